@@ -1,0 +1,56 @@
+"""The one box that learned and true dynamics fill: state and torque in, state out."""
+
+from typing import Protocol
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.scene import Scene
+
+
+class Dynamics(Protocol):
+    """What an env needs of physics. A state holds ``qpos`` and ``qvel``, float64."""
+
+    scene: Scene
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all rows)."""
+        ...
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """The state one control step later.
+
+        Args:
+            state: ``qpos (num_envs, nq)``, ``qvel (num_envs, nv)``.
+            joint_torque: ``(num_envs, num_actuated)``, N and N m, held over the step.
+            terrain: ``(num_envs, terrain.size)`` where the ground varies.
+
+        Returns:
+            A new tensordict; rows that the physics could not step are not finite.
+        """
+        ...
+
+
+def check_step(
+    scene: Scene, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
+) -> None:
+    """Raise ValueError where a shape is not the scene's, naming got and expected."""
+    rows = state.batch_size[0] if state.batch_size else state[QPOS].shape[0]
+    expected = {
+        QPOS: (state[QPOS], (rows, scene.model.nq)),
+        QVEL: (state[QVEL], (rows, scene.model.nv)),
+        "joint_torque": (joint_torque, (rows, len(scene.actuated))),
+    }
+    if scene.terrain is not None and scene.terrain.is_per_row:
+        if terrain is None:
+            raise ValueError(f"scene '{scene.name}' has a ground per row: got no terrain")
+        expected["terrain"] = (terrain, (rows, scene.terrain.size))
+    for name, (value, shape) in expected.items():
+        if tuple(value.shape) != shape:
+            raise ValueError(f"expected {name} of shape {shape}, got {tuple(value.shape)}")

@@ -1,0 +1,133 @@
+"""Ground truth: all rows through MuJoCo's thread-pooled rollout in one call."""
+
+import copy
+import os
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.scene import Scene
+
+STATE = mujoco.mjtState
+CONTROL = STATE.mjSTATE_QFRC_APPLIED | STATE.mjSTATE_MOCAP_POS | STATE.mjSTATE_MOCAP_QUAT
+
+
+def torque_model(scene: Scene) -> mujoco.MjModel:
+    """The scene's model driven by joint torques alone: its own actuators are off, since
+    the controller already turned actions into torques; no silent reset on bad numbers."""
+    model = copy.copy(scene.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model
+
+
+class MujocoDynamics:
+    """MuJoCo itself, substeps and threads in C, no Python loop over rows.
+
+    The solver's warm start is carried from step to step (it changes results by less than
+    the solver's tolerance) and cleared for rows that are reset.
+
+    Args:
+        scene: robot, ground and substeps.
+        num_threads: worker threads; all processors by default.
+    """
+
+    def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
+        self.scene = scene
+        self.num_threads = num_threads or os.cpu_count() or 1
+        self._start()
+
+    def _start(self) -> None:
+        self._model = torque_model(self.scene)
+        self._data = [mujoco.MjData(self._model) for _ in range(self.num_threads)]
+        self._pool = mujoco.rollout.Rollout(nthread=self.num_threads)
+        self._warmstart = np.zeros((0, self._model.nv))
+
+    def __getstate__(self) -> dict:
+        """Threads do not travel: a copy in another process starts its own."""
+        return {"scene": self.scene, "num_threads": self.num_threads}
+
+    def __setstate__(self, state: dict) -> None:
+        self.scene, self.num_threads = state["scene"], state["num_threads"]
+        self._start()
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Clear the warm start of ``rows``."""
+        count = state[QPOS].shape[0]
+        if rows is None or len(self._warmstart) != count:
+            self._warmstart = np.zeros((count, self._model.nv))
+        else:
+            self._warmstart[rows.cpu().numpy()] = 0.0
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`. Rows that MuJoCo gave up on come back as NaN."""
+        check_step(self.scene, state, joint_torque, terrain)
+        qpos, qvel = (state[key].double().cpu().numpy() for key in (QPOS, QVEL))
+        trajectory = self._rollout(qpos, qvel, self._control(joint_torque, terrain))
+        nq, nv = self._model.nq, self._model.nv
+        last = trajectory[:, -1]
+        before = trajectory[:, -2, 1 + nq : 1 + nq + nv] if self._steps > 1 else qvel
+        next_qvel = last[:, 1 + nq : 1 + nq + nv]
+        self._warmstart = (next_qvel - before) / self._model.opt.timestep
+        next_state = torch.from_numpy(last[:, 1 : 1 + nq + nv].copy())
+        # a row that MuJoCo gave up on stopped before the end: its clock is behind
+        is_late = abs(last[:, 0] - self.scene.control_step) > 0.5 * self._model.opt.timestep
+        if is_late.any():
+            next_state[torch.from_numpy(is_late)] = torch.nan
+            self._warmstart[is_late] = 0.0
+        next_state = next_state.to(state[QPOS].device)
+        return TensorDict(
+            {QPOS: next_state[:, :nq], QVEL: next_state[:, nq:]},
+            batch_size=[len(qpos)],
+            device=state.device,
+        )
+
+    @property
+    def _steps(self) -> int:
+        return self.scene.substeps
+
+    def _control(self, joint_torque: Tensor, terrain: Tensor | None) -> np.ndarray:
+        """MuJoCo's control vector: applied force, then the ground's pose."""
+        rows = len(joint_torque)
+        force = torch.zeros(rows, self._model.nv, dtype=torch.float64)
+        force[:, self.scene.actuated] = joint_torque.double().cpu()
+        ground = self.scene.terrain
+        if terrain is None or ground is None or not ground.is_per_row:
+            pos = torch.from_numpy(self._data[0].mocap_pos.reshape(1, -1))
+            quat = torch.from_numpy(self._data[0].mocap_quat.reshape(1, -1))
+            pose = torch.cat((pos, quat), -1).expand(rows, -1)
+        else:
+            pose = ground.mocap_pose(terrain.double().cpu())
+        return torch.cat((force, pose), -1).numpy()
+
+    def _rollout(
+        self, qpos: np.ndarray, qvel: np.ndarray, control: np.ndarray
+    ) -> np.ndarray:
+        """All substeps of all rows, ``(rows, substeps, state)``."""
+        rows = len(qpos)
+        size = mujoco.mj_stateSize(self._model, STATE.mjSTATE_FULLPHYSICS)
+        start = np.zeros((rows, size))
+        start[:, 1 : 1 + qpos.shape[1]] = qpos
+        start[:, 1 + qpos.shape[1] : 1 + qpos.shape[1] + qvel.shape[1]] = qvel
+        if len(self._warmstart) != rows:
+            self._warmstart = np.zeros((rows, self._model.nv))
+        states, _ = self._pool.rollout(
+            self._model,
+            self._data,
+            start,
+            np.repeat(control[:, None], self._steps, 1),
+            control_spec=int(CONTROL),
+            initial_warmstart=self._warmstart,
+        )
+        return states

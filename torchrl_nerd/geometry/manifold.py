@@ -1,0 +1,93 @@
+"""The configuration manifold of a MuJoCo model: positions plus tangent vectors.
+
+``qpos`` is a point and ``qvel`` a tangent vector: hinges and slides are scalars, ball and
+free joints carry a quaternion. Same definitions as ``mj_integratePos`` and
+``mj_differentiatePos`` (https://mujoco.readthedocs.io/en/stable/APIreference).
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import torch
+from torch import Tensor
+
+from torchrl_nerd.geometry.frames import (
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_normalize,
+)
+
+
+@dataclass(frozen=True)
+class JointLayout:
+    """Where each joint lives in ``qpos`` and ``qvel``.
+
+    | field | meaning |
+    |---|---|
+    | ``nq``, ``nv`` | lengths of ``qpos`` and ``qvel`` |
+    | ``linear`` | (qpos address, dof address) of every entry that adds like a number |
+    | ``rotations`` | (qpos address of the quaternion, dof address) of ball and free joints |
+    """
+
+    nq: int
+    nv: int
+    linear: tuple[tuple[int, int], ...]
+    rotations: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def from_model(cls, model: mujoco.MjModel) -> "JointLayout":
+        """Read the joints of a compiled model."""
+        linear: list[tuple[int, int]] = []
+        rotations: list[tuple[int, int]] = []
+        for joint in range(model.njnt):
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            kind = int(model.jnt_type[joint])
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                linear += [(q + i, v + i) for i in range(3)]
+                rotations.append((q + 3, v + 3))
+            elif kind == mujoco.mjtJoint.mjJNT_BALL:
+                rotations.append((q, v))
+            else:
+                linear.append((q, v))
+        return cls(model.nq, model.nv, tuple(linear), tuple(rotations))
+
+    @property
+    def is_vector_space(self) -> bool:
+        """True where positions are plain numbers in the order of the velocities."""
+        return not self.rotations
+
+
+def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
+    """``qpos`` moved along ``tangent`` (velocity times time), ``(*batch, nq)``.
+
+    Linear parts add in world axes; quaternions are multiplied from the right by the
+    exponential of the body-axes rotation vector and normalised.
+    """
+    if layout.is_vector_space:
+        return qpos + tangent
+    moved = torch.empty_like(qpos)
+    for q, v in layout.linear:
+        moved[..., q] = qpos[..., q] + tangent[..., v]
+    for q, v in layout.rotations:
+        turn = quat_exp(tangent[..., v : v + 3])
+        moved[..., q : q + 4] = quat_normalize(
+            quat_multiply(qpos[..., q : q + 4], turn)
+        )
+    return moved
+
+
+def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor:
+    """Tangent vector that takes ``start`` to ``end``, ``(*batch, nv)``."""
+    if layout.is_vector_space:
+        return end - start
+    tangent = start.new_empty((*start.shape[:-1], layout.nv))
+    for q, v in layout.linear:
+        tangent[..., v] = end[..., q] - start[..., q]
+    for q, v in layout.rotations:
+        turn = quat_multiply(
+            quat_conjugate(start[..., q : q + 4]), end[..., q : q + 4]
+        )
+        tangent[..., v : v + 3] = quat_log(turn)
+    return tangent

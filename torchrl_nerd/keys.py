@@ -1,0 +1,53 @@
+"""Every tensordict key, once: meaning, shape, unit, frame.
+
+Conventions: SI units, z up, quaternions ``wxyz``. ``qpos`` and ``qvel`` are MuJoCo's and
+are *the* state: a free joint's ``qvel`` is the linear velocity of the body origin in
+world axes, then the angular velocity in body axes. The suffix ``_w`` names the world
+frame and ``_b`` the base frame B_t = (x_t, R_t), the pose of the robot's base body at the
+token's own time. States are float64, features and observations float32.
+"""
+
+QPOS = "qpos"
+"""Joint positions ``(*batch, nq)``, m and rad, float64, MuJoCo's order."""
+
+QVEL = "qvel"
+"""Joint velocities ``(*batch, nv)``, m/s and rad/s, float64, MuJoCo's order."""
+
+TERRAIN = "terrain"
+"""Ground parameters of each row ``(*batch, scene.terrain.size)``, world frame, float64.
+A plane is (unit normal, offset) with ``normal . x = offset``. Only where the ground
+varies from row to row."""
+
+ACTION = "action"
+"""What the policy chose ``(*batch, num_actions)``, float32, in [-1, 1]."""
+
+OBSERVATION = "observation"
+"""What the policy sees ``(*batch, D)``, float32; the task defines it."""
+
+JOINT_TORQUE = ("next", "joint_torque")
+"""What the controller applied over the step, per actuated dof ``(*batch, num_actuated)``,
+N and N m, float64. Recorded under ``next``: it belongs to the transition."""
+
+NEXT_QPOS = ("next", "qpos")
+NEXT_QVEL = ("next", "qvel")
+
+ROBOT_STATE = "robot_state"
+"""Base velocity and gravity in B_t, joint features ``(*batch, D)``; see RobotCentric."""
+
+ROBOT_TORQUE = "robot_torque"
+"""Joint torques ``(*batch, num_actuated)``, N and N m, float32."""
+
+CONTACT_DISTANCE = "contact_distance"
+"""Clearance of each contact point to the ground, minus the margin, at most zero
+``(*batch, num_points)``, m: 0 beyond the margin, ``-margin`` when touching."""
+
+CONTACT_VELOCITY = "contact_velocity"
+"""Velocity of each contact point in B_t, along and across the ground's normal
+``(*batch, num_points * 4)``, m/s, zero beyond the margin."""
+
+CONTACT_NORMAL = "contact_normal"
+"""Ground normal at each point in B_t ``(*batch, num_points * 3)``, zero beyond the
+margin. Only where it does not follow from gravity."""
+
+STATE_DELTA = "state_delta"
+"""Change of the state over one control step in B_t ``(*batch, 2 nv)``; see StateDelta."""

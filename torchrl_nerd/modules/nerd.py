@@ -1,0 +1,108 @@
+"""A Neural Robot Dynamics model: features of a scene, a network, statistics."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
+from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms import ContactFeatures, Normalize, RobotCentric, StateDelta, Stats
+
+NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
+
+NETWORKS: dict[str, NetworkConfig] = {
+    **PRESETS,
+    "mlp": MLPConfig(),
+    "gru": GRUConfig(),
+}
+"""Networks by name, for the command line."""
+
+TOKEN, TARGET = "token", "target"
+
+
+class Memory(Protocol):
+    """History of a network, one entry per row."""
+
+    def clear(self, rows: Tensor) -> None:
+        """Empty the history of ``rows`` (bool ``(num_rows,)``)."""
+        ...
+
+
+class Network(Protocol):
+    """What the transformer, the MLP and the GRU have in common."""
+
+    def __call__(self, tokens: Tensor) -> Tensor: ...
+
+    def empty_memory(self, rows: int) -> Memory: ...
+
+    def step(self, token: Tensor, memory: Memory) -> Tensor: ...
+
+
+class NeRD(nn.Module):
+    """The learned solver of one robot: state, torque and ground in, change of state out.
+
+    Args:
+        scene: the robot.
+        config: size and kind of the network.
+        stats: statistics of raw tokens and targets, from `SceneTokens`; zero mean and
+            unit variance where not given (a model whose weights are yet to be loaded).
+    """
+
+    def __init__(
+        self, scene: Scene, config: NetworkConfig, stats: dict[str, Stats] | None = None
+    ) -> None:
+        super().__init__()
+        self.scene, self.config = scene, config
+        self.tokens = SceneTokens(scene)
+        self.state_delta = StateDelta(scene)
+        num_inputs, num_outputs = self.tokens.size, self.state_delta.size
+        self.normalize = Normalize(
+            stats or {TOKEN: unit_stats(num_inputs), TARGET: unit_stats(num_outputs)}
+        )
+        self.network = config.build(num_inputs, num_outputs)
+
+    def encode(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Tensor:
+        """Normalised float32 tokens ``(*batch, F)`` of float64 states and torques."""
+        raw = self.tokens(qpos, qvel, joint_torque, terrain)
+        return self.normalize.normalize(TOKEN, raw).to(self.dtype)
+
+    def decode(
+        self, qpos: Tensor, qvel: Tensor, output: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Next ``qpos`` and ``qvel`` from the network's normalised output."""
+        delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
+        return self.state_delta.integrate(qpos, qvel, delta)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+        return next(self.network.parameters()).dtype
+
+
+class SceneTokens(nn.Module):
+    """The features of a scene as one vector per state: `RobotCentric`, torques and
+    `ContactFeatures`, in this order."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.robot = RobotCentric(scene)
+        self.contact = ContactFeatures(scene)
+        widths = (*self.robot.sizes.values(), *self.contact.sizes.values())
+        self.size = sum(widths)
+
+    def forward(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Tensor:
+        """Raw tokens ``(*batch, F)`` in the dtype of the state."""
+        state = self.robot.state_features(qpos, qvel)
+        contacts = self.contact.contact_features(qpos, qvel, terrain)
+        return torch.cat((state, joint_torque, *contacts), -1)
+
+
+def unit_stats(size: int) -> Stats:
+    """Statistics that leave ``(*, size)`` as it is."""
+    return Stats(1, torch.zeros(size).double(), torch.ones(size).double())

@@ -1,0 +1,208 @@
+"""Causal transformer whose attention is a band, so that one step costs one token.
+
+NeRD section 3.4 recomputes its last ten tokens at every step, with absolute positions.
+Here each layer sees a token and the ``band - 1`` before it, and positions are relative (a
+learned bias per head and offset). A token is written in its own base frame and never
+changes as time moves on, so its keys and values are kept in a ring. Depth widens the
+view: ``layers * (band - 1) + 1`` tokens reach the output, in training as in streaming.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+MASKED = float("-inf")
+HEAD_WIDTH = 64  # paper, appendix A: output head Linear-64-ReLU-Linear
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """Size of a transformer.
+
+    | field | meaning |
+    |---|---|
+    | ``layers``, ``width``, ``heads`` | as usual; ``heads`` divides ``width`` |
+    | ``band`` | tokens each layer sees, the current one included (paper: h = 10) |
+    """
+
+    layers: int = 2
+    width: int = 64
+    heads: int = 4
+    band: int = 10
+
+    def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
+        """A freshly initialised network."""
+        return CausalTransformer(self, num_inputs, num_outputs)
+
+
+@dataclass
+class KeyValueCache:
+    """Keys and values of the last ``band - 1`` tokens of every layer.
+
+    | field | meaning |
+    |---|---|
+    | ``keys``, ``values`` | per layer ``(rows, heads, band - 1, head width)`` |
+    | ``age`` | ``(rows,)``: tokens seen since the row's reset, at most ``band - 1`` |
+    | ``slot`` | where the oldest token lies, which the next one overwrites |
+    """
+
+    keys: list[Tensor]
+    values: list[Tensor]
+    age: Tensor
+    slot: int = 0
+
+    def clear(self, rows: Tensor) -> None:
+        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
+        self.age = self.age.masked_fill(rows, 0)
+        for past in (*self.keys, *self.values):
+            past[rows] = 0.0  # whatever stood there, a masked NaN would still spread
+
+    def write(self, layer: int, key: Tensor, value: Tensor) -> None:
+        """Store one token of one layer; out of place while gradients are recorded."""
+        for past, new in ((self.keys, key), (self.values, value)):
+            if torch.is_grad_enabled():
+                kept = past[layer].roll(-self.slot, 2)[:, :, 1:]
+                past[layer] = torch.cat((kept, new[:, :, None]), 2)
+            else:
+                past[layer][:, :, self.slot] = new
+
+    def advance(self) -> None:
+        """Count one token."""
+        size = self.keys[0].shape[2]
+        self.slot = 0 if torch.is_grad_enabled() else (self.slot + 1) % size
+        self.age = (self.age + 1).clamp_max(size)
+
+
+class Attention(nn.Module):
+    """Multi-head attention within a band, with a learned bias per head and offset."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.heads, self.band = config.heads, config.band
+        self.scale = (config.width // config.heads) ** -0.5
+        self.project = nn.Linear(config.width, 3 * config.width, bias=False)
+        self.output = nn.Linear(config.width, config.width, bias=False)
+        self.offset_bias = nn.Parameter(torch.zeros(config.heads, config.band))
+
+    def _split(self, x: Tensor) -> tuple[Tensor, ...]:
+        parts = self.project(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
+        return parts  # each (*, heads, head width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """All tokens at once, ``(rows, T, width)``."""
+        query, key, value = (part.transpose(1, 2) for part in self._split(x))
+        steps = torch.arange(x.shape[1], device=x.device)
+        offset = steps[:, None] - steps[None, :]
+        is_seen = (offset >= 0) & (offset < self.band)
+        bias = self.offset_bias[:, offset.clamp(0, self.band - 1)]
+        scores = query @ key.mT * self.scale + bias
+        weights = scores.masked_fill(~is_seen, MASKED).softmax(-1)
+        return self.output((weights @ value).transpose(1, 2).flatten(2))
+
+    def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
+        """One token per row, ``(rows, width)``, against the cached ones."""
+        query, key, value = self._split(x)
+        past_keys, past_values = cache.keys[layer], cache.values[layer]
+        size = self.band - 1
+        slots = torch.arange(size, device=x.device)
+        offset = (cache.slot - 1 - slots) % size + 1
+        is_seen = offset <= cache.age[:, None]
+        past = torch.einsum("bhd,bhsd->bhs", query, past_keys) * self.scale
+        past = (past + self.offset_bias[:, offset]).masked_fill(~is_seen[:, None], MASKED)
+        own = (query * key).sum(-1, keepdim=True) * self.scale + self.offset_bias[:, :1]
+        weights = torch.cat((past, own), -1).softmax(-1)
+        mixed = torch.einsum("bhs,bhsd->bhd", weights[..., :-1], past_values)
+        mixed = mixed + weights[..., -1:] * value
+        cache.write(layer, key, value)
+        return self.output(mixed.flatten(1))
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block: attention, then a GELU MLP of four times the width."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.norm_attention = nn.LayerNorm(width, bias=False)
+        self.attention = Attention(config)
+        self.norm_mlp = nn.LayerNorm(width, bias=False)
+        self.expand = nn.Linear(width, 4 * width, bias=False)
+        self.contract = nn.Linear(4 * width, width, bias=False)
+
+    def _mlp(self, x: Tensor) -> Tensor:
+        return x + self.contract(F.gelu(self.expand(self.norm_mlp(x))))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(rows, T, width)``."""
+        return self._mlp(x + self.attention(self.norm_attention(x)))
+
+    def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
+        """``(rows, width)``."""
+        return self._mlp(x + self.attention.step(self.norm_attention(x), cache, layer))
+
+
+class CausalTransformer(nn.Module):
+    """Tokens of features to one prediction per token.
+
+    Args:
+        config: its size.
+        num_inputs: features per token.
+        num_outputs: numbers predicted per token.
+    """
+
+    def __init__(
+        self, config: TransformerConfig, num_inputs: int, num_outputs: int
+    ) -> None:
+        super().__init__()
+        if config.width % config.heads:
+            raise ValueError(
+                f"expected heads to divide width {config.width}, got {config.heads}"
+            )
+        self.config = config
+        self.embed = nn.Linear(num_inputs, config.width)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(config.width, bias=False)
+        self.head = nn.Sequential(
+            nn.Linear(config.width, HEAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(HEAD_WIDTH, num_outputs),
+        )
+        for name, weight in self.blocks.named_parameters():
+            if weight.ndim == 2 and "offset_bias" not in name:
+                is_residual = name.endswith(("output.weight", "contract.weight"))
+                depth = (2 * config.layers) ** 0.5 if is_residual else 1.0
+                nn.init.normal_(weight, std=0.02 / depth)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
+        x = self.embed(tokens)
+        for block in self.blocks:
+            x = block(x)
+        return self.head(self.norm(x))
+
+    def empty_memory(self, rows: int) -> KeyValueCache:
+        """A history of nothing for ``rows`` rows."""
+        c, weight = self.config, self.embed.weight
+        shape = (rows, c.heads, c.band - 1, c.width // c.heads)
+        keys, values = (
+            [weight.new_zeros(shape) for _ in range(c.layers)] for _ in range(2)
+        )
+        return KeyValueCache(keys, values, torch.zeros(rows, dtype=torch.long, device=weight.device))
+
+    def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
+        """The next token of every row, ``(rows, F) -> (rows, D)``; advances ``memory``."""
+        x = self.embed(token)
+        for layer, block in enumerate(self.blocks):
+            x = block.step(x, memory, layer)
+        memory.advance()
+        return self.head(self.norm(x))
+
+
+PRESETS = {
+    "tiny": TransformerConfig(2, 64, 4),
+    "small": TransformerConfig(4, 128, 4),
+    "paper": TransformerConfig(6, 192, 12),
+    "paper-large": TransformerConfig(6, 384, 12),
+}

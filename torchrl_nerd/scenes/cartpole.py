@@ -1,0 +1,36 @@
+"""Cartpole of the NeRD paper: a 50 kg cart on a rail, a 2.5 kg pole, 1500 N."""
+
+from math import pi
+from pathlib import Path
+
+import mujoco
+
+from torchrl_nerd.scenes.controllers import TorqueController
+from torchrl_nerd.scenes.penalty import set_penalty_limit
+from torchrl_nerd.scenes.sampling import Sampling
+from torchrl_nerd.scenes.scene import Scene
+
+GAIN = 1500.0  # N per unit of action; reference code, env_cartpole
+LIMIT_STIFFNESS = 1e4  # N/m, beyond +-4 m; reference URDF importer's limit_ke
+LIMIT_DAMPING = 10.0  # N s/m; limit_kd
+SUBSTEPS = 5  # of 1/300 s: control step 1/60 s; paper, appendix B
+
+
+def cartpole() -> Scene:
+    """Build the scene. ``qpos`` = (cart x, pole angle from upright)."""
+    path = Path(__file__).parent / "assets" / "cartpole.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    set_penalty_limit(model, "slider", ke=LIMIT_STIFFNESS, kd=LIMIT_DAMPING)
+    return Scene(
+        name="cartpole",
+        model=model,
+        substeps=SUBSTEPS,
+        controller=TorqueController((GAIN,)),
+        sampling=Sampling(
+            qpos_low=(-3.5, -pi),
+            qpos_high=(3.5, pi),
+            qvel_low=(-10.0, -10.0),
+            qvel_high=(10.0, 10.0),
+            torque=(GAIN,),
+        ),
+    )

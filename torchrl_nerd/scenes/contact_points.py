@@ -1,0 +1,143 @@
+"""The points of a robot that can touch the ground.
+
+As in the paper (section 3.2; facts of the reference code): a sphere's centre, a capsule's
+two cap centres, a box's eight corners. Points that always coincide are merged, points
+that no joint can move are dropped: the ground cannot do work on them.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import mujoco
+import numpy as np
+
+from torchrl_nerd.geometry.kinematics import Base
+
+MARGIN_PER_RADIUS = 4.0  # paper, appendix A: xi = max(4 thickness, 0.1 m)
+MIN_MARGIN = 0.1  # m
+
+SPHERE, CAPSULE, BOX = (
+    int(mujoco.mjtGeom.mjGEOM_SPHERE),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
+    int(mujoco.mjtGeom.mjGEOM_BOX),
+)
+
+
+@dataclass(frozen=True)
+class ContactPoints:
+    """Contact points after merging.
+
+    | field | meaning |
+    |---|---|
+    | ``bodies`` | body id of each point |
+    | ``positions`` | ``(P, 3)``, m, body frame |
+    | ``radii`` | ``(P,)``, m: the surface touches when a point's distance equals its radius |
+    | ``margins`` | ``(P,)``, m: xi, the distance beyond which a point has no features |
+    | ``count_found`` | how many the shapes have before merging and dropping |
+    """
+
+    bodies: list[int]
+    positions: np.ndarray
+    radii: np.ndarray
+    margins: np.ndarray
+    count_found: int
+
+    def __len__(self) -> int:
+        return len(self.bodies)
+
+
+def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
+    """Find the contact points of the robot in a compiled model.
+
+    Raises:
+        ValueError: a shape that can touch the ground is none of sphere, capsule, box.
+    """
+    bodies: list[int] = []
+    positions: list[np.ndarray] = []
+    radii: list[float] = []
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        for geom in range(model.ngeom):
+            if model.body_weldid[model.geom_bodyid[geom]] and _touches(model, geom):
+                points, radius = _points_of(model, geom)
+                bodies += [int(model.geom_bodyid[geom])] * len(points)
+                positions += list(points)
+                radii += [radius] * len(points)
+    kept = _distinct(model, base, bodies, positions, radii)
+    radius = np.array([radii[i] for i in kept])
+    return ContactPoints(
+        bodies=[bodies[i] for i in kept],
+        positions=np.array([positions[i] for i in kept]).reshape(-1, 3),
+        radii=radius,
+        margins=np.maximum(MARGIN_PER_RADIUS * radius, MIN_MARGIN),
+        count_found=len(bodies),
+    )
+
+
+def ground_geoms(model: mujoco.MjModel) -> list[int]:
+    """Static or mocap shapes that something moving can touch."""
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if model.body_weldid[model.geom_bodyid[geom]] == 0
+        or model.body_mocapid[model.geom_bodyid[geom]] >= 0
+        if model.geom_contype[geom] or model.geom_conaffinity[geom]
+    ]
+
+
+def _touches(model: mujoco.MjModel, geom: int) -> bool:
+    is_moving = model.body_dofnum[model.body_weldid[model.geom_bodyid[geom]]] > 0
+    return is_moving and any(
+        model.geom_contype[geom] & model.geom_conaffinity[other]
+        or model.geom_contype[other] & model.geom_conaffinity[geom]
+        for other in ground_geoms(model)
+    )
+
+
+def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
+    size, kind = model.geom_size[geom], int(model.geom_type[geom])
+    if kind == SPHERE:
+        local, radius = np.zeros((1, 3)), size[0]
+    elif kind == CAPSULE:
+        local, radius = np.array([[0, 0, size[1]], [0, 0, -size[1]]]), size[0]
+    elif kind == BOX:
+        local, radius = np.array(list(product((-1, 1), repeat=3))) * size, 0.0
+    else:
+        name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+        raise ValueError(
+            f"geom '{model.geom(geom).name or geom}' that can touch the ground is a "
+            f"{name}; expected sphere, capsule or box"
+        )
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+    return local @ matrix.reshape(3, 3).T + model.geom_pos[geom], float(radius)
+
+
+def _distinct(
+    model: mujoco.MjModel,
+    base: Base,
+    bodies: list[int],
+    positions: list[np.ndarray],
+    radii: list[float],
+) -> list[int]:
+    """Indices of points that move and that do not follow another one everywhere."""
+    rng, data = np.random.default_rng(0), mujoco.MjData(model)
+    tracks = []
+    for _ in range(4):
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+        mujoco.mj_kinematics(model, data)
+        world = [
+            data.xpos[b] + data.xmat[b].reshape(3, 3) @ p
+            for b, p in zip(bodies, positions, strict=True)
+        ]
+        tracks.append(np.array(world).reshape(-1, 3))
+    track = np.stack(tracks, 1)  # (P, poses, 3)
+    kept: list[int] = []
+    for i in range(len(bodies)):
+        if not base.is_floating and np.ptp(track[i], 0).max() < 1e-9:
+            continue
+        twins = (
+            abs(track[i] - track[k]).max() < 1e-9 and radii[i] == radii[k] for k in kept
+        )
+        if not any(twins):
+            kept.append(i)
+    return kept

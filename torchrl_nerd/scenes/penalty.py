@@ -1,0 +1,56 @@
+"""MuJoCo parameters that reproduce the paper's spring-and-damper contacts and limits.
+
+The paper's engine pushes back with ``ke * depth + kd * speed`` and friction
+``min(kf * slip, mu * normal)``. MuJoCo's soft constraint has force
+``(a_ref - a_0) / (A + R)`` with ``R = (1 - d)/d * A`` and ``a_ref = -(k/d) depth - (b/d)
+speed``. For a small impedance ``d`` the term ``a_0`` fades and the force becomes
+``(k * depth + b * speed) / A``: the spring and damper, if ``k = A ke`` and ``b = A kd``.
+``A`` is MuJoCo's constant ``invweight0``. Friction shares the damping, and ``impratio``
+multiplies it, so ``impratio = kf / kd``.
+Source: https://mujoco.readthedocs.io/en/stable/computation/#constraint-model
+"""
+
+import mujoco
+import numpy as np
+
+IMPEDANCE = 0.01
+SOLIMP = np.array([IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0])
+
+
+def set_penalty_contact(
+    model: mujoco.MjModel, *, ke: float, kd: float, kf: float, mu: float
+) -> None:
+    """Give every shape of a moving body the penalty law against the ground.
+
+    Args:
+        ke: stiffness, N/m.
+        kd: normal damping, N s/m.
+        kf: tangential damping below the friction limit, N s/m.
+        mu: Coulomb friction coefficient.
+    """
+    model.opt.impratio = kf / kd
+    for geom in range(model.ngeom):
+        body = model.geom_bodyid[geom]
+        inverse_mass = model.body_invweight0[body, 0]
+        if inverse_mass == 0.0:
+            continue
+        model.geom_solref[geom] = (-ke * inverse_mass, -kd * inverse_mass)
+        model.geom_solimp[geom] = SOLIMP
+        model.geom_friction[geom, 0] = mu
+        model.geom_priority[geom] = 1
+
+
+def set_penalty_limit(
+    model: mujoco.MjModel, joint: str, *, ke: float, kd: float
+) -> None:
+    """Give a limited joint a spring and damper that act beyond its range.
+
+    Args:
+        joint: its name.
+        ke: stiffness, N/m or N m/rad.
+        kd: damping, N s/m or N m s/rad.
+    """
+    index = model.joint(joint).id
+    inverse_mass = model.dof_invweight0[model.jnt_dofadr[index]]
+    model.jnt_solref[index] = (-ke * inverse_mass, -kd * inverse_mass)
+    model.jnt_solimp[index] = SOLIMP

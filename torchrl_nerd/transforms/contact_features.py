@@ -1,0 +1,122 @@
+"""What the robot's contact points see of the ground, in the robot's own frame.
+
+NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
+zeroed beyond the margin xi. Over one plane, p1 follows from kinematics, n and d, so it is
+left out; where the plane is the same for all rows, n follows from gravity and is left
+out too. Added is what decides an impact: the point's velocity. All of it fades to zero at
+the margin without a jump.
+"""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.geometry.kinematics import PointKinematics, matrix_from_quat
+from torchrl_nerd.keys import (
+    CONTACT_DISTANCE,
+    CONTACT_NORMAL,
+    CONTACT_VELOCITY,
+    QPOS,
+    QVEL,
+    TERRAIN,
+)
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms.base import FeatureTransform
+
+FADE = 0.25  # share of the way from margin to touching over which velocities fade in
+
+
+class ContactFeatures(FeatureTransform):
+    """Distance, velocity and, where it varies, normal of every contact point, in B_t.
+
+    With P contact points, gate g(d) = 0 at d >= xi and 1 well inside:
+
+    | out key | what | width |
+    |---|---|---|
+    | ``contact_distance`` | min(d - xi, 0), m | P |
+    | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
+    | ``contact_normal`` | g * n; only where the ground varies from row to row | 3 P |
+
+    A scene without contact gives no keys at all.
+
+    Args:
+        scene: the robot and its ground.
+
+    Examples:
+        >>> transform = ContactFeatures(load_scene("cartpole"))
+        >>> transform.out_keys
+        []
+    """
+
+    why_no_inverse = "distances do not determine a pose"
+
+    def __init__(self, scene: Scene) -> None:
+        count, terrain = len(scene.contacts), scene.terrain
+        sizes, in_keys = {}, []
+        if terrain is not None:
+            in_keys = [QPOS, QVEL]
+            sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
+            if terrain.is_per_row:
+                in_keys.append(TERRAIN)
+                sizes[CONTACT_NORMAL] = 3 * count
+        super().__init__(in_keys, sizes)
+        self.terrain, self.base = terrain, scene.base
+        if terrain is None:
+            return
+        points = scene.contacts
+        self.kinematics = PointKinematics(
+            scene.model, scene.base, points.bodies, points.positions
+        )
+        constants = {"radii": points.radii, "margins": points.margins}
+        constants |= {"plane": terrain.default}
+        constants |= dict(zip(("mount_pos", "mount_rot"), scene.mount, strict=True))
+        for name, value in constants.items():
+            tensor = torch.as_tensor(value, dtype=torch.float64).clone()
+            self.register_buffer(name, tensor, persistent=False)
+
+    def contact_features(
+        self, qpos: Tensor, qvel: Tensor, terrain: Tensor | None = None
+    ) -> list[Tensor]:
+        """The outputs in the order of ``out_keys``, in the dtype of the inputs.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+            terrain: ``(*batch, 4)`` in the world; None for the scene's own plane.
+        """
+        if self.terrain is None:
+            return []
+        points, velocity = self.kinematics(qpos, qvel)
+        position, rotation = self._base_pose(qpos)
+        if self.base.is_floating:  # from riding on the base to standing on the ground
+            v = self.base.dof_address
+            linear = (rotation.mT @ qvel[..., v : v + 3, None])[..., 0]
+            angular = qvel[..., None, v + 3 : v + 6].expand_as(points)
+            turning = torch.linalg.cross(angular, points)
+            velocity = velocity + linear[..., None, :] + turning
+        plane = self.plane.expand(*qpos.shape[:-1], -1) if terrain is None else terrain
+        distance, normal = self.terrain.distance(points, plane, position, rotation)
+        beyond = distance - self.margins
+        gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)[..., None]
+        speed = (velocity * normal).sum(-1, keepdim=True)
+        sliding = velocity - speed * normal
+        features = [beyond.clamp_max(0.0)]
+        features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
+        if self.terrain.is_per_row:
+            features.append((gate * normal).flatten(-2))
+        return features
+
+    def _base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
+        """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
+        if not self.base.is_floating:
+            batch = qpos.shape[:-1]
+            return self.mount_pos.expand(*batch, 3), self.mount_rot.expand(*batch, 3, 3)
+        q = self.base.qpos_address
+        return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
+
+    def _features(self, tensordict: TensorDictBase) -> dict:
+        if self.terrain is None:
+            return {}
+        terrain = tensordict[TERRAIN] if self.terrain.is_per_row else None
+        values = self.contact_features(tensordict[QPOS], tensordict[QVEL], terrain)
+        return dict(zip(self.out_keys, values, strict=True))

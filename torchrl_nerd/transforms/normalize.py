@@ -1,0 +1,129 @@
+"""Zero mean and unit variance, with statistics that merge across processes.
+
+NeRD section 3.4. Statistics are float64 and exact (Chan, Golub and LeVeque, "Algorithms
+for computing the sample variance", 1983), so that huge offsets cost no digits.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import Transform
+
+FLOOR = 1e-6
+"""Smallest standard deviation, relative to 1 + |mean|: a constant stays a constant."""
+
+
+@dataclass(frozen=True)
+class Stats:
+    """Count, mean and sum of squared deviations of one vector quantity.
+
+    | field | meaning |
+    |---|---|
+    | ``count`` | number of samples |
+    | ``mean`` | ``(D,)`` |
+    | ``m2`` | ``(D,)``: sum of (x - mean)^2 |
+    """
+
+    count: int
+    mean: Tensor
+    m2: Tensor
+
+    @classmethod
+    def of(cls, samples: Tensor) -> "Stats":
+        """Statistics of ``(*batch, D)`` samples over all leading dimensions."""
+        x = samples.detach().double().flatten(0, -2)
+        mean = x.mean(0)
+        return cls(len(x), mean, ((x - mean) ** 2).sum(0))
+
+    def merge(self, other: "Stats") -> "Stats":
+        """Statistics of both sets of samples together."""
+        count = self.count + other.count
+        shift = other.mean - self.mean
+        share = other.count / count
+        m2 = self.m2 + other.m2 + shift**2 * (self.count * share)
+        return Stats(count, self.mean + shift * share, m2)
+
+    @property
+    def std(self) -> Tensor:
+        """Population standard deviation ``(D,)``, floored."""
+        floor = FLOOR * (1.0 + self.mean.abs())
+        return torch.maximum((self.m2 / max(self.count, 1)).sqrt(), floor)
+
+
+class Normalize(Transform):
+    """``(x - mean) / std`` per element, and its inverse.
+
+    Statistics are frozen buffers: they follow ``.to`` and ``state_dict``, are copied by
+    ``deepcopy``, and never change while running. Keys that a tensordict lacks are left
+    alone. The inverse acts outside an env only, on the keys that are present.
+
+    Args:
+        stats: key -> `Stats`.
+
+    Examples:
+        >>> x = torch.randn(100, 3).double() * 5.0 + 1000.0
+        >>> transform = Normalize({"x": Stats.of(x)})
+        >>> y = transform(TensorDict(x=x, batch_size=[100]))["x"]
+        >>> bool((y.mean().abs() < 1e-6) & ((y.std() - 1.0).abs() < 1e-2))
+        True
+    """
+
+    def __init__(self, stats: Mapping[NestedKey, Stats]) -> None:
+        keys = list(stats)
+        super().__init__(
+            in_keys=keys, out_keys=keys, in_keys_inv=keys, out_keys_inv=keys
+        )
+        self.names = {key: "_".join(("key", *_parts(key))) for key in keys}
+        for key, name in self.names.items():
+            self.register_buffer(f"{name}_mean", stats[key].mean.clone())
+            self.register_buffer(f"{name}_std", stats[key].std.clone())
+
+    def normalize(self, key: NestedKey, x: Tensor) -> Tensor:
+        """``(x - mean) / std`` in float64, returned in the dtype of ``x``."""
+        mean, std = self._constants(key)
+        return ((x.double() - mean) / std).to(x.dtype)
+
+    def denormalize(self, key: NestedKey, x: Tensor) -> Tensor:
+        """``mean + std * x`` in float64, returned in the dtype of ``x``."""
+        mean, std = self._constants(key)
+        return (mean + std * x.double()).to(x.dtype)
+
+    def _constants(self, key: NestedKey) -> tuple[Tensor, Tensor]:
+        name = self.names[key]
+        return self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for key in self.in_keys:
+            x = next_tensordict.get(key, None)
+            if x is not None:
+                next_tensordict.set(key, self.normalize(key, x))
+        return next_tensordict
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        return self._call(tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.parent is not None:
+            return tensordict
+        for key in self.in_keys:
+            x = tensordict.get(key, None)
+            if x is not None:
+                tensordict.set(key, self.denormalize(key, x))
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        return observation_spec
+
+
+def _parts(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)  # pyright: ignore

@@ -1,0 +1,145 @@
+"""The robot's state in its own frame: where it stands and faces does not matter.
+
+NeRD section 3.3. Dynamics do not depend on horizontal position and heading, so they are
+not features; nor is any other coordinate that `Scene.symmetries` found to be ignored.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.geometry.frames import rotate_inverse
+from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, matrix_from_quat
+from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms.base import FeatureTransform
+
+LIMIT_STEPS = 1.5  # a limit is seen this many control steps ahead, at top speed
+FADE = 0.25  # share of the margin over which a gated velocity fades in
+
+
+class RobotCentric(FeatureTransform):
+    """Base velocity and gravity in B_t, joint features, joint torques.
+
+    | out key | what | width |
+    |---|---|---|
+    | ``robot_state`` | floating base: linear velocity, angular velocity, unit gravity in B_t | 9 |
+    | | unlimited hinge: sin, cos | 2 |
+    | | other hinge, slide: position, unless the dynamics ignore it | 1 |
+    | | ball: first two columns of its rotation matrix | 6 |
+    | | limited joint: gaps to both limits, minus the margin, at most 0 | 2 |
+    | | velocity of every dof; one that the free dynamics ignore only near a limit | 1 |
+    | ``robot_torque`` | ``("next", "joint_torque")``, where the tensordict holds it | actuated dofs |
+
+    Args:
+        scene: the robot.
+
+    Examples:
+        >>> transform = RobotCentric(load_scene("cartpole"))
+        >>> state = TensorDict(qpos=torch.zeros(3, 2).double(), qvel=torch.zeros(3, 2).double())
+        >>> transform(state)["robot_state"].shape
+        torch.Size([3, 6])
+    """
+
+    why_no_inverse = "position and heading are not among its features"
+
+    def __init__(self, scene: Scene) -> None:
+        joints = _JointFeatures.from_scene(scene)
+        state_size = joints.size + 9 * scene.base.is_floating
+        sizes = {ROBOT_STATE: state_size, ROBOT_TORQUE: len(scene.actuated)}
+        super().__init__([QPOS, QVEL], {k: n for k, n in sizes.items() if n})
+        self.base = scene.base
+        self.joints = joints
+        self.down = -1.0 if scene.model.opt.gravity[2] <= 0.0 else 1.0
+
+    def state_features(self, qpos: Tensor, qvel: Tensor) -> Tensor:
+        """``robot_state`` in the dtype of the inputs, ``(*batch, D)``."""
+        parts = self.joints(qpos, qvel)
+        if self.base.is_floating:
+            q, v = self.base.qpos_address, self.base.dof_address
+            quat, down = qpos[..., q + 3 : q + 7], torch.zeros_like(qvel[..., :3])
+            down[..., 2] = self.down
+            linear = rotate_inverse(quat, qvel[..., v : v + 3])
+            angular = qvel[..., v + 3 : v + 6]
+            parts = [linear, angular, rotate_inverse(quat, down), *parts]
+        return torch.cat(parts, -1)
+
+    def _features(self, tensordict: TensorDictBase) -> dict:
+        state = self.state_features(tensordict[QPOS], tensordict[QVEL])
+        features = {ROBOT_STATE: state}
+        torque = tensordict.get(JOINT_TORQUE, None)
+        if torque is not None and ROBOT_TORQUE in self.sizes:
+            features[ROBOT_TORQUE] = torque
+        return features
+
+    def _observed_sizes(self) -> dict:
+        return {ROBOT_STATE: self.sizes[ROBOT_STATE]}
+
+
+@dataclass(frozen=True)
+class _JointFeatures:
+    """Addresses of the joints by the kind of feature they give."""
+
+    angles: list[int]  # qpos of unlimited hinges
+    positions: list[int]  # qpos that enter as they are
+    balls: list[int]  # qpos of ball joints' quaternions
+    velocities: list[int]  # dofs whose velocity enters as it is
+    limited: list[int]  # qpos of limited joints
+    limits: list[tuple[float, float, float]]  # low, high, margin of each
+    gated: list[tuple[int, int]]  # (index into limited, dof): velocity near a limit
+
+    @classmethod
+    def from_scene(cls, scene: Scene) -> "_JointFeatures":
+        found = cls([], [], [], [], [], [], [])
+        model, ignored = scene.model, scene.symmetries
+        speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
+        speed = speed.abs().amax(0)
+        for joint in range(model.njnt):
+            kind, is_limited = int(model.jnt_type[joint]), bool(model.jnt_limited[joint])
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            if kind == FREE:
+                continue
+            if kind == BALL:
+                found.balls.append(q)
+                found.velocities.extend((v, v + 1, v + 2))
+                continue
+            if q not in ignored.positions:
+                is_angle = kind == HINGE and not is_limited
+                (found.angles if is_angle else found.positions).append(q)
+            if v not in ignored.velocities:
+                found.velocities.append(v)
+            if is_limited:
+                if v in ignored.velocities:
+                    found.gated.append((len(found.limited), v))
+                low, high = (float(x) for x in model.jnt_range[joint])
+                margin = LIMIT_STEPS * scene.control_step * float(speed[v])
+                found.limited.append(q)
+                found.limits.append((low, high, margin))
+        return found
+
+    @property
+    def size(self) -> int:
+        configuration = 2 * len(self.angles) + len(self.positions) + 6 * len(self.balls)
+        limits = 2 * len(self.limited) + len(self.gated)
+        return configuration + len(self.velocities) + limits
+
+    def __call__(self, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
+        angles = qpos[..., self.angles]
+        parts = [angles.sin(), angles.cos(), qpos[..., self.positions]]
+        for q in self.balls:
+            columns = matrix_from_quat(qpos[..., q : q + 4])[..., :2]
+            parts.append(columns.flatten(-2))
+        parts.append(qvel[..., self.velocities])
+        if self.limited:
+            low, high, margin = qpos.new_tensor(self.limits).unbind(-1)
+            position = qpos[..., self.limited]
+            below = (position - low - margin).clamp_max(0.0)
+            above = (high - position - margin).clamp_max(0.0)
+            parts += [below, above]
+            if self.gated:
+                rows, dofs = map(list, zip(*self.gated, strict=True))
+                depth = -torch.minimum(below, above) / (FADE * margin)
+                parts.append(qvel[..., dofs] * depth[..., rows].clamp(0.0, 1.0))
+        return parts

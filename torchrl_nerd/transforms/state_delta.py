@@ -1,0 +1,141 @@
+"""What the network predicts: the change of the state over one control step, in B_t.
+
+NeRD section 3.3 predicts s_{t+1} - s_t. Here a position's change is taken against the
+trapezoid rule, dt (v_t + v_{t+1}) / 2, so that only a small smooth residual is left, and
+rotations live in the tangent space: 2 nv numbers, no quaternion.
+"""
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Transform
+
+from torchrl_nerd.geometry.frames import quat_exp, rotate, rotate_inverse
+from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, STATE_DELTA
+from torchrl_nerd.scenes.scene import Scene
+
+
+class StateDelta(Transform):
+    """Velocity change and trapezoid residual of the position, ``(*batch, 2 nv)``.
+
+    With x' the next value of x, h the control step, R_t the rotation of the base and Q
+    that of a free or ball joint, whose angular velocity w MuJoCo writes in moving axes:
+
+    | | velocity | position |
+    |---|---|---|
+    | hinge, slide | v' - v | q' - q - h/2 (v + v') |
+    | free, linear | R_t^T (v' - v) | R_t^T (p' - p - h/2 (v + v')) |
+    | free and ball, angular | Q^T Q' w' - w | log(Q^T Q') - h/2 (w + Q^T Q' w') |
+
+    In an env it is written under ``next`` and is zero at a reset. The inverse integrates:
+    from ``qpos``, ``qvel`` and ``state_delta`` it writes the next ``qpos`` and ``qvel``.
+
+    Args:
+        scene: the robot.
+
+    Examples:
+        >>> transform = StateDelta(load_scene("cartpole"))
+        >>> state = torch.zeros(3, 2).double()
+        >>> transform.delta(state, state, state, state + 1.0)[0]
+        tensor([ 1.0000,  1.0000, -0.0083, -0.0083], dtype=torch.float64)
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(
+            in_keys=[QPOS, QVEL, NEXT_QPOS, NEXT_QVEL], out_keys=[STATE_DELTA]
+        )
+        self.layout = scene.layout
+        self.base = scene.base
+        self.step_size = scene.control_step
+
+    @property
+    def size(self) -> int:
+        """Width of ``state_delta``."""
+        return 2 * self.layout.nv
+
+    def delta(
+        self, qpos: Tensor, qvel: Tensor, next_qpos: Tensor, next_qvel: Tensor
+    ) -> Tensor:
+        """The change from one state to the next, ``(*batch, 2 nv)``."""
+        moved, after = differentiate_pos(self.layout, qpos, next_qpos), next_qvel
+        for _, v in self.layout.rotations:
+            turn = quat_exp(moved[..., v : v + 3])
+            after = _replace(after, v, rotate(turn, after[..., v : v + 3]))
+        residual = moved - 0.5 * self.step_size * (qvel + after)
+        change = after - qvel
+        if self.base.is_floating:
+            change, residual = (self._turn(qpos, x, rotate_inverse) for x in (change, residual))
+        return torch.cat((change, residual), -1)
+
+    def integrate(
+        self, qpos: Tensor, qvel: Tensor, delta: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The next ``qpos`` and ``qvel``: exact inverse of `delta`."""
+        change, residual = delta.split(self.layout.nv, -1)
+        if self.base.is_floating:
+            change, residual = (self._turn(qpos, x, rotate) for x in (change, residual))
+        after = qvel + change
+        moved = 0.5 * self.step_size * (qvel + after) + residual
+        for _, v in self.layout.rotations:
+            turn = quat_exp(moved[..., v : v + 3])
+            after = _replace(after, v, rotate_inverse(turn, after[..., v : v + 3]))
+        return integrate_pos(self.layout, qpos, moved), after
+
+    def _turn(
+        self, qpos: Tensor, x: Tensor, turn: Callable[[Tensor, Tensor], Tensor]
+    ) -> Tensor:
+        """The floating base's linear part of a tangent vector, in other axes."""
+        q, v = self.base.qpos_address + 3, self.base.dof_address
+        return _replace(x, v, turn(qpos[..., q : q + 4], x[..., v : v + 3]))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        missing = [key for key in self.in_keys if key not in tensordict.keys(True)]
+        if missing:
+            found = sorted(map(str, tensordict.keys(True, True)))
+            raise KeyError(f"StateDelta needs {missing}, got a tensordict with {found}")
+        delta = self.delta(*(tensordict[key] for key in self.in_keys))
+        return tensordict.set(STATE_DELTA, delta)
+
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
+        delta = self.delta(
+            tensordict[QPOS],
+            tensordict[QVEL],
+            next_tensordict[QPOS],
+            next_tensordict[QVEL],
+        )
+        return next_tensordict.set(STATE_DELTA, delta)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        qvel = tensordict_reset[QVEL]
+        return tensordict_reset.set(STATE_DELTA, torch.cat((0.0 * qvel, 0.0 * qvel), -1))
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.parent is None and STATE_DELTA in tensordict.keys():
+            missing = [key for key in (QPOS, QVEL) if key not in tensordict.keys()]
+            if missing:
+                raise KeyError(f"the inverse of StateDelta needs {missing}: a start state")
+            state = (tensordict[QPOS], tensordict[QVEL], tensordict[STATE_DELTA])
+            next_qpos, next_qvel = self.integrate(*state)
+            tensordict.set(NEXT_QPOS, next_qpos)
+            tensordict.set(NEXT_QVEL, next_qvel)
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        spec = observation_spec.clone()
+        spec[STATE_DELTA] = Unbounded(
+            (*spec.shape, self.size), dtype=torch.float64, device=spec.device
+        )
+        return spec
+
+
+def _replace(x: Tensor, start: int, value: Tensor) -> Tensor:
+    """``x`` with three entries of its last dimension replaced; out of place."""
+    return torch.cat((x[..., :start], value, x[..., start + 3 :]), -1)
