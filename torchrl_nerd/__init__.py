@@ -1,0 +1,16 @@
+"""Neural Robot Dynamics as composable TorchRL parts."""
+
+__version__ = "0.1.0"
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.envs import GroundTruthEnv, NeRDEnv, make_env
+from torchrl_nerd.scenes import Scene, load_scene
+
+__all__ = [
+    "GroundTruthEnv",
+    "NeRDEnv",
+    "Scene",
+    "from_pretrained",
+    "load_scene",
+    "make_env",
+]

@@ -1,0 +1,8 @@
+"""Physics behind one call: true (MuJoCo, dm_control) and learned (NeRD)."""
+
+from torchrl_nerd.dynamics.base import Dynamics
+from torchrl_nerd.dynamics.dm_control import DMControlDynamics
+from torchrl_nerd.dynamics.mujoco import MujocoDynamics
+from torchrl_nerd.dynamics.nerd import NeRDDynamics
+
+__all__ = ["DMControlDynamics", "Dynamics", "MujocoDynamics", "NeRDDynamics"]

@@ -1,0 +1,182 @@
+"""Checkpoints: a folder with ``model.safetensors`` and ``card.json``; nothing is pickled.
+
+The card says which physics the weights were trained on. Loading compares it with the
+local scene and warns, in one sentence, of what differs.
+"""
+
+import platform
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from torchrl_nerd import __version__
+from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
+from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
+from torchrl_nerd.modules.transformer import TransformerConfig
+from torchrl_nerd.scenes import SCENES, Scene, load_scene
+
+WEIGHTS, CARD = "model.safetensors", "card.json"
+PRETRAINED = Path(__file__).parent / "pretrained"
+LFS_POINTER = b"version https://git-lfs"
+KINDS: dict[str, type] = {
+    "transformer": TransformerConfig,
+    "mlp": MLPConfig,
+    "gru": GRUConfig,
+}
+
+
+def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, Any]:
+    """What a checkpoint says of itself.
+
+    Args:
+        model: the weights' owner.
+        training: how they were made: configuration, data, measured error curve.
+    """
+    scene, config = model.scene, model.config
+    kind = next(name for name, cls in KINDS.items() if type(config) is cls)
+    ranges = {k: v for k, v in asdict(scene.sampling).items() if k != "ground"}
+    return {
+        "format": 1,
+        "scene": scene.name,
+        "scene_hash": scene.hash,
+        "control_step": scene.control_step,
+        "network": {"kind": kind, **asdict(config)},
+        "training_ranges": ranges,
+        "versions": {
+            "torchrl_nerd": __version__,
+            "mujoco": mujoco.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+        "licence": "MIT",
+        **(training or {}),
+    }
+
+
+def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
+    """Write weights, then card, each whole or not at all."""
+    folder = writable_folder(folder)
+    tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
+    write_atomically(folder / WEIGHTS, lambda aside: save_file(tensors, aside))
+    write_json(folder / CARD, card)
+    return folder
+
+
+def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
+    """A model from a folder that `save_checkpoint` wrote.
+
+    Args:
+        folder: where.
+        scene: the robot to use it for; the card's own scene where not given.
+
+    Raises:
+        ValueError: in one sentence, a missing, truncated or foreign file, a wrong shape,
+            or weights of another robot.
+    """
+    if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
+        raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint")
+    card = read_json(folder / CARD)
+    scene = scene or _scene_of(card, folder)
+    _compare(card, scene, folder)
+    model = NeRD(scene, _network_config(card, folder))
+    tensors = _read_tensors(folder / WEIGHTS)
+    expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in tensors.items()}
+    if expected != found:
+        keys = sorted(expected.keys() | found.keys())
+        key = next(k for k in keys if expected.get(k) != found.get(k))
+        raise ValueError(
+            f"weights in {folder} do not fit scene '{scene.name}': expected '{key}' of "
+            f"shape {expected.get(key)}, got {found.get(key)}"
+        )
+    if not all(value.isfinite().all() for value in tensors.values()):
+        raise ValueError(f"expected finite weights in {folder}, got NaN or infinity")
+    model.load_state_dict(tensors)
+    return model.eval()
+
+
+def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> NeRD:
+    """A shipped model by the name of its scene, or one of your own by its folder.
+
+    Raises:
+        ValueError: neither a shipped model nor a folder with a checkpoint.
+    """
+    shipped = PRETRAINED / str(name_or_folder)
+    if str(name_or_folder) in shipped_models():
+        return load_checkpoint(shipped, scene)
+    if Path(name_or_folder).is_dir():
+        return load_checkpoint(Path(name_or_folder), scene)
+    names = ", ".join(shipped_models())
+    raise ValueError(
+        f"expected a shipped model ({names}) or a checkpoint folder, got '{name_or_folder}'"
+    )
+
+
+def shipped_models() -> list[str]:
+    """Names of the models that come with the package."""
+    return sorted(path.parent.name for path in PRETRAINED.glob(f"*/{CARD}"))
+
+
+def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
+    name = card.get("scene")
+    if name not in SCENES:
+        raise ValueError(f"the card in {folder} names an unknown scene: {name!r}")
+    return load_scene(str(name))
+
+
+def _network_config(card: dict[str, Any], folder: Path) -> NetworkConfig:
+    network = dict(card.get("network") or {})
+    kind = network.pop("kind", None)
+    try:
+        return KINDS[str(kind)](**network)
+    except (KeyError, TypeError):
+        raise ValueError(
+            f"the card in {folder} has a network this version cannot build: "
+            f"{card.get('network')!r}"
+        ) from None
+
+
+def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
+    """Refuse another robot; warn of other physics or another MuJoCo."""
+    if card.get("scene") != scene.name:
+        raise ValueError(
+            f"the checkpoint in {folder} is for robot '{card.get('scene')}', "
+            f"expected '{scene.name}'"
+        )
+    local = {
+        "control_step": scene.control_step,
+        "scene_hash": scene.hash,
+        "mujoco": mujoco.__version__.rsplit(".", 1)[0],
+    }
+    version = str((card.get("versions") or {}).get("mujoco"))
+    stored = {**card, "mujoco": version.rsplit(".", 1)[0]}
+    differing = [
+        f"{key} is {stored.get(key)} there and {value} here"
+        for key, value in local.items()
+        if stored.get(key) != value
+    ]
+    if differing:
+        warnings.warn(
+            f"the checkpoint in {folder} was made for other physics: "
+            + ", ".join(differing),
+            stacklevel=3,
+        )
+
+
+def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    with open(path, "rb") as file:
+        if file.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise ValueError(
+                f"{path} is a git-lfs pointer, not weights: run `git lfs pull`"
+            )
+    try:
+        return load_file(path)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None

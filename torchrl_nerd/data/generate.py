@@ -1,0 +1,167 @@
+"""Training data: random trajectories of the true dynamics, over all cores, on disk.
+
+NeRD appendix A.2: random initial states and torques, no task. Stored as a memory-mapped
+TensorDict ``[trajectories, steps]`` in TorchRL's layout (``qpos``, ``qvel`` and, where the
+ground varies, ``terrain``; under ``next`` the same state keys and ``joint_torque``), with a
+JSON card beside it.
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import mujoco
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator
+from tqdm import tqdm
+
+from torchrl_nerd import __version__
+from torchrl_nerd.dynamics.mujoco import MujocoDynamics
+from torchrl_nerd.files import read_json, writable_folder, write_json
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.sampling import sample_torque
+
+CHUNK = 2048  # trajectories stepped together; also what a kill can lose
+LARGEST = 1e5  # reference code: a trajectory beyond this is broken
+CARD = "data.json"
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What to generate.
+
+    | field | meaning |
+    |---|---|
+    | ``trajectories`` | how many are drawn; broken ones are dropped and counted |
+    | ``steps`` | control steps of each |
+    | ``seed`` | every chunk of trajectories has a stream of its own |
+    """
+
+    trajectories: int = 10_000
+    steps: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in (("trajectories", self.trajectories), ("steps", self.steps)):
+            if value < 1:
+                raise ValueError(f"expected {name} of at least 1, got {value}")
+
+
+def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> TensorDict:
+    """Trajectories ``[rows, steps]`` from the scene's ranges, broken ones included."""
+    dynamics = MujocoDynamics(scene)
+    start, scale = scene.sample_initial(rows, generator)
+    terrain = start.pop(TERRAIN, None)
+    state = TensorDict(start, batch_size=[rows])
+    dynamics.reset(state)
+    transitions: list[TensorDictBase] = []
+    for _ in range(steps):
+        torque = sample_torque(scene.sampling, scale, generator)
+        next_state = dynamics.step(state, torque, terrain)
+        following = next_state.clone(False).set("joint_torque", torque)
+        transitions.append(state.clone(False).set("next", following))
+        state = next_state
+    data = torch.stack(transitions, 1)
+    if terrain is not None:
+        data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
+    return data  # pyright: ignore
+
+
+def is_sound(data: TensorDictBase) -> torch.Tensor:
+    """Which trajectories ``[rows, steps]`` stay finite and within bounds, ``(rows,)``."""
+    state = torch.cat((data["next", QPOS], data["next", QVEL]), -1)
+    return (state.abs() < LARGEST).all(-1).all(-1)
+
+
+def generate(scene: Scene, config: DataConfig, folder: Path, quiet: bool = False) -> Path:
+    """Write a data set, or go on with one that was cut short.
+
+    Args:
+        scene: the robot.
+        config: what to draw.
+        folder: where; a finished data set of the same card is left as it is.
+        quiet: no progress bar.
+
+    Raises:
+        ValueError: the folder cannot be written or holds data of another card.
+    """
+    card = _open_card(scene, config, writable_folder(folder))
+    store = _open_store(scene, config, folder)
+    chunks = -(-config.trajectories // CHUNK)
+    bar = tqdm(
+        total=config.trajectories * config.steps,
+        initial=min(card["chunks_done"] * CHUNK, config.trajectories) * config.steps,
+        unit=" transitions",
+        unit_scale=True,
+        desc=f"data {scene.name}",
+        disable=quiet,
+    )
+    for chunk in range(card["chunks_done"], chunks):
+        rows = min(CHUNK, config.trajectories - chunk * CHUNK)
+        generator = Generator().manual_seed((config.seed << 24) + chunk)
+        data = simulate(scene, rows, config.steps, generator)
+        sound = is_sound(data)
+        kept, first = data[sound], card["trajectories"]
+        store[first : first + len(kept)] = kept
+        card["trajectories"] += len(kept)
+        card["dropped"] += int((~sound).sum())
+        card["chunks_done"] = chunk + 1
+        write_json(folder / CARD, card)
+        bar.update(rows * config.steps)
+    bar.close()
+    return folder
+
+
+def load_data(scene: Scene, folder: Path) -> TensorDict:
+    """A finished data set, memory-mapped, ``[trajectories, steps]``.
+
+    Raises:
+        ValueError: nothing there, not finished, or of another scene.
+    """
+    if not (folder / CARD).is_file():
+        raise ValueError(f"expected a data set in {folder}, found no {CARD}")
+    card = read_json(folder / CARD)
+    if card.get("scene_hash") != scene.hash:
+        raise ValueError(
+            f"the data in {folder} are of scene '{card.get('scene')}' "
+            f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
+        )
+    if card["chunks_done"] * CHUNK < card["config"]["trajectories"]:
+        raise ValueError(f"the data in {folder} are not finished: run the command again")
+    return TensorDict.load_memmap(folder)[: card["trajectories"]]
+
+
+def _open_card(scene: Scene, config: DataConfig, folder: Path) -> dict:
+    fresh = {
+        "scene": scene.name,
+        "scene_hash": scene.hash,
+        "config": asdict(config),
+        "ranges": {k: v for k, v in asdict(scene.sampling).items() if k != "ground"},
+        "mujoco": mujoco.__version__,
+        "torchrl_nerd": __version__,
+        "trajectories": 0,
+        "dropped": 0,
+        "chunks_done": 0,
+    }
+    path = folder / CARD
+    if not path.exists():
+        return fresh
+    card = read_json(path)
+    for key in ("scene_hash", "config"):
+        if card.get(key) != fresh[key]:
+            raise ValueError(
+                f"{folder} already holds data with {key} {card.get(key)}, asked for "
+                f"{fresh[key]}: choose another folder"
+            )
+    return card
+
+
+def _open_store(scene: Scene, config: DataConfig, folder: Path) -> TensorDictBase:
+    """The memory-mapped tensordict, created where it is not there yet."""
+    if (folder / "meta.json").exists():
+        return TensorDict.load_memmap(folder)
+    example = simulate(scene, 1, 1, Generator().manual_seed(0))
+    shape = [config.trajectories, config.steps]
+    return example.expand(*shape).memmap_like(folder)
+

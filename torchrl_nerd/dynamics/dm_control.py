@@ -1,0 +1,114 @@
+"""Ground truth on dm_control: one `Physics` per row, stepped as dm_control steps it."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.dynamics.mujoco import torque_model
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from dm_control.mujoco import Physics
+
+
+def make_physics(scene: Scene) -> "Physics":
+    """A dm_control `Physics` of the scene, driven by joint torques.
+
+    dm_control is imported here, on first use: it looks for a display and says so.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from dm_control.mujoco import Physics, wrapper
+    return Physics.from_model(wrapper.MjModel(torque_model(scene)))
+
+
+class DMControlDynamics:
+    """The same rows on dm_control `Physics` objects, bit for bit what it would give.
+
+    A row whose state is the one its `Physics` was left in goes on from there, as an
+    episode of dm_control does; any other state is written in first. For many rows
+    `MujocoDynamics` is faster: here every row costs a Python call.
+
+    Args:
+        scene: robot, ground and substeps.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._rows: "list[Physics]" = []
+
+    def __getstate__(self) -> dict:
+        """A copy in another process builds its own `Physics` objects."""
+        return {"scene": self.scene, "_rows": []}
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Return the `Physics` of ``rows`` to the state a new one has."""
+        count = state[QPOS].shape[0]
+        if len(self._rows) != count:
+            self._rows = [make_physics(self.scene) for _ in range(count)]
+            return
+        for row, physics in enumerate(self._rows):
+            if rows is None or rows[row]:
+                physics.reset()
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`. Rows on which MuJoCo gave up come back as NaN."""
+        check_step(self.scene, state, joint_torque, terrain)
+        if len(self._rows) != len(joint_torque):
+            self.reset(state)
+        qpos, qvel, force = (
+            x.double().cpu().numpy() for x in (state[QPOS], state[QVEL], joint_torque)
+        )
+        pose = None
+        if terrain is not None and self.scene.terrain is not None:
+            pose = self.scene.terrain.mocap_pose(terrain.double().cpu()).numpy()
+        next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
+        for row, physics in enumerate(self._rows):
+            self._place(physics, qpos[row], qvel[row], None if pose is None else pose[row])
+            physics.data.qfrc_applied[self.scene.actuated] = force[row]
+            with physics.suppress_physics_errors():
+                physics.step(self.scene.substeps)
+            is_broken = physics.data.warning.number.any()
+            next_qpos[row] = np.nan if is_broken else physics.data.qpos
+            next_qvel[row] = np.nan if is_broken else physics.data.qvel
+        device = state[QPOS].device
+        return TensorDict(
+            {
+                QPOS: torch.from_numpy(next_qpos).to(device),
+                QVEL: torch.from_numpy(next_qvel).to(device),
+            },
+            batch_size=[len(qpos)],
+            device=state.device,
+        )
+
+    def _place(
+        self,
+        physics: "Physics",
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        pose: np.ndarray | None,
+    ) -> None:
+        """Put a row where it should be, unless it is there already."""
+        data, mocap = physics.data, 0
+        is_there = np.array_equal(data.qpos, qpos) and np.array_equal(data.qvel, qvel)
+        if pose is not None:
+            mocap = self.scene.terrain.mocap if self.scene.terrain else 0
+            ground = np.concatenate((data.mocap_pos[mocap], data.mocap_quat[mocap]))
+            is_there = is_there and np.array_equal(ground, pose)
+        if is_there:
+            return
+        with physics.reset_context():
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            if pose is not None:
+                data.mocap_pos[mocap], data.mocap_quat[mocap] = pose[:3], pose[3:]

@@ -1,0 +1,104 @@
+"""The learned stand-in for the solver; everything round it is shared with the truth."""
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.nerd import Memory, NeRD
+from torchrl_nerd.modules.window import WindowNetwork
+
+Inference = Literal["streaming", "window"]
+
+
+class NeRDDynamics:
+    """A `NeRD` model with the history of every row.
+
+    The history is private: a ring of keys and values (streaming) or of tokens (window),
+    never a key of a tensordict, or every collector would store it.
+
+    Args:
+        model: weights, features and statistics.
+        inference: ``"streaming"`` computes one token a step; ``"window"`` recomputes the
+            last ``window`` tokens, as the paper does.
+        window: tokens recomputed in window mode (paper: h = 10).
+        compile: run through `torch.compile`; without a compiler, eager with a warning.
+        differentiable: record gradients through the step.
+
+    Raises:
+        ValueError: an unknown mode of inference, or a window below 1.
+    """
+
+    def __init__(
+        self,
+        model: NeRD,
+        inference: Inference = "streaming",
+        window: int = 10,
+        compile: bool = False,
+        differentiable: bool = False,
+    ) -> None:
+        if inference not in ("streaming", "window"):
+            raise ValueError(
+                f"expected inference 'streaming' or 'window', got '{inference}'"
+            )
+        if window < 1:
+            raise ValueError(f"expected a window of at least 1 token, got {window}")
+        self.scene = model.scene
+        self.model = model.eval()
+        self.compile = compile
+        self.differentiable = differentiable
+        self.network = model.network
+        if inference == "window":
+            self.network = WindowNetwork(model.network, window, model.tokens.size)
+        self._memory: Memory | None = None
+        self._compiled = None
+
+    def __getstate__(self) -> dict:
+        """Compiled code does not travel: a copy in another process compiles its own."""
+        return {**self.__dict__, "_compiled": None}
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Empty the history of ``rows`` and leave the others bitwise as they are."""
+        count = state[QPOS].shape[0]
+        if rows is None or self._memory is None:
+            self._memory = self.network.empty_memory(count)
+        elif rows.any():
+            self._memory.clear(rows.reshape(count))
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`."""
+        check_step(self.scene, state, joint_torque, terrain)
+        qpos, qvel = state[QPOS], state[QVEL]
+        if self._memory is None:
+            self._memory = self.network.empty_memory(len(qpos))
+        predict = self._compiled or (self._compile() if self.compile else self._predict)
+        with torch.set_grad_enabled(self.differentiable):
+            next_qpos, next_qvel = predict(
+                qpos, qvel, joint_torque.to(qpos), terrain, self._memory
+            )
+        return TensorDict(
+            {QPOS: next_qpos, QVEL: next_qvel},
+            batch_size=state.batch_size,
+            device=state.device,
+        )
+
+    def _predict(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        torque: Tensor,
+        terrain: Tensor | None,
+        memory: Memory,
+    ) -> tuple[Tensor, Tensor]:
+        """Next ``qpos`` and ``qvel``; advances ``memory``."""
+        token = self.model.encode(qpos, qvel, torque, terrain)
+        output = self.network.step(token, memory)
+        return self.model.decode(qpos, qvel, output)

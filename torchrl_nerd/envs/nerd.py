@@ -1,0 +1,46 @@
+"""A task in learned dynamics."""
+
+from pathlib import Path
+
+import torch
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.dynamics.nerd import Inference, NeRDDynamics
+from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.tasks import Task, make_task
+
+
+class NeRDEnv(SceneEnv):
+    """A `SceneEnv` on `NeRDDynamics`.
+
+    Args:
+        task: id of a registered task, or a task.
+        model: a model, a checkpoint folder, or None for the one that is shipped.
+        num_envs: rows.
+        seed: of the resets.
+        device: where the model and all tensors live.
+        inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
+        compile: run through `torch.compile`.
+
+    Examples:
+        >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
+        >>> env.rollout(5, break_when_any_done=False)["next", "qpos"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        model: NeRD | str | Path | None = None,
+        num_envs: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        inference: Inference = "streaming",
+        compile: bool = False,
+    ) -> None:
+        task = make_task(task) if isinstance(task, str) else task
+        if not isinstance(model, NeRD):
+            model = from_pretrained(model or task.scene.name, task.scene)
+        dynamics = NeRDDynamics(model.to(device), inference=inference, compile=compile)
+        super().__init__(task, dynamics, num_envs, seed, device)

@@ -1,0 +1,150 @@
+"""Open-loop error: learned against true dynamics from the same start, never corrected.
+
+Protocol of the paper's Fig. 3 and appendix C.2: starts from the task's reset
+distribution, the same torques in both (none: passive), errors of every step averaged over
+time and trajectories.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics.base import Dynamics
+from torchrl_nerd.geometry.frames import orientation_error, wrap_angle
+from torchrl_nerd.keys import QPOS, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tasks import Task
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Error of one quantity over a horizon.
+
+    | field | meaning |
+    |---|---|
+    | ``unit`` | m or rad |
+    | ``mean`` | over all steps and trajectories |
+    | ``interval`` | half width of the 95% interval of the mean, over trajectories |
+    | ``final`` | mean over trajectories at the last step |
+    | ``p95`` | 95th percentile over trajectories of their mean over time |
+    """
+
+    unit: str
+    mean: float
+    interval: float
+    final: float
+    p95: float
+
+
+def initial_states(task: Task, rows: int, seed: int) -> TensorDict:
+    """Starts of the task's reset distribution, ``[rows]``, from a seed of their own."""
+    generator = Generator().manual_seed(seed)
+    u = torch.rand(rows, task.num_uniforms, dtype=torch.float64, generator=generator)
+    return TensorDict(task.initial_state(u), batch_size=[rows])
+
+
+def open_loop(
+    dynamics: Dynamics,
+    start: TensorDict,
+    steps: int,
+    joint_torque: Tensor | None = None,
+) -> Tensor:
+    """Positions after each step, ``(rows, steps, nq)``.
+
+    Args:
+        dynamics: learned or true.
+        start: ``qpos``, ``qvel`` and, where the ground varies, ``terrain``.
+        steps: how many.
+        joint_torque: ``(rows, steps, num_actuated)``; None for none (passive motion).
+    """
+    rows, terrain = start.batch_size[0], start.get(TERRAIN, None)
+    state = start.select(QPOS, "qvel")
+    idle = state[QPOS].new_zeros(rows, len(dynamics.scene.actuated))
+    dynamics.reset(state)
+    positions = []
+    for step in range(steps):
+        torque = idle if joint_torque is None else joint_torque[:, step]
+        state = dynamics.step(state, torque, terrain)
+        positions.append(state[QPOS])
+    return torch.stack(positions, 1)
+
+
+def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, Tensor]:
+    """Error of every quantity at every step, ``(rows, steps)``.
+
+    A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
+    over ``joints`` (rad); a fixed base gives one entry per joint, by name.
+    """
+    model, errors = scene.model, {}
+    if scene.base.is_floating:
+        q = scene.base.qpos_address
+        offset = truth[..., q : q + 3] - learned[..., q : q + 3]
+        errors["base_position"] = torch.linalg.vector_norm(offset, dim=-1)
+        quats = (x[..., q + 3 : q + 7] for x in (truth, learned))
+        errors["base_orientation"] = orientation_error(*quats)
+    joints = {}
+    for joint in range(model.njnt):
+        q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            continue
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            quats = (x[..., q : q + 4] for x in (truth, learned))
+            joints[model.joint(joint).name] = orientation_error(*quats)
+            continue
+        error = truth[..., q] - learned[..., q]
+        if kind == mujoco.mjtJoint.mjJNT_HINGE:
+            error = wrap_angle(error)
+        joints[model.joint(joint).name] = error.abs()
+    if scene.base.is_floating:
+        if joints:
+            errors["joints"] = torch.stack(list(joints.values())).mean(0)
+        return errors
+    return joints
+
+
+def unit_of(scene: Scene, quantity: str) -> str:
+    """m or rad."""
+    if quantity == "base_position":
+        return "m"
+    if quantity in ("base_orientation", "joints"):
+        return "rad"
+    is_slide = scene.model.joint(quantity).type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+    return "m" if is_slide else "rad"
+
+
+def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary]:
+    """Summary of each quantity of `position_errors`; non-finite errors stay visible."""
+    summaries = {}
+    for name, error in errors.items():
+        per_row = error.mean(1)
+        summaries[name] = ErrorSummary(
+            unit=unit_of(scene, name),
+            mean=float(per_row.mean()),
+            interval=float(1.96 * per_row.std() / len(per_row) ** 0.5),
+            final=float(error[:, -1].mean()),
+            p95=float(per_row.quantile(0.95)),
+        )
+    return summaries
+
+
+def passive_errors(
+    task: Task,
+    learned: Dynamics,
+    truth: Dynamics,
+    horizons: list[int],
+    rows: int,
+    seed: int,
+) -> dict[int, dict[str, ErrorSummary]]:
+    """Passive open-loop errors at every horizon, from one rollout of the longest."""
+    start = initial_states(task, rows, seed)
+    steps = max(horizons)
+    true_path = open_loop(truth, start, steps)
+    learned_path = open_loop(learned, start, steps)
+    errors = position_errors(task.scene, true_path, learned_path)
+    return {
+        horizon: summarize(task.scene, {k: e[:, :horizon] for k, e in errors.items()})
+        for horizon in horizons
+    }

@@ -1,0 +1,68 @@
+"""Files that are either whole or not there: written aside, flushed, renamed."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Replace ``path`` by what ``write(temporary path)`` leaves, durably.
+
+    A crash at any moment leaves the old file or the new one, never a part.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        write(aside)
+        with open(aside, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON object atomically."""
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_atomically(path, lambda aside: aside.write_text(text) and None)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        ValueError: the file holds something else, said in one sentence.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"expected JSON in {path}, got something else: {error}") from None
+    if not isinstance(content, dict):
+        kind = type(content).__name__
+        raise ValueError(f"expected a JSON object in {path}, got a {kind}")
+    return content
+
+
+def writable_folder(path: Path) -> Path:
+    """Create a folder, or say in one sentence why it cannot be written.
+
+    Raises:
+        ValueError: a file stands there, or permission is missing.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".probe.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(
+            f"expected a folder that can be written, got {path}: {error.strerror}"
+        ) from None
+    return path

@@ -1,0 +1,56 @@
+"""No goal: the double pendulum swings and hits the ground, to measure dynamics."""
+
+import torch
+from torch import Tensor
+
+from torchrl_nerd.geometry.frames import wrap_angle
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes.double_pendulum import GROUNDS, evaluation_ground
+from torchrl_nerd.tasks.task import State, Task
+
+MAX_START_SPEED = 2.0  # rad/s
+
+
+class DoublePendulumPassive(Task):
+    """Zero reward, never terminated; the protocol of the paper's appendix C.2.
+
+    Every row stands over one of the seven evaluation grounds, drawn at each reset, or
+    over the one that ``ground`` names.
+
+    Args:
+        ground: 0 (out of reach) to 6; None draws one per row.
+    """
+
+    scene_name = "double_pendulum"
+    horizon = 100
+    num_uniforms = 5
+    observation_size = 6
+    parameters = {TERRAIN: 4}
+
+    def __init__(self, ground: int | None = None) -> None:
+        numbers = range(len(GROUNDS)) if ground is None else [ground]
+        self.planes = torch.stack([evaluation_ground(number) for number in numbers])
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """Joint 1 in +-pi; joint 2 such that the second link points up; +-2 rad/s."""
+        first = torch.pi * (2.0 * u[..., 0] - 1.0)
+        second = wrap_angle(torch.pi * u[..., 1] - first)
+        speed = MAX_START_SPEED * (2.0 * u[..., 2:4] - 1.0)
+        number = (u[..., 4] * len(self.planes)).long().clamp_max(len(self.planes) - 1)
+        return {
+            QPOS: torch.stack((first, second), -1),
+            QVEL: speed,
+            TERRAIN: self.planes.to(u.device)[number],
+        }
+
+    def observation(self, state: State) -> Tensor:
+        """Sines, cosines and velocities of both joints."""
+        return torch.cat((state[QPOS].sin(), state[QPOS].cos(), state[QVEL]), -1)
+
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Zero."""
+        return torch.zeros_like(next_state[QVEL][..., 0])
+
+    def terminated(self, next_state: State) -> Tensor:
+        """Never."""
+        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)

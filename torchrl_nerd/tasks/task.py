@@ -1,0 +1,53 @@
+"""A task: where episodes start, what the policy sees, what it earns, when it ends."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+from torch import Tensor
+
+from torchrl_nerd.scenes import Scene, load_scene
+
+State = Mapping[str, Tensor]
+"""``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's row parameters; a
+TensorDict is one."""
+
+
+class Task(ABC):
+    """Pure functions of the state; the same ones for learned and true dynamics.
+
+    | class attribute | meaning |
+    |---|---|
+    | ``scene_name`` | the robot it is for |
+    | ``horizon`` | control steps after which an episode is truncated |
+    | ``num_uniforms`` | random numbers that one reset takes |
+    | ``observation_size`` | width of the observation |
+    | ``parameters`` | row parameters drawn at a reset and kept, key -> width |
+    """
+
+    scene_name: ClassVar[str]
+    horizon: ClassVar[int]
+    num_uniforms: ClassVar[int]
+    observation_size: ClassVar[int]
+    parameters: ClassVar[dict[str, int]] = {}
+
+    @property
+    def scene(self) -> Scene:
+        """The robot and its ground."""
+        return load_scene(self.scene_name)
+
+    @abstractmethod
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """Initial states, float64, from uniform numbers ``(*batch, num_uniforms)``."""
+
+    @abstractmethod
+    def observation(self, state: State) -> Tensor:
+        """What the policy sees, ``(*batch, observation_size)``, float64."""
+
+    @abstractmethod
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """What the step earned, ``(*batch,)``, float64."""
+
+    @abstractmethod
+    def terminated(self, next_state: State) -> Tensor:
+        """Where the episode has failed or succeeded, bool ``(*batch,)``."""
