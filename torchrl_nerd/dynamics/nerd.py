@@ -1,10 +1,14 @@
 """The learned stand-in for the solver; everything round it is shared with the truth."""
 
+import warnings
+from collections.abc import Callable
 from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch._dynamo.exc import BackendCompilerFailed
+from torch._inductor.exc import InductorError
 
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
@@ -54,7 +58,7 @@ class NeRDDynamics:
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.tokens.size)
         self._memory: Memory | None = None
-        self._compiled = None
+        self._compiled: Callable | None = None
 
     def __getstate__(self) -> dict:
         """Compiled code does not travel: a copy in another process compiles its own."""
@@ -79,7 +83,7 @@ class NeRDDynamics:
         qpos, qvel = state[QPOS], state[QVEL]
         if self._memory is None:
             self._memory = self.network.empty_memory(len(qpos))
-        predict = self._compiled or (self._compile() if self.compile else self._predict)
+        predict = self._run_compiled if self.compile else self._predict
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel = predict(
                 qpos, qvel, joint_torque.to(qpos), terrain, self._memory
@@ -102,3 +106,15 @@ class NeRDDynamics:
         token = self.model.encode(qpos, qvel, torque, terrain)
         output = self.network.step(token, memory)
         return self.model.decode(qpos, qvel, output)
+
+    def _run_compiled(self, *inputs: Tensor | Memory | None) -> tuple[Tensor, Tensor]:
+        """`_predict` through the compiler; eager for good where there is none."""
+        if self._compiled is None:
+            self._compiled = torch.compile(self._predict)
+        try:
+            return self._compiled(*inputs)
+        except (BackendCompilerFailed, InductorError) as error:
+            reason = str(error).strip().splitlines()[0]
+            warnings.warn(f"cannot compile, running eagerly: {reason}", stacklevel=3)
+            self.compile, self._compiled = False, None
+            return self._predict(*inputs)  # pyright: ignore

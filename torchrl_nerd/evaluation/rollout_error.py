@@ -137,9 +137,10 @@ def passive_errors(
     horizons: list[int],
     rows: int,
     seed: int,
+    device: torch.device | str = "cpu",
 ) -> dict[int, dict[str, ErrorSummary]]:
     """Passive open-loop errors at every horizon, from one rollout of the longest."""
-    start = initial_states(task, rows, seed)
+    start = initial_states(task, rows, seed).to(device)
     steps = max(horizons)
     true_path = open_loop(truth, start, steps)
     learned_path = open_loop(learned, start, steps)

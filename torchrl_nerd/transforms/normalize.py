@@ -93,6 +93,10 @@ class Normalize(Transform):
         mean, std = self._constants(key)
         return (mean + std * x.double()).to(x.dtype)
 
+    def std(self, key: NestedKey) -> Tensor:
+        """Standard deviation ``(D,)``, float64."""
+        return self._constants(key)[1]
+
     def _constants(self, key: NestedKey) -> tuple[Tensor, Tensor]:
         name = self.names[key]
         return self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")

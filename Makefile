@@ -1,0 +1,74 @@
+# Every target that needs Python first makes the virtual environment .venv, once: a
+# stamp inside it carries the checksum of what it was made from, so a second run
+# installs nothing and an edit of pyproject.toml or constraints.txt brings it up to date.
+#
+#   make demo PYTHON=python3.12   another interpreter than python3
+#   make demo TORCH_INDEX=URL     a second package index to look for PyTorch in: with
+#                                 PyTorch's CPU index, Linux gets the build without CUDA
+
+PYTHON ?= python3
+TORCH_INDEX ?=
+CONSTRAINTS ?= constraints.txt
+WORKERS ?= 2
+
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip install -qq --disable-pip-version-check --no-input
+TORCH := $(shell sed -n 's/^ *"\(torch==[^";]*\).*/\1/p' pyproject.toml)
+DM_CONTROL := $(shell sed -n 's/^ *"\(dm-control==[^";]*\).*/\1/p' pyproject.toml)
+MADE_FROM := $(shell { pwd; cat pyproject.toml $(CONSTRAINTS); } | cksum | cut -d' ' -f1)
+STAMP := $(VENV)/.installed-$(MADE_FROM)
+PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
+
+.PHONY: help setup demo test check test-slow test-gpu format build lock clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1#\2/p' Makefile | column -t -s '#'
+
+setup: $(STAMP) ## make .venv, the only step before any `.venv/bin/nerd ...`
+
+# PyTorch goes first, so that nothing else chooses its build. dm_control goes last and
+# alone: from Python 3.13 on one package that it names, but the suite does not use, has
+# no wheel (see pyproject.toml); before that it is there already.
+$(STAMP):
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(v < (3, 11) and "Python >= 3.11 is needed, but $(PYTHON) is %d.%d: name another one, as in make PYTHON=python3.12" % v)'
+	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	@echo "Installing into $(VENV): minutes the first time, nothing the second"
+	$(PIP) "$(TORCH)" $(if $(TORCH_INDEX),--extra-index-url "$(TORCH_INDEX)")
+	$(PIP) -c $(CONSTRAINTS) -e ".[dev]"
+	$(PIP) --no-deps "$(DM_CONTROL)"
+	@rm -f $(VENV)/.installed-* && touch $@
+
+demo: $(STAMP) ## learn a swing-up in learned dynamics, check it in true physics
+	$(PY) examples/ppo.py
+
+test: check ## lint, types and the test suite
+	$(PYTEST) -n $(WORKERS) $(ARGS)
+
+check: $(STAMP) ## lint, format and types alone
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m basedpyright
+
+test-slow: $(STAMP) ## the tests that take minutes
+	$(PYTEST) -m "slow and not gpu" $(ARGS)
+
+test-gpu: $(STAMP) ## the tests that need a CUDA device
+	$(PYTEST) -m gpu $(ARGS)
+
+format: $(STAMP) ## repair what ruff can repair
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+build: $(STAMP) ## wheel and source archive in dist/
+	$(PY) -m hatchling build
+
+lock: ## write the newest versions that pyproject.toml allows to constraints.txt
+	rm -rf $(VENV)
+	$(MAKE) setup CONSTRAINTS=/dev/null
+	$(PY) -m pip freeze -qq --exclude-editable | sed 's/+.*//' > constraints.txt
+
+clean: ## remove .venv, caches and built files; runs/ and datasets/ stay
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

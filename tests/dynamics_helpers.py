@@ -1,0 +1,164 @@
+"""Learned models whose history matters, and envs in every dynamics, for the tests."""
+
+from collections.abc import Mapping
+from functools import cache
+from itertools import product
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor, nn
+
+from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import (
+    DMControlDynamics,
+    Dynamics,
+    MujocoDynamics,
+    NeRDDynamics,
+)
+from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.modules.nerd import NETWORKS, TARGET, TOKEN, NeRD, SceneTokens
+from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.transforms import StateDelta, Stats
+
+LEARNED = ("streaming", "window")
+TRUE = ("mujoco", "dm_control")
+DYNAMICS = (*LEARNED, *TRUE)
+
+each_scene = pytest.mark.parametrize("scene", [load_scene(n) for n in SCENES], ids=SCENES)
+each_task = pytest.mark.parametrize("task", TASKS)
+each_dynamics = pytest.mark.parametrize("dynamics", DYNAMICS)
+each_env = pytest.mark.parametrize(("task", "dynamics"), list(product(TASKS, DYNAMICS)))
+
+
+def enliven(network: nn.Module, generator: Generator) -> nn.Module:
+    """Weights large enough that every input, history included, shows in the output."""
+    with torch.no_grad():
+        for name, weight in network.named_parameters():
+            noise = torch.randn(weight.shape, generator=generator)
+            if "offset_bias" in name:
+                weight.copy_(noise)
+            elif weight.ndim == 2:
+                weight.copy_(noise / weight.shape[1] ** 0.5)
+            elif "norm" in name:
+                weight.copy_(1.0 + 0.2 * noise)
+            else:
+                weight.copy_(0.2 * noise)
+    return network
+
+
+@cache
+def scene_stats(scene: Scene) -> dict[str, Stats]:
+    """Statistics of a little true motion of the scene."""
+    data = simulate(scene, 64, 4, Generator().manual_seed(0))
+    data = data[is_sound(data)]
+    after = data["next"]
+    terrain = data.get("terrain", None)
+    now = data["qpos"], data["qvel"]
+    tokens = SceneTokens(scene)(*now, after["joint_torque"], terrain)
+    target = StateDelta(scene).delta(*now, after["qpos"], after["qvel"])
+    return {TOKEN: Stats.of(tokens), TARGET: Stats.of(target)}
+
+
+def random_model(scene: Scene, generator: Generator, network: str = "tiny") -> NeRD:
+    """A model of the right scale that has learned nothing."""
+    model = NeRD(scene, NETWORKS[network], scene_stats(scene))
+    enliven(model.network, generator)
+    return model
+
+
+def random_drive(
+    scene: Scene, rows: int, steps: int, generator: Generator
+) -> tuple[TensorDict, Tensor, Tensor | None]:
+    """A start ``[rows]``, torques ``(steps, rows, num_actuated)`` and the ground."""
+    start, _ = scene.sample_initial(rows, generator)
+    terrain = start.pop("terrain", None)
+    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
+    u = torch.rand(steps, rows, len(high), generator=generator, dtype=torch.float64)
+    return TensorDict(start, [rows]), (2.0 * u - 1.0) * high, terrain
+
+
+def roll(
+    dynamics: Dynamics, state: TensorDict, torques: Tensor, terrain: Tensor | None
+) -> TensorDict:
+    """States after each step, ``[rows, steps]``; the dynamics keeps its past."""
+    states = []
+    for torque in torques:
+        state = dynamics.step(state, torque, terrain)
+        states.append(state)
+    return torch.stack(states, 1)
+
+
+class DynamicsMaker:
+    """Dynamics of one kind, as often as asked, with the same weights."""
+
+    def __init__(self, scene: Scene, kind: str, generator: Generator) -> None:
+        self.scene, self.kind = scene, kind
+        self.model = random_model(scene, generator) if kind in LEARNED else None
+
+    def __call__(self) -> Dynamics:
+        if self.model is not None:
+            return NeRDDynamics(self.model, inference=self.kind)
+        if self.kind == "mujoco":
+            return MujocoDynamics(self.scene, num_threads=2)
+        return DMControlDynamics(self.scene)
+
+
+class EnvMaker:
+    """Envs of one task in one dynamics, as often as asked, with the same weights."""
+
+    def __init__(self, task: str, dynamics: str, generator: Generator) -> None:
+        self.task, self.dynamics = task, dynamics
+        is_learned, scene = dynamics in LEARNED, make_task(task).scene
+        self.model = random_model(scene, generator) if is_learned else None
+
+    def __call__(self, num_envs: int = 3, seed: int = 0) -> SceneEnv:
+        if self.model is None:
+            return GroundTruthEnv(self.task, self.dynamics, num_envs, seed)
+        model, inference = self.model, self.dynamics
+        return NeRDEnv(self.task, model, num_envs, seed, inference=inference)
+
+
+def random_actions(env: SceneEnv, steps: int, generator: Generator) -> Tensor:
+    """Actions in [-1, 1], ``(steps, *action shape)``."""
+    return 2.0 * torch.rand(steps, *env.action_spec.shape, generator=generator) - 1.0
+
+
+def act(env: SceneEnv, action: Tensor) -> TensorDict:
+    """What one step writes under ``next``."""
+    return env.step(TensorDict({"action": action}, env.batch_size))["next"]
+
+
+def act_all(env: SceneEnv, actions: Tensor) -> TensorDict:
+    """What the steps write under ``next``, ``[rows, steps]``; no resets between."""
+    return torch.stack([act(env, action) for action in actions], 1)
+
+
+def reset_rows(env: SceneEnv, rows: Tensor) -> TensorDict:
+    """A partial reset of ``rows`` (bool ``(num_envs,)``)."""
+    return env.reset(TensorDict({"_reset": rows[:, None]}, env.batch_size))
+
+
+def start_at(env: SceneEnv, state: TensorDict) -> TensorDict:
+    """All rows reset to ``state``."""
+    return env.reset(state.clone(), set_state=True)
+
+
+def unequal_keys(a: Mapping, b: Mapping) -> list:
+    """Keys whose tensors differ by a bit; NaN equals NaN."""
+    assert set(a.keys(True, True)) == set(b.keys(True, True))
+    return [
+        key
+        for key in a.keys(True, True)
+        if not torch.equal(a[key].nan_to_num(1e300), b[key].nan_to_num(1e300))
+    ]
+
+
+def random_mask(rows: int, generator: Generator, share: float = 0.5) -> Tensor:
+    """Some rows, never none and never all of them."""
+    mask = torch.rand(rows, generator=generator) < share
+    first, last = torch.randperm(rows, generator=generator)[:2]
+    mask[first], mask[last] = True, False
+    return mask

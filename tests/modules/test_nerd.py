@@ -1,0 +1,126 @@
+"""A NeRD's encode and decode are the scene's transforms and nothing else."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from dynamics_helpers import each_scene, random_drive, random_model, scene_stats
+from tensordict import TensorDict
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.modules.nerd import NETWORKS, TARGET, NeRD, SceneTokens
+from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.transforms import (
+    ContactFeatures,
+    RobotCentric,
+    StateDelta,
+)
+
+ROWS = 32
+each_precision = pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-11)]
+)
+
+
+@each_scene
+@each_precision
+def test_decode_inverts_the_normalised_target(scene, dtype, tolerance, generator):
+    model = random_model(scene, generator).to(dtype)
+    state, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    after = MujocoDynamics(scene).step(state, torques[0], terrain)
+    now = state["qpos"], state["qvel"]
+    delta = StateDelta(scene).delta(*now, after["qpos"], after["qvel"])
+    output = model.normalize.normalize(TARGET, delta).to(dtype)
+    qpos, qvel = model.decode(*now, output)
+    assert qpos.dtype == qvel.dtype == torch.float64
+    scale = scene_stats(scene)[TARGET].std.max() * output.abs().max()
+    for got, want in ((qpos, after["qpos"]), (qvel, after["qvel"])):
+        assert (got - want).abs().max() < tolerance * (scale + want.abs().max())
+
+
+@each_scene
+@each_precision
+def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator):
+    model = random_model(scene, generator).to(dtype)
+    state, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    token = model.encode(state["qpos"], state["qvel"], torques[0], terrain)
+    following = TensorDict({"joint_torque": torques[0]}, [ROWS])
+    td = state.clone().set("next", following)
+    if terrain is not None:
+        td["terrain"] = terrain
+    robot, contact = RobotCentric(scene), ContactFeatures(scene)
+    contact(robot(td))
+    keys = [*robot.out_keys, *contact.out_keys]
+    raw = torch.cat([td[key].double() for key in keys], -1)
+    stats = scene_stats(scene)["token"]
+    expected = (raw - stats.mean) / stats.std
+    assert token.dtype == dtype and token.shape[-1] == SceneTokens(scene).size
+    # the transforms hand over float32, whose rounding a small deviation magnifies
+    slack = 1e-6 * (raw.abs() + 1.0) / stats.std + tolerance * (1.0 + expected.abs())
+    assert ((token - expected).abs() <= slack).all()
+
+
+@each_scene
+def test_leading_dimensions_are_free(scene, generator):
+    model = random_model(scene, generator)
+    state, torques, terrain = random_drive(scene, 12, 1, generator)
+    values = [state["qpos"], state["qvel"], torques[0]]
+    split = [x.unflatten(0, (3, 4)) for x in values]
+    ground = None if terrain is None else terrain.unflatten(0, (3, 4))
+    flat, shaped = model.encode(*values, terrain), model.encode(*split, ground)
+    torch.testing.assert_close(shaped.flatten(0, 1), flat, atol=1e-6, rtol=1e-6)
+    output = torch.randn(12, model.state_delta.size, generator=generator)
+    flat = model.decode(*values[:2], output)
+    shaped = model.decode(*split[:2], output.unflatten(0, (3, 4)))
+    for a, b in zip(shaped, flat, strict=True):
+        torch.testing.assert_close(a.flatten(0, 1), b, atol=1e-12, rtol=1e-12)
+
+
+@each_scene
+def test_without_statistics_zero_output_is_motion_at_constant_velocity(
+    scene, generator
+):
+    model = NeRD(scene, NETWORKS["mlp"])
+    state, _, _ = random_drive(scene, ROWS, 1, generator)
+    zeros = torch.zeros(ROWS, model.state_delta.size)
+    qpos, qvel = model.decode(state["qpos"], state["qvel"], zeros)
+    expected = state["qpos"].numpy().copy()
+    for row, velocity in zip(expected, state["qvel"].numpy(), strict=True):
+        mujoco.mj_integratePos(scene.model, row, velocity, scene.control_step)
+    np.testing.assert_allclose(qpos, expected, atol=1e-12)
+    torch.testing.assert_close(qvel, state["qvel"], atol=1e-12, rtol=1e-12)
+
+
+@each_scene
+def test_the_learned_step_does_not_see_where_its_statistics_live(scene, generator):
+    model = random_model(scene, generator)
+    twin = NeRD(scene, model.config)
+    twin.load_state_dict(model.state_dict())
+    state, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    inputs = state["qpos"], state["qvel"], torques[0], terrain
+    token = model.encode(*inputs)
+    assert torch.equal(twin.encode(*inputs), token)
+    output = model.network(token[:, None])[:, 0]
+    for a, b in zip(model.decode(*inputs[:2], output), twin.decode(*inputs[:2], output)):
+        assert torch.equal(a, b)
+
+
+def test_a_deep_copy_owns_its_weights_and_statistics(generator):
+    model = random_model(load_scene(next(iter(SCENES))), generator)
+    before = {key: value.clone() for key, value in model.state_dict().items()}
+    with torch.no_grad():
+        for value in copy.deepcopy(model).state_dict().values():
+            value.fill_(torch.nan)
+    assert all(torch.equal(before[k], v) for k, v in model.state_dict().items())
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_every_network_builds_for_every_scene(name):
+    for scene in map(load_scene, SCENES):
+        model = NeRD(scene, NETWORKS[name])
+        tokens = torch.zeros(2, 3, model.tokens.size)
+        with torch.no_grad():
+            output = model.network(tokens)
+        assert output.shape == (2, 3, 2 * scene.model.nv)

@@ -1,0 +1,85 @@
+"""What a user gets from the wheel, and that every file tells the same version."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+import torchrl_nerd
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "torchrl_nerd"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
+    """The wheel of this tree."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    return ZipFile(next(folder.glob("*.whl")))
+
+
+def read(wheel: ZipFile, name: str) -> str:
+    """A file of the wheel's ``.dist-info`` folder."""
+    path = next(path for path in wheel.namelist() if path.endswith(f".dist-info/{name}"))
+    return wheel.read(path).decode()
+
+
+def test_wheel_holds_every_file_of_the_package(wheel):
+    source = {
+        path.relative_to(ROOT).as_posix()
+        for path in PACKAGE.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    packed = {path for path in wheel.namelist() if ".dist-info/" not in path}
+    assert packed == source
+    assert "torchrl_nerd/py.typed" in packed
+    assert any(re.fullmatch(r"torchrl_nerd/scenes/assets/\w+\.xml", p) for p in packed)
+
+
+def test_every_shipped_model_is_small_and_complete(wheel):
+    prefix = "torchrl_nerd/pretrained/"
+    files = [i for i in wheel.infolist() if i.filename.startswith(prefix)]
+    if not files:
+        pytest.skip("no model is shipped yet")
+    files = [i for i in files if not i.filename.endswith(".py")]
+    for folder in {Path(info.filename).parent for info in files}:
+        names = {Path(i.filename).name for i in files if folder in Path(i.filename).parents}
+        assert {"card.json", "model.safetensors"} == names, folder
+    assert all(info.file_size < 2_000_000 for info in files)
+
+
+def test_wheel_installs_the_nerd_command_and_the_licence(wheel):
+    assert "nerd = torchrl_nerd.cli:main" in read(wheel, "entry_points.txt")
+    assert "The torchrl_nerd authors" in read(wheel, "licenses/LICENSE")
+
+
+def test_version_is_the_same_everywhere(wheel):
+    version = torchrl_nerd.__version__
+    assert f"\nVersion: {version}\n" in read(wheel, "METADATA")
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\n## [{version}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_package_works_from_the_wheel_alone(wheel, tmp_path):
+    wheel.extractall(tmp_path)
+    code = (
+        "import torchrl_nerd; print(torchrl_nerd.__file__);"
+        "print(torchrl_nerd.load_scene('cartpole').model.nq)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    path, nq = result.stdout.split()
+    assert Path(path) == tmp_path / "torchrl_nerd" / "__init__.py"
+    assert nq == "2"

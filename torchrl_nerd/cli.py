@@ -1,0 +1,238 @@
+"""The ``nerd`` command: data, train, eval, transfer."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
+from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.policy_transfer import transfer
+from torchrl_nerd.evaluation.protocols import PROTOCOLS
+from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.files import read_json, writable_folder, write_json
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.tasks import make_task
+from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+
+Positional = tyro.conf.Positional
+Flat = tyro.conf.OmitArgPrefixes
+
+
+@dataclass(frozen=True)
+class Data:
+    """Generate random trajectories of the true dynamics.
+
+    Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum."""
+    out: Path | None = None
+    """Folder of the data set; datasets/SCENE by default."""
+    config: Flat[DataConfig] = field(default_factory=DataConfig)
+    json: Path | None = None
+    """Write the figures to this file."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> dict[str, Any]:
+        """Write the data set and return its card."""
+        scene = load_scene(self.scene)
+        out = self.out or Path("datasets") / self.scene
+        generate(scene, self.config, out, self.quiet)
+        card = read_json(out / CARD)
+        print(f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped")
+        return card
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a NeRD; without options, exactly as the shipped model of the scene.
+
+    Missing data are generated first. A killed run goes on where it stopped.
+    Example: nerd train cartpole --out runs/cartpole --network mlp
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum."""
+    out: Path | None = None
+    """Folder of the run; runs/SCENE by default."""
+    data: Path | None = None
+    """Folder of the data set; datasets/SCENE by default."""
+    config: Flat[TrainConfig] = field(default_factory=TrainConfig)
+    export: Path | None = None
+    """Copy the best checkpoint to this folder when done."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    threads: int | None = None
+    """Processor threads; torch's own choice by default."""
+    json: Path | None = None
+    """Write the figures to this file."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> dict[str, Any]:
+        """Train and return the card of the best checkpoint."""
+        scene, recipe = load_scene(self.scene), RECIPES[self.scene]
+        out = writable_folder(self.out or Path("runs") / self.scene)
+        folder = self.data or Path("datasets") / self.scene
+        if not (folder / CARD).exists():
+            generate(scene, recipe.data, folder, self.quiet)
+        if self.threads:
+            torch.set_num_threads(self.threads)
+        trainer = Trainer(
+            scene,
+            load_data(scene, folder),
+            make_task(recipe.task),
+            self.config,
+            out,
+            self.device,
+            horizons=PROTOCOLS[self.scene]().horizons[:2],
+            quiet=self.quiet,
+        )
+        trainer.run()
+        card = read_json(out / "best" / "card.json")
+        if self.export is not None:
+            save_checkpoint(load_checkpoint(out / "best", scene), self.export, card)
+        print(f"best checkpoint in {out / 'best'}: {_curve(card)}")
+        return card
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Open-loop error of a model against true physics, beside the paper's figures.
+
+    Example: nerd eval cartpole --json results/cartpole.json
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum."""
+    model: Path | None = None
+    """Checkpoint folder; the shipped model by default."""
+    rows: int = 2048
+    """Trajectories per case."""
+    seed: int = 500
+    """Of the starts; test seeds are never used in training or validation."""
+    inference: Inference = "streaming"
+    """streaming, or window: the paper's recomputation."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print a table and return its rows."""
+        scene = load_scene(self.scene)
+        if self.rows < 2:
+            raise ValueError(f"expected at least 2 rows, got {self.rows}")
+        protocol = PROTOCOLS[self.scene]()
+        model = from_pretrained(self.model or self.scene, scene).to(self.device)
+        learned = NeRDDynamics(model, inference=self.inference)
+        rows = []
+        header = f"{'case':<10}{'steps':>6} {'quantity':<12}{'mean':>9}{'+-':>9}"
+        print(f"{header}{'final':>9}{'p95':>9}  paper")
+        for case, task in protocol.cases.items():
+            errors = passive_errors(
+                task,
+                learned,
+                MujocoDynamics(scene),
+                list(protocol.horizons),
+                self.rows,
+                self.seed,
+                self.device,
+            )
+            for horizon, by_name in errors.items():
+                for name, error in by_name.items():
+                    paper = protocol.published.get((case, horizon, name))
+                    row = {"case": case, "steps": horizon, "quantity": name}
+                    rows.append({**row, **asdict(error), "paper": paper})
+                    figures = (error.mean, error.interval, error.final, error.p95)
+                    line = f"{case:<10}{horizon:>6} {name:<9}{error.unit:<3}"
+                    line += "".join(f"{figure:>9.5f}" for figure in figures)
+                    print(f"{line}  {paper if paper is not None else '-'}")
+        settings = {"rows": self.rows, "seed": self.seed, "inference": self.inference}
+        return {"scene": self.scene, **settings, "errors": rows}
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Returns of a policy in learned and in true dynamics, and the gap.
+
+    Example: nerd transfer cartpole/swingup --policy runs/ppo
+    """
+
+    task: Positional[str]
+    """Id of the task, such as cartpole/swingup."""
+    policy: Path
+    """Folder of a policy, as examples/ppo.py writes it."""
+    dynamics: tuple[str, ...] = ("nerd", "mujoco")
+    """Any of nerd, mujoco, dm_control, checkpoint folders."""
+    episodes: int = 2048
+    """Per dynamics."""
+    seed: int = 500
+    """Of the resets."""
+    json: Path | None = None
+    """Write the figures to this file."""
+"""The command line grows a command by a class here and a line in COMMANDS."""
+
+
+COMMANDS = {"data": Data, "train": Train, "eval": Eval, "transfer": Transfer}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; bad input is one sentence on stderr and exit status 2."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if not argv or argv[0] in ("-h", "--help"):
+        print("usage: nerd COMMAND ... (each with --help)\n")
+        for name, command in COMMANDS.items():
+            print(f"  {name:<10}{(command.__doc__ or '').splitlines()[0]}")
+        return 0
+    if argv[0] not in COMMANDS:
+        return _fail(f"unknown command '{argv[0]}', expected {', '.join(COMMANDS)}")
+    kind = COMMANDS[argv[0]]
+    try:
+        command = tyro.cli(
+            kind, args=argv[1:], prog=f"nerd {argv[0]}", default=_default(kind, argv[1:])
+        )
+        figures = command.run()
+        if command.json is not None:
+            write_json(command.json, figures)
+    except (ValueError, OSError) as error:
+        return _fail(str(error))
+    return 0
+
+
+def _default(kind: type, args: list[str]) -> Any:
+    """Defaults of a command: a scene's recipe where the command has one."""
+    scene = next((arg for arg in args if arg in RECIPES), None)
+    if scene is None or kind not in (Data, Train):
+        return tyro.MISSING_NONPROP
+    recipe = RECIPES[scene]
+    return kind(scene, config=recipe.data if kind is Data else recipe.train)
+
+
+def _fail(sentence: str) -> int:
+    print(f"nerd: {sentence}", file=sys.stderr)
+    return 2
+
+
+def _curve(card: dict[str, Any]) -> str:
+    """Validation error of a card in one line."""
+    parts = [
+        f"{name} {figures['mean']:.2g} {figures['unit']} at {horizon} steps"
+        for horizon, by_name in card.get("validation_error", {}).items()
+        for name, figures in by_name.items()
+    ]
+    return ", ".join(parts) or "not validated"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

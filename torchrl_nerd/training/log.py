@@ -1,0 +1,40 @@
+"""Figures of a training run: CSV always, TensorBoard where it is installed."""
+
+import csv
+from importlib.util import find_spec
+from pathlib import Path
+
+
+class TrainingLog:
+    """Appends one row of figures per validation to ``log.csv``.
+
+    Args:
+        folder: of the run.
+        step: rows after it, left by a run that was killed, are dropped.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        self.path = folder / "log.csv"
+        self.rows = [row for row in self._read() if int(row["step"]) <= step]
+        self.board = None
+        if find_spec("tensorboard") is not None:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self.board = SummaryWriter(folder / "tensorboard", purge_step=step)
+
+    def _read(self) -> list[dict[str, str]]:
+        if not self.path.exists():
+            return []
+        with open(self.path, newline="") as file:
+            return list(csv.DictReader(file))
+
+    def write(self, figures: dict[str, float]) -> None:
+        """Add a row; the file is whole after every call."""
+        self.rows.append({key: repr(value) for key, value in figures.items()})
+        with open(self.path, "w", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
+            writer.writeheader()
+            writer.writerows(self.rows)
+        if self.board is not None:
+            for key, value in figures.items():
+                self.board.add_scalar(key, value, int(figures["step"]))

@@ -1,0 +1,29 @@
+"""How the shipped model of each scene is made: ``nerd train SCENE`` with its defaults."""
+
+from dataclasses import dataclass
+
+from torchrl_nerd.data.generate import DataConfig
+from torchrl_nerd.training.trainer import TrainConfig
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Data and training of one scene, and the task that validates it."""
+
+    data: DataConfig
+    train: TrainConfig
+    task: str
+
+
+RECIPES: dict[str, Recipe] = {
+    "cartpole": Recipe(
+        DataConfig(trajectories=20_000, steps=100),
+        TrainConfig(steps=40_000, rollout_steps=3_000),
+        "cartpole/swingup",
+    ),
+    "double_pendulum": Recipe(
+        DataConfig(trajectories=40_000, steps=100),
+        TrainConfig(steps=60_000, rollout_steps=3_000),
+        "double_pendulum/passive",
+    ),
+}

@@ -1,0 +1,324 @@
+"""Training of a NeRD: sequences gathered on the device, resumable to the bit."""
+
+import dataclasses
+import time
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
+from torch import Generator, Tensor, nn
+from tqdm import tqdm
+
+from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
+from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tasks import Task
+from torchrl_nerd.training.log import TrainingLog
+from torchrl_nerd.training.losses import one_step_loss, rollout_loss
+from torchrl_nerd.training.muon import Muon
+from torchrl_nerd.training.sequences import Sequences, data_stats
+
+VALIDATION_SEED = 1_000_003
+VALIDATION_ROWS = 256
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train.
+
+    | field | meaning |
+    |---|---|
+    | ``network`` | name of a network: tiny, small, paper, paper-large, mlp, gru |
+    | ``steps`` | updates on one-step targets |
+    | ``rollout_steps`` | further updates on the model's own rollouts |
+    | ``rows``, ``length`` | sequences per update and tokens of each |
+    | ``rollout_rows``, ``rollout_length`` | the same for rollouts |
+    | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
+    | ``rollout_lr`` | share of the peak at which the rollout updates begin |
+    | ``warmup`` | updates over which the step size rises from zero |
+    | ``softening`` | of the relative loss; see `losses.relative_weights` |
+    | ``clip`` | largest norm of the gradient |
+    | ``ema`` | decay of the averaged weights, which are the ones saved |
+    | ``save_every`` | updates between saves: what a kill can lose |
+    | ``validate_every`` | updates between rollouts in true physics |
+    | ``seed`` | of weights and batches |
+    """
+
+    network: str = "tiny"
+    steps: int = 20_000
+    rollout_steps: int = 2_000
+    rows: int = 64
+    length: int = 16
+    rollout_rows: int = 128
+    rollout_length: int = 8
+    lr: float = 0.01
+    lr_other: float = 3e-3
+    rollout_lr: float = 0.1
+    warmup: int = 200
+    softening: float = 0.01
+    clip: float = 1.0
+    ema: float = 0.995
+    save_every: int = 1_000
+    validate_every: int = 2_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.network not in NETWORKS:
+            raise ValueError(
+                f"unknown network '{self.network}', expected one of {', '.join(NETWORKS)}"
+            )
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name != "network" and value < 0:
+                raise ValueError(f"expected {field.name} of at least 0, got {value}")
+
+    @property
+    def total_steps(self) -> int:
+        """Updates of both kinds."""
+        return self.steps + self.rollout_steps
+
+
+class Trainer:
+    """Trains a model on one data set; `run` goes on from where the folder stopped.
+
+    The folder holds ``last`` and ``best`` checkpoints (averaged weights), ``state`` (all
+    that a resumed run needs for the same bits), ``log.csv`` and, if it is installed,
+    TensorBoard files.
+
+    Args:
+        scene: the robot.
+        data: from `load_data`.
+        task: its reset distribution starts the validation rollouts.
+        config: how.
+        folder: where.
+        device: of model and data; bf16 autocast on CUDA, float32 on the CPU.
+        horizons: control steps of the validation rollouts.
+        quiet: no progress bar.
+
+    Raises:
+        ValueError: the folder cannot be written or holds a run of another configuration.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        data: TensorDict,
+        task: Task,
+        config: TrainConfig,
+        folder: Path,
+        device: torch.device | str = "cpu",
+        horizons: tuple[int, ...] = (100, 500),
+        quiet: bool = False,
+    ) -> None:
+        self.scene, self.task, self.config = scene, task, config
+        self.folder, self.device = writable_folder(folder), torch.device(device)
+        self.horizons, self.quiet = horizons, quiet
+        longest = max(config.length, config.rollout_length if config.rollout_steps else 1)
+        if data.batch_size[1] < longest:
+            raise ValueError(
+                f"expected trajectories of at least {longest} steps, "
+                f"got {data.batch_size[1]}"
+            )
+        torch.manual_seed(config.seed)
+        model = NeRD(scene, NETWORKS[config.network], data_stats(scene, data))
+        self.sequences = Sequences(model, data, self.device)
+        self.model = model.to(self.device)
+        matrices, others = split_parameters(self.model.network)
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            "muon": Muon(matrices, lr=config.lr),
+            "adamw": torch.optim.AdamW(
+                others, lr=config.lr_other, betas=(0.9, 0.95), weight_decay=0.0
+            ),
+        }
+        self.peaks = {"muon": config.lr, "adamw": config.lr_other}
+        weights = dict(self.model.network.named_parameters())
+        self.average = {name: w.detach().clone() for name, w in weights.items()}
+        self.step, self.seconds, self.best = 0, 0.0, float("inf")
+        if (self.folder / "state.json").exists():
+            self._resume()
+
+    def run(self, until: int | None = None) -> NeRD:
+        """Train to the end, or to update ``until``; returns the averaged model."""
+        last = min(until or self.config.total_steps, self.config.total_steps)
+        bar = tqdm(
+            total=self.config.total_steps,
+            initial=self.step,
+            desc=f"train {self.scene.name}",
+            disable=self.quiet,
+        )
+        log = TrainingLog(self.folder, self.step)
+        began = time.monotonic() - self.seconds
+        loss = torch.zeros(())
+        while self.step < last:
+            loss = self.update()
+            self.step += 1
+            is_last = self.step == self.config.total_steps
+            if self.step % self.config.validate_every == 0 or is_last:
+                figures = self.validate()
+                log.write({"step": self.step, "loss": float(loss), **figures})
+                bar.set_postfix({k: f"{v:.2g}" for k, v in figures.items()})
+            if self.step % self.config.save_every == 0 or is_last:
+                self.seconds = time.monotonic() - began
+                self.save()
+            bar.update()
+        bar.close()
+        return self.averaged_model()
+
+    def update(self) -> Tensor:
+        """One update; its batch depends on seed and step alone."""
+        config = self.config
+        generator = Generator().manual_seed((config.seed << 32) + self.step)
+        rate = self._rate()
+        for name, optimizer in self.optimizers.items():
+            for group in optimizer.param_groups:
+                group["lr"] = self.peaks[name] * rate
+            optimizer.zero_grad()
+        self.model.train()
+        with torch.enable_grad(), self._autocast():
+            if self.step < config.steps:
+                tokens, targets = self.sequences.one_step(
+                    config.rows, config.length, generator
+                )
+                outputs = self.model.network(tokens).float()
+                loss = one_step_loss(outputs, targets, config.softening)
+            else:
+                batch = self.sequences.rollout(
+                    config.rollout_rows, config.rollout_length, generator
+                )
+                loss = rollout_loss(self.model, *batch, config.softening)
+        loss.backward()
+        parameters = self.model.network.parameters()
+        norm = nn.utils.clip_grad_norm_(parameters, config.clip)
+        if norm.isfinite():
+            for optimizer in self.optimizers.values():
+                optimizer.step()
+        decay = min(config.ema, self.step / (self.step + 10.0))
+        with torch.no_grad():
+            for name, weight in self.model.network.named_parameters():
+                self.average[name].lerp_(weight, 1.0 - decay)
+        return loss.detach()
+
+    def _rate(self) -> float:
+        """Share of the peak step size: up, then down to zero, in each of two phases."""
+        config, step = self.config, self.step
+        if step < config.steps:
+            return min(1.0, (step + 1) / max(config.warmup, 1)) * (1 - step / config.steps)
+        left = 1.0 - (step - config.steps) / config.rollout_steps
+        return config.rollout_lr * left
+
+    def _autocast(self) -> AbstractContextManager:
+        if self.device.type == "cuda":
+            return torch.autocast("cuda", torch.bfloat16)
+        return nullcontext()
+
+    def averaged_model(self) -> NeRD:
+        """A copy of the model that holds the averaged weights."""
+        model = NeRD(self.scene, self.model.config).to(self.device)
+        model.load_state_dict(self.model.state_dict())
+        model.network.load_state_dict(self.average)
+        return model.eval()
+
+    def validate(self) -> dict[str, float]:
+        """Mean passive error of the averaged model at every horizon.
+
+        The starts (their seed) are of no test: choices are made on them.
+        """
+        summaries = passive_errors(
+            self.task,
+            NeRDDynamics(self.averaged_model()),
+            MujocoDynamics(self.scene),
+            list(self.horizons),
+            rows=VALIDATION_ROWS,
+            seed=VALIDATION_SEED,
+            device=self.device,
+        )
+        figures = {
+            f"{name}_{horizon}": summary.mean
+            for horizon, by_name in summaries.items()
+            for name, summary in by_name.items()
+        }
+        score = sum(v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}"))
+        if score < self.best:
+            self.best = score
+            self._save_model("best", summaries)
+        return figures
+
+    def save(self) -> None:
+        """Everything a resumed run needs; the state's card is written last."""
+        self._save_model("last", {})
+        tensors = {f"model.{k}": v for k, v in self.model.network.state_dict().items()}
+        tensors |= {f"average.{k}": v for k, v in self.average.items()}
+        for name, optimizer in self.optimizers.items():
+            for index, state in optimizer.state_dict()["state"].items():
+                tensors |= {f"{name}.{index}.{k}": v for k, v in state.items()}
+        tensors = {k: v.detach().cpu().clone() for k, v in tensors.items()}
+        tensors["step"] = torch.tensor(self.step)
+        path = self.folder / "state.safetensors"
+        write_atomically(path, lambda aside: save_file(tensors, aside))
+        card = {"config": asdict(self.config), "scene_hash": self.scene.hash}
+        card |= {"seconds": self.seconds, "best": min(self.best, 1e300)}
+        write_json(self.folder / "state.json", card)
+
+    def _save_model(
+        self, name: str, errors: dict[int, dict[str, ErrorSummary]]
+    ) -> None:
+        curve = {
+            str(horizon): {k: asdict(v) for k, v in by_name.items()}
+            for horizon, by_name in errors.items()
+        }
+        training = {
+            "training": {
+                **asdict(self.config),
+                "steps_done": self.step,
+                "seconds": round(self.seconds, 1),
+                "device": str(self.device),
+                "threads": torch.get_num_threads(),
+                "trajectories": len(self.sequences.tokens),
+            },
+            "validation_error": curve,
+        }
+        model = self.averaged_model()
+        save_checkpoint(model, self.folder / name, make_card(model, training))
+
+    def _resume(self) -> None:
+        card = read_json(self.folder / "state.json")
+        expected = {"config": asdict(self.config), "scene_hash": self.scene.hash}
+        for key, value in expected.items():
+            if card.get(key) != value:
+                raise ValueError(
+                    f"{self.folder} holds a run with {key} {card.get(key)}, asked for "
+                    f"{value}: choose another folder"
+                )
+        tensors = load_file(self.folder / "state.safetensors")
+        self.step = int(tensors["step"])
+        self.seconds, self.best = card["seconds"], card["best"]
+        pick = _with_prefix(tensors, "model.")
+        self.model.network.load_state_dict(pick)
+        for name, value in _with_prefix(tensors, "average.").items():
+            self.average[name].copy_(value)
+        for name, optimizer in self.optimizers.items():
+            state: dict[int, dict[str, Tensor]] = {}
+            for key, value in _with_prefix(tensors, f"{name}.").items():
+                index, entry = key.split(".", 1)
+                state.setdefault(int(index), {})[entry] = value
+            groups = optimizer.state_dict()["param_groups"]
+            optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
+    """Weights of linear layers, for Muon, and everything else."""
+    matrices, others = [], []
+    for name, weight in network.named_parameters():
+        is_matrix = weight.ndim == 2 and "offset_bias" not in name
+        (matrices if is_matrix else others).append(weight)
+    return matrices, others
+
+
+def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
