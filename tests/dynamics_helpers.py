@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from functools import cache
-from itertools import product
 
 import pytest
 import torch
@@ -19,18 +18,15 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.modules.nerd import NETWORKS, TARGET, TOKEN, NeRD, SceneTokens
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tasks import make_task
 from torchrl_nerd.transforms import StateDelta, Stats
 
 LEARNED = ("streaming", "window")
 TRUE = ("mujoco", "dm_control")
 DYNAMICS = (*LEARNED, *TRUE)
 
-each_scene = pytest.mark.parametrize("scene", [load_scene(n) for n in SCENES], ids=SCENES)
-each_task = pytest.mark.parametrize("task", TASKS)
 each_dynamics = pytest.mark.parametrize("dynamics", DYNAMICS)
-each_env = pytest.mark.parametrize(("task", "dynamics"), list(product(TASKS, DYNAMICS)))
 
 
 def enliven(network: nn.Module, generator: Generator) -> nn.Module:
@@ -107,11 +103,22 @@ class DynamicsMaker:
 
 
 class EnvMaker:
-    """Envs of one task in one dynamics, as often as asked, with the same weights."""
+    """Envs of one task in one dynamics, as often as asked, with the same weights.
 
-    def __init__(self, task: str, dynamics: str, generator: Generator) -> None:
-        self.task, self.dynamics = task, dynamics
-        is_learned, scene = dynamics in LEARNED, make_task(task).scene
+    ``horizon`` replaces the task's own.
+    """
+
+    def __init__(
+        self,
+        task_id: str,
+        dynamics: str,
+        generator: Generator,
+        horizon: int | None = None,
+    ) -> None:
+        self.task, self.dynamics = make_task(task_id), dynamics
+        if horizon is not None:
+            self.task.horizon = horizon
+        is_learned, scene = dynamics in LEARNED, self.task.scene
         self.model = random_model(scene, generator) if is_learned else None
 
     def __call__(self, num_envs: int = 3, seed: int = 0) -> SceneEnv:
@@ -144,6 +151,12 @@ def reset_rows(env: SceneEnv, rows: Tensor) -> TensorDict:
 def start_at(env: SceneEnv, state: TensorDict) -> TensorDict:
     """All rows reset to ``state``."""
     return env.reset(state.clone(), set_state=True)
+
+
+def junk_fill(td: TensorDict) -> None:
+    """Overwrite every tensor in place."""
+    for value in td.values(True, True):
+        value.fill_(torch.nan if value.is_floating_point() else True)
 
 
 def unequal_keys(a: Mapping, b: Mapping) -> list:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from dynamics_helpers import each_scene, random_drive, random_model, scene_stats
+from dynamics_helpers import random_drive, random_model, scene_stats
 from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -24,10 +24,10 @@ each_precision = pytest.mark.parametrize(
 )
 
 
-@each_scene
 @each_precision
 def test_decode_inverts_the_normalised_target(scene, dtype, tolerance, generator):
-    model = random_model(scene, generator).to(dtype)
+    model = random_model(scene, generator)
+    model.network.to(dtype)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     after = MujocoDynamics(scene).step(state, torques[0], terrain)
     now = state["qpos"], state["qvel"]
@@ -40,10 +40,10 @@ def test_decode_inverts_the_normalised_target(scene, dtype, tolerance, generator
         assert (got - want).abs().max() < tolerance * (scale + want.abs().max())
 
 
-@each_scene
 @each_precision
 def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator):
-    model = random_model(scene, generator).to(dtype)
+    model = random_model(scene, generator)
+    model.network.to(dtype)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     token = model.encode(state["qpos"], state["qvel"], torques[0], terrain)
     following = TensorDict({"joint_torque": torques[0]}, [ROWS])
@@ -62,7 +62,16 @@ def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator)
     assert ((token - expected).abs() <= slack).all()
 
 
-@each_scene
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_casting_a_model_casts_its_network_alone(scene, dtype, generator):
+    model = random_model(scene, generator).to(dtype)
+    state, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    token = model.encode(state["qpos"], state["qvel"], torques[0], terrain)
+    assert token.dtype == dtype
+    for buffer in model.normalize.buffers():
+        assert buffer.dtype == torch.float64
+
+
 def test_leading_dimensions_are_free(scene, generator):
     model = random_model(scene, generator)
     state, torques, terrain = random_drive(scene, 12, 1, generator)
@@ -78,7 +87,6 @@ def test_leading_dimensions_are_free(scene, generator):
         torch.testing.assert_close(a.flatten(0, 1), b, atol=1e-12, rtol=1e-12)
 
 
-@each_scene
 def test_without_statistics_zero_output_is_motion_at_constant_velocity(
     scene, generator
 ):
@@ -93,7 +101,6 @@ def test_without_statistics_zero_output_is_motion_at_constant_velocity(
     torch.testing.assert_close(qvel, state["qvel"], atol=1e-12, rtol=1e-12)
 
 
-@each_scene
 def test_the_learned_step_does_not_see_where_its_statistics_live(scene, generator):
     model = random_model(scene, generator)
     twin = NeRD(scene, model.config)

@@ -18,7 +18,7 @@ class Recipe:
 RECIPES: dict[str, Recipe] = {
     "cartpole": Recipe(
         DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(steps=40_000, rollout_steps=3_000),
+        TrainConfig(steps=30_000, rollout_steps=3_000),
         "cartpole/swingup",
     ),
     "double_pendulum": Recipe(

@@ -1,0 +1,56 @@
+"""Fixtures of every test: fresh random numbers, and all registered robots and tasks.
+
+A test that takes ``scene`` or ``task_id`` runs once for each one registered, so a new
+robot is tested by being there. Random inputs are drawn anew at every run; a failure shows
+its seed, and ``pytest --seed N`` draws the same again.
+"""
+
+import logging
+import secrets
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.tasks import TASKS
+
+logging.getLogger("torchrl").setLevel(logging.ERROR)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--seed", type=int, help="draw the random inputs of this seed")
+
+
+@pytest.fixture
+def seed(request: pytest.FixtureRequest) -> int:
+    """A fresh seed for this test, printed if it fails."""
+    given = request.config.getoption("--seed")
+    value = secrets.randbits(31) if given is None else given
+    request.node.add_report_section("call", "seed", f"--seed {value}")
+    torch.manual_seed(value)
+    return value
+
+
+@pytest.fixture
+def generator(seed: int) -> torch.Generator:
+    """Torch's random numbers of this test."""
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture
+def rng(seed: int) -> np.random.Generator:
+    """NumPy's random numbers of this test."""
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(params=list(SCENES))
+def scene(request: pytest.FixtureRequest) -> Scene:
+    """Each registered scene."""
+    return load_scene(request.param)
+
+
+@pytest.fixture(params=list(TASKS))
+def task_id(request: pytest.FixtureRequest) -> str:
+    """Each registered task."""
+    return request.param

@@ -1,0 +1,178 @@
+"""What every dynamics promises, learned or true: rows are worlds of their own."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from dynamics_helpers import (
+    TRUE,
+    DynamicsMaker,
+    each_dynamics,
+    random_drive,
+    random_mask,
+    roll,
+    unequal_keys,
+)
+from tensordict import TensorDict
+
+ROWS, STEPS = 6, 4
+
+
+def rows_of(rows, state, torques, terrain):
+    return state[rows], torques[:, rows], None if terrain is None else terrain[rows]
+
+
+@each_dynamics
+def test_a_row_of_a_batch_moves_as_it_would_alone(scene, dynamics, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    drive = random_drive(scene, ROWS, STEPS, generator)
+    together = roll(make(), *drive)
+    tolerance = 0.0 if dynamics in TRUE else 1e-6
+    for row in range(ROWS):
+        alone = roll(make(), *rows_of(slice(row, row + 1), *drive))
+        for key in ("qpos", "qvel"):
+            torch.testing.assert_close(
+                together[key][row], alone[key][0], atol=tolerance, rtol=tolerance
+            )
+
+
+@each_dynamics
+def test_a_partial_reset_forgets_its_rows_and_no_others(scene, dynamics, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    start, torques, terrain = random_drive(scene, ROWS, 2 * STEPS, generator)
+    reset, untouched = make(), make()
+    middle = roll(reset, start, torques[:STEPS], terrain)[:, -1]
+    roll(untouched, start, torques[:STEPS], terrain)
+    rows = random_mask(ROWS, generator)
+    other = random_drive(scene, ROWS, 1, generator)[0]
+    state = torch.where(rows, other, middle)
+    reset.reset(state, rows)
+    after = roll(reset, state, torques[STEPS:], terrain)
+    undisturbed = roll(untouched, middle, torques[STEPS:], terrain)
+    assert not unequal_keys(after[~rows], undisturbed[~rows])
+    fresh = roll(make(), state, torques[STEPS:], terrain)
+    if dynamics == "streaming":  # another place in the ring sums in another order
+        for key in ("qpos", "qvel"):
+            torch.testing.assert_close(
+                after[key][rows], fresh[key][rows], atol=1e-6, rtol=1e-6
+            )
+    else:
+        assert not unequal_keys(after[rows], fresh[rows])
+
+
+@each_dynamics
+@pytest.mark.parametrize("junk", [float("nan"), float("inf"), 1e200])
+def test_a_broken_row_breaks_no_other(scene, dynamics, junk, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    row = int(torch.randint(ROWS, (), generator=generator))
+    key = ("qpos", "qvel")[int(torch.randint(2, (), generator=generator))]
+    broken = start.clone()
+    broken[key][row] = junk
+    others = torch.arange(ROWS) != row
+    polluted, clean = make(), make()
+    after = roll(polluted, broken, torques, terrain)
+    undisturbed = roll(clean, start, torques, terrain)
+    assert not unequal_keys(after[others], undisturbed[others])
+    if junk != 1e200:
+        state = torch.cat((after["qpos"], after["qvel"]), -1)
+        assert not state[row].isfinite().all(-1).any()
+    polluted.reset(start, ~others)
+    state = torch.where(others, after[:, -1], start)
+    healed = roll(polluted, state, torques, terrain)
+    assert healed["qpos"].isfinite().all() and healed["qvel"].isfinite().all()
+
+
+@each_dynamics
+def test_a_step_keeps_its_inputs_and_shares_no_memory(scene, dynamics, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    expected = roll(make(), start, torques, terrain)
+    moving, state, states = make(), start, []
+    for torque in torques:
+        inputs = [state.clone(), torque.clone()]
+        inputs += [] if terrain is None else [terrain.clone()]
+        moved = moving.step(*inputs)
+        assert not unequal_keys(inputs[0], state) and torch.equal(inputs[1], torque)
+        state = moved.clone()
+        states.append(state)
+        for value in (*inputs[0].values(), *inputs[1:], *moved.values()):
+            value.fill_(torch.nan)
+    assert not unequal_keys(torch.stack(states, 1), expected)
+
+
+@each_dynamics
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_moves_like_the_original_and_apart_from_it(
+    scene, dynamics, duplicate, generator
+):
+    make = DynamicsMaker(scene, dynamics, generator)
+    drive = random_drive(scene, ROWS, STEPS, generator)
+    original = make()
+    original.reset(drive[0])
+    twin = duplicate(original)
+    expected = roll(original, *drive)
+    assert not unequal_keys(roll(twin, *drive), expected)
+
+
+@each_dynamics
+@pytest.mark.parametrize("is_reset", [True, False], ids=["reset", "no reset"])
+def test_another_number_of_rows_starts_anew(scene, dynamics, is_reset, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    drive = random_drive(scene, ROWS, STEPS, generator)
+    used = make()
+    roll(used, *drive)
+    for rows in (slice(0, 1), slice(1, ROWS - 1), slice(0, ROWS)):
+        fewer = rows_of(rows, *drive)
+        if is_reset:
+            used.reset(fewer[0])
+        assert not unequal_keys(roll(used, *fewer), roll(make(), *fewer))
+
+
+@each_dynamics
+def test_wrong_shapes_are_refused_in_one_sentence(scene, dynamics, generator):
+    moving = DynamicsMaker(scene, dynamics, generator)()
+    start, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    torque, nq = torques[0], scene.model.nq
+
+    def message(state=start, torque=torque, terrain=terrain) -> str:
+        with pytest.raises(ValueError) as caught:
+            moving.step(state, torque, terrain)
+        return str(caught.value)
+
+    wide = start.clone().set("qpos", torch.zeros(ROWS, nq + 1, dtype=torch.float64))
+    said = message(state=wide)
+    assert "qpos" in said and str((ROWS, nq)) in said and str((ROWS, nq + 1)) in said
+    said = message(torque=torque[:-1])
+    assert "joint_torque" in said and str(tuple(torque.shape)) in said
+    assert "joint_torque" in message(torque=torque[:, None])
+    if terrain is not None:
+        assert "terrain" in message(terrain=None)
+        assert "terrain" in message(terrain=terrain[:, :-1])
+        assert "terrain" in message(terrain=terrain[0])
+
+
+@each_dynamics
+def test_torque_and_ground_matter(scene, dynamics, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    start, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    pushed = roll(make(), start, torques, terrain)["qvel"]
+    passive = roll(make(), start, 0.0 * torques, terrain)["qvel"]
+    assert (pushed != passive).any(-1).all()
+    if terrain is None:
+        return
+    touching = terrain.clone()
+    touching[:, 3] += 3.5  # no robot stands farther above its ground than this, in m
+    touched = roll(make(), start, torques, touching)["qvel"]
+    assert (touched != pushed).any(-1).all()
+
+
+@each_dynamics
+def test_states_are_float64_and_of_the_scene(scene, dynamics, generator):
+    moving = DynamicsMaker(scene, dynamics, generator)()
+    start, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    moved = moving.step(start, torques[0].float(), terrain)
+    assert isinstance(moved, TensorDict) and moved.batch_size == (ROWS,)
+    for key, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv)):
+        assert moved[key].shape == (ROWS, size) and moved[key].dtype == torch.float64

@@ -1,0 +1,86 @@
+"""The batched rollout is a plain loop of mj_step, one MjData per row."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from dynamics_helpers import random_drive, roll, unequal_keys
+from torch import Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.scenes import Scene
+
+ROWS, STEPS = 16, 8
+
+
+def plain_loop(
+    scene: Scene, qpos: Tensor, qvel: Tensor, torques: Tensor, plane: Tensor | None
+) -> tuple[np.ndarray, int]:
+    """States ``(steps, nq + nv)`` of one row, and how many constraints were active."""
+    model = copy.copy(scene.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    if plane is not None:
+        normal, offset = plane[:3].numpy(), float(plane[3])
+        data.mocap_pos[0] = normal * offset
+        mujoco.mju_quatZ2Vec(data.mocap_quat[0], normal)
+    states, constraints = [], 0
+    for torque in torques:
+        data.qfrc_applied[scene.actuated] = torque
+        for _ in range(scene.substeps):
+            mujoco.mj_step(model, data)
+            constraints += data.nefc
+        states.append(np.concatenate((data.qpos, data.qvel)))
+    return np.array(states), constraints
+
+
+def test_rollout_is_a_plain_loop_of_mj_step(scene, generator):
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    path = roll(MujocoDynamics(scene), start, torques, terrain)
+    path = torch.cat((path["qpos"], path["qvel"]), -1).numpy()
+    free_rows = 0
+    for row in range(ROWS):
+        plane = None if terrain is None else terrain[row]
+        state = start[row]
+        expected, constraints = plain_loop(
+            scene, state["qpos"], state["qvel"], torques[:, row], plane
+        )
+        if constraints == 0:
+            free_rows += 1
+            np.testing.assert_array_equal(path[row], expected)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(path[row], expected, rtol=0, atol=1e-12 * scale)
+    assert free_rows > 0
+
+
+def test_one_substep_at_a_time_is_the_same_loop(scene, generator):
+    fine = Scene(scene.name, scene.model, 1, scene.controller, scene.sampling)
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    path = roll(MujocoDynamics(fine), start, torques, terrain)
+    for row in range(ROWS):
+        plane = None if terrain is None else terrain[row]
+        state = start[row]
+        expected, _ = plain_loop(
+            fine, state["qpos"], state["qvel"], torques[:, row], plane
+        )
+        got = torch.cat((path["qpos"][row], path["qvel"][row]), -1).numpy()
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 33])
+def test_threads_do_not_change_a_bit(scene, rows, generator):
+    drive = random_drive(scene, rows, STEPS, generator)
+    paths = [roll(MujocoDynamics(scene, num_threads=n), *drive) for n in (1, 2, 3)]
+    for path in paths[1:]:
+        assert not unequal_keys(path, paths[0])
+
+
+def test_the_scene_is_left_as_it_was(scene, generator):
+    flags, qpos0 = int(scene.model.opt.disableflags), scene.model.qpos0.copy()
+    roll(MujocoDynamics(scene), *random_drive(scene, ROWS, 1, generator))
+    assert int(scene.model.opt.disableflags) == flags
+    np.testing.assert_array_equal(scene.model.qpos0, qpos0)

@@ -1,0 +1,126 @@
+"""A fault stays in its row, ends it, and is gone after its reset."""
+
+import pytest
+import torch
+from dynamics_helpers import (
+    EnvMaker,
+    act,
+    act_all,
+    each_dynamics,
+    junk_fill,
+    random_actions,
+    reset_rows,
+    start_at,
+    unequal_keys,
+)
+from tensordict import TensorDict
+
+ROWS, STEPS = 4, 3
+each_junk = pytest.mark.parametrize("junk", [float("nan"), float("inf"), -float("inf")])
+
+
+@each_dynamics
+@each_junk
+def test_a_bad_action_ends_its_own_row_alone(task_id, dynamics, junk, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, sound = make(ROWS), make(ROWS)
+    actions = random_actions(env, 3 * STEPS, generator)
+    row = int(torch.randint(ROWS, (), generator=generator))
+    bad = actions[STEPS].clone()
+    bad[row, int(torch.randint(bad.shape[1], (), generator=generator))] = junk
+    others = torch.arange(ROWS) != row
+    for each in (env, sound):
+        each.reset()
+        before = act_all(each, actions[:STEPS])[:, -1]
+
+    faulty, expected = act(env, bad), act(sound, actions[STEPS])
+    assert not unequal_keys(faulty[others], expected[others])
+    assert faulty["terminated"][row] and faulty["done"][row]
+    assert not faulty["truncated"][row]
+    for key in ("observation", "reward", "qpos", "qvel", "joint_torque"):
+        assert faulty[key].isfinite().all(), key
+    assert torch.equal(faulty["qpos"][row], before["qpos"][row])
+
+    start = reset_rows(env, ~others)
+    after, expected = (act_all(each, actions[-STEPS:]) for each in (env, sound))
+    assert not unequal_keys(after[others], expected[others])
+    clean = make(ROWS)
+    start_at(clean, start)
+    fresh = act_all(clean, actions[-STEPS:])
+    tolerance = 1e-6 if dynamics == "streaming" else 0.0
+    for key in ("qpos", "qvel", "observation", "reward"):
+        size = fresh[key][row].abs().max()
+        difference = (after[key][row] - fresh[key][row]).abs().max()
+        assert difference <= tolerance * (1.0 + size), key
+
+
+@each_dynamics
+def test_a_row_that_the_physics_cannot_step_ends_alone(task_id, dynamics, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, sound = make(ROWS), make(ROWS)
+    start = sound.reset()
+    row = int(torch.randint(ROWS, (), generator=generator))
+    others = torch.arange(ROWS) != row
+    wild = start.clone()
+    wild["qvel"][row] = 1e300
+    start_at(env, wild)
+    start_at(sound, start)
+    actions = random_actions(env, 2 * STEPS, generator)
+    first, expected = (act(each, actions[0]) for each in (env, sound))
+    assert not unequal_keys(first[others], expected[others])
+    assert first["terminated"][row]
+    assert first["qpos"].isfinite().all() and first["qvel"].isfinite().all()
+    reset_rows(env, ~others)
+    after, expected = (act_all(each, actions[1:]) for each in (env, sound))
+    assert not unequal_keys(after[others], expected[others])
+    state = torch.cat((after["qpos"], after["qvel"], after["reward"]), -1)
+    assert state.isfinite().all()
+
+
+@each_dynamics
+def test_actions_beyond_the_limits_act_like_the_limits(task_id, dynamics, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, limited = make(ROWS), make(ROWS)
+    for each in (env, limited):
+        each.reset()
+    actions = 50.0 * random_actions(env, STEPS, generator)
+    after, expected = act_all(env, actions), act_all(limited, actions.clamp(-1.0, 1.0))
+    assert torch.equal(after["qpos"], expected["qpos"])
+
+
+@each_dynamics
+def test_collected_data_never_alias_the_env(task_id, dynamics, generator):
+    """Junk written into all that an env returned changes nothing, and it writes none."""
+    make = EnvMaker(task_id, dynamics, generator)
+    env, sound = make(ROWS), make(ROWS)
+    actions = random_actions(env, 4 * STEPS, generator)
+    junk_fill(env.reset())
+    sound.reset()
+    kept, copies = [], []
+    for step, action in enumerate(actions):
+        if step == 2 * STEPS:
+            rows = torch.tensor([True, False, True, False])
+            given = TensorDict({"_reset": rows[:, None]}, [ROWS])
+            junk_fill(env.reset(given))
+            reset_rows(sound, rows)
+        record = env.step(TensorDict({"action": action.clone()}, [ROWS]))
+        kept.append(sound.step(TensorDict({"action": action.clone()}, [ROWS])))
+        copies.append(kept[-1].clone())
+        assert not unequal_keys(record["next"], kept[-1]["next"])
+        junk_fill(record)
+        junk_fill(env.state)
+    for record, copy in zip(kept, copies, strict=True):
+        assert not unequal_keys(record, copy)
+
+
+@each_dynamics
+def test_a_given_state_is_copied(task_id, dynamics, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, sound = make(ROWS), make(ROWS)
+    start = sound.reset()
+    start_at(sound, start)
+    given = start.clone()
+    env.reset(given, set_state=True)
+    junk_fill(given)
+    action = random_actions(env, 1, generator)[0]
+    assert not unequal_keys(act(env, action), act(sound, action))

@@ -1,0 +1,154 @@
+"""Same seed, same bits; another seed, other numbers; the global generators untouched."""
+
+import hashlib
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dynamics_helpers import (
+    EnvMaker,
+    act_all,
+    each_dynamics,
+    random_actions,
+    random_model,
+    unequal_keys,
+)
+from torch import Generator, Tensor
+
+from torchrl_nerd import GroundTruthEnv, NeRDEnv, load_scene, make_env
+from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.envs.streams import row_uniforms
+from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.tasks import TASKS, make_task
+
+ROWS, STEPS = 4, 8
+TASK = next(iter(TASKS))
+
+
+def life(env, generator: Generator) -> Tensor:
+    """Steps and resets of an env whose episodes are short, ``[rows, steps]``."""
+    actions, state, states = random_actions(env, STEPS, generator), env.reset(), []
+    for action in actions:
+        record, state = env.step_and_maybe_reset(state.set("action", action))
+        states.append(record)
+    return torch.stack(states, 1)
+
+
+@each_dynamics
+def test_same_seed_same_bits_and_other_seed_other_starts(
+    task_id, dynamics, generator, seed
+):
+    make = EnvMaker(task_id, dynamics, generator, horizon=3)
+    copies = [life(make(ROWS, seed), Generator().manual_seed(1)) for _ in range(2)]
+    assert not unequal_keys(*copies)
+    other = life(make(ROWS, seed ^ 1), Generator().manual_seed(1))
+    assert (other["qpos"][:, 0] != copies[0]["qpos"][:, 0]).any(-1).all()
+
+
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+def test_setting_the_seed_begins_again(task_id, dynamics, generator, seed):
+    make = EnvMaker(task_id, dynamics, generator, horizon=3)
+    env = make(ROWS, 0)
+    life(env, generator)
+    env.set_seed(seed)
+    again = life(env, Generator().manual_seed(1))
+    assert not unequal_keys(again, life(make(ROWS, seed), Generator().manual_seed(1)))
+
+
+def test_any_seed_that_torchrl_hands_on_is_taken(seed):
+    env = GroundTruthEnv(TASK)
+    env.set_seed(2**32 - 2)  # the largest that torchrl's seed_generator gives
+    for _ in range(16):
+        seed = env.set_seed(seed)
+
+
+def test_episodes_rows_and_seeds_share_no_numbers(task_id, seed):
+    starts = []
+    for step in range(3):
+        env = GroundTruthEnv(task_id, num_envs=ROWS, seed=(seed + step) % 2**31)
+        for _ in range(2):
+            start = env.reset()
+            starts.append(torch.cat((start["qpos"], start["qvel"]), -1))
+    rows = torch.cat(starts)
+    assert len(rows.unique(dim=0)) == len(rows) == 6 * ROWS
+
+
+def test_a_row_draws_the_same_in_any_company(task_id, seed):
+    few, many = (GroundTruthEnv(task_id, num_envs=n, seed=seed) for n in (3, 7))
+    for _ in range(2):
+        a, b = few.reset(), many.reset()
+        assert torch.equal(a["qpos"], b["qpos"][:3])
+        assert torch.equal(a["qvel"], b["qvel"][:3])
+
+
+def test_uniform_numbers_are_uniform_and_uncorrelated(seed):
+    rows, episodes, count = 128, 16, 8
+    u = torch.stack(
+        [row_uniforms(seed, torch.full((rows,), e), count) for e in range(episodes)]
+    )
+    assert u.min() >= 0.0 and u.max() < 1.0
+    ordered = u.flatten().sort().values
+    grid = torch.arange(len(ordered)) / len(ordered)
+    assert (ordered - grid).abs().max() < 3.5 / len(ordered) ** 0.5  # one in 10^10
+    for dim in range(3):
+        a, b = u.narrow(dim, 0, u.shape[dim] - 1), u.narrow(dim, 1, u.shape[dim] - 1)
+        correlation = 12.0 * ((a - 0.5) * (b - 0.5)).mean()
+        assert correlation.abs() < 7.0 / a.numel() ** 0.5
+
+
+@each_dynamics
+def test_the_global_generators_are_left_alone(task_id, dynamics, generator, tmp_path):
+    make = EnvMaker(task_id, dynamics, generator, horizon=2)
+    if make.model is not None:
+        save_checkpoint(make.model, tmp_path, make_card(make.model))
+
+    def states() -> tuple:
+        return torch.get_rng_state().tolist(), random.getstate(), np.random.get_state()
+
+    before = states()
+    env = make(ROWS)
+    env.set_seed(1)
+    life(env, generator)
+    if make.model is not None:
+        NeRDEnv(task_id, tmp_path)
+    after = states()
+    assert after[:2] == before[:2]
+    assert (after[2][1] == before[2][1]).all() and after[2][2] == before[2][2]
+
+
+def fingerprint(folder: Path, seed: int) -> str:
+    """Hash of a few steps of every task, in learned and in true dynamics."""
+    digest = hashlib.sha256()
+    for task_id in TASKS:
+        scene = make_task(task_id).scene.name
+        for dynamics in (folder / scene, "mujoco"):
+            env = make_env(task_id, dynamics, ROWS, seed)
+            env.reset()
+            path = act_all(env, random_actions(env, 4, Generator().manual_seed(seed)))
+            for key in ("qpos", "qvel", "observation", "reward"):
+                digest.update(path[key].contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def test_another_process_gets_the_same_bits(tmp_path, generator, seed):
+    for name in SCENES:
+        model = random_model(load_scene(name), generator)
+        save_checkpoint(model, tmp_path / name, make_card(model))
+    code = (
+        "import sys; from pathlib import Path; from test_seeds import fingerprint;"
+        "print(fingerprint(Path(sys.argv[1]), int(sys.argv[2])))"
+    )
+    paths = [Path(__file__).parent, Path(__file__).parents[1]]
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path), str(seed)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stdout.split()[-1] == fingerprint(tmp_path, seed)

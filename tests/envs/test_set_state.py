@@ -1,0 +1,159 @@
+"""Starting from a given state, and taking an env's state elsewhere."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from dynamics_helpers import (
+    LEARNED,
+    EnvMaker,
+    act_all,
+    each_dynamics,
+    random_actions,
+    random_drive,
+    random_mask,
+    reset_rows,
+    start_at,
+    unequal_keys,
+)
+from tensordict import TensorDict
+
+ROWS, STEPS = 4, 3
+
+
+def random_state(env, generator) -> TensorDict:
+    """A state of the scene's training ranges, far from the task's resets."""
+    state, _, terrain = random_drive(env.scene, ROWS, 1, generator)
+    if terrain is not None:
+        state["terrain"] = terrain
+    return state
+
+
+@each_dynamics
+def test_an_env_starts_where_it_is_told(task_id, dynamics, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, other = make(ROWS, seed=0), make(ROWS, seed=1)
+    state = random_state(env, generator)
+    other.reset()
+    act_all(other, random_actions(env, STEPS, generator))
+    for each in (env, other):
+        given = each.reset(state.clone(), set_state=True)
+        for key, value in state.items():
+            assert torch.equal(given[key], value)
+        expected = each.task.observation(state).float()
+        assert torch.equal(given["observation"], expected)
+        assert not given["done"].any()
+    actions = random_actions(env, STEPS, generator)
+    assert not unequal_keys(act_all(env, actions), act_all(other, actions))
+
+
+@each_dynamics
+def test_a_mask_says_which_rows_are_set(task_id, dynamics, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, undisturbed = make(ROWS), make(ROWS)
+    actions = random_actions(env, 2 * STEPS, generator)
+    for each in (env, undisturbed):
+        each.reset()
+        before = act_all(each, actions[:STEPS])[:, -1]
+    rows = random_mask(ROWS, generator)
+    state = random_state(env, generator)
+    given = state.clone().set("_reset", rows[:, None])
+    given["qpos"][~rows] = torch.nan  # what stands in other rows is nobody's business
+    after = env.reset(given, set_state=True)
+    assert torch.equal(after["qpos"][rows], state["qpos"][rows])
+    assert torch.equal(env.state["qpos"][~rows], before["qpos"][~rows])
+    path, expected = (act_all(each, actions[STEPS:]) for each in (env, undisturbed))
+    assert not unequal_keys(path[~rows], expected[~rows])
+    fresh = make(ROWS)
+    start_at(fresh, state)
+    expected = act_all(fresh, actions[STEPS:])
+    for key in ("qpos", "qvel"):
+        size = expected[key].abs().max()
+        difference = (path[key][rows] - expected[key][rows]).abs().max()
+        assert difference <= (1e-6 if dynamics == "streaming" else 0.0) * (1.0 + size)
+
+
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+def test_parameters_that_are_not_given_are_drawn(task_id, dynamics, generator):
+    env = EnvMaker(task_id, dynamics, generator)(ROWS)
+    state = random_state(env, generator).select("qpos", "qvel")
+    after = env.reset(state, set_state=True)
+    for key, size in env.task.parameters.items():
+        assert after[key].shape == (ROWS, size) and after[key].isfinite().all()
+        assert after[key].any(-1).all()
+
+
+def test_bad_states_are_refused_in_one_sentence(task_id, generator):
+    env = EnvMaker(task_id, "mujoco", generator)(ROWS)
+    before = env.reset()
+    state = random_state(env, generator)
+    nq = env.scene.model.nq
+
+    def message(given: TensorDict | None) -> str:
+        with pytest.raises(ValueError) as caught:
+            env.reset(given, set_state=True)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    for key in ("qpos", "qvel"):
+        assert key in message(state.exclude(key))
+    assert "qpos" in message(None)
+    said = message(state.clone().set("qpos", torch.zeros(ROWS, nq + 1)))
+    assert f"qpos of shape ({ROWS}, {nq})" in said and f"({ROWS}, {nq + 1})" in said
+    for key in state.keys():
+        for junk in (torch.nan, torch.inf):
+            wrong = state.clone()
+            wrong[key][1, 0] = junk
+            assert f"finite {key}" in message(wrong)
+    assert torch.equal(env.state["qpos"], before["qpos"])  # and nothing has changed
+
+
+@each_dynamics
+def test_state_dict_restores_the_physical_state(task_id, dynamics, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, other = make(ROWS, seed=5), make(ROWS, seed=5)
+    actions = random_actions(env, 2 * STEPS, generator)
+    env.reset()
+    act_all(env, actions[:STEPS])
+    reset_rows(env, random_mask(ROWS, generator))
+    other.reset()
+    other.load_state_dict(copy.deepcopy(env.state_dict()))
+    assert not unequal_keys(other.state, env.state)
+    if dynamics not in LEARNED:
+        after, expected = (act_all(each, actions[STEPS:]) for each in (other, env))
+        for key in ("qpos", "qvel"):  # a solver's warm start is no state
+            torch.testing.assert_close(after[key], expected[key], atol=1e-9, rtol=1e-9)
+    again, expected = (each.reset() for each in (other, env))
+    assert torch.equal(again["qpos"], expected["qpos"])
+
+
+@each_dynamics
+def test_state_dict_leaves_no_history_of_another_life(task_id, dynamics, generator):
+    """What a row saw before a state was loaded does not move it afterwards."""
+    make = EnvMaker(task_id, dynamics, generator)
+    used, fresh, source = (make(ROWS, seed=5) for _ in range(3))
+    actions = random_actions(used, 2 * STEPS, generator)
+    used.reset()
+    act_all(used, actions[:STEPS])
+    fresh.reset()
+    start_at(source, random_state(source, generator))
+    for each in (used, fresh):
+        each.load_state_dict(copy.deepcopy(source.state_dict()))
+    after, expected = (act_all(each, actions[STEPS:]) for each in (used, fresh))
+    for key in ("qpos", "qvel"):
+        torch.testing.assert_close(after[key], expected[key], atol=1e-6, rtol=1e-6)
+
+
+@each_dynamics
+@pytest.mark.parametrize("way", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copied_env_lives_a_life_of_its_own(task_id, dynamics, way, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, expected = make(ROWS), make(ROWS)
+    actions = random_actions(env, STEPS, generator)
+    for each in (env, expected):
+        each.reset()
+    twin = way(env)
+    copied, path = act_all(twin, actions), act_all(env, actions)
+    wanted = act_all(expected, actions)
+    assert not unequal_keys(copied, wanted) and not unequal_keys(path, wanted)

@@ -1,0 +1,138 @@
+"""Points on random robots and on every scene against mj_kinematics and mj_jac."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from helpers import every_scene, random_quats, random_states, random_tree
+
+from torchrl_nerd.geometry.kinematics import (
+    Base,
+    PointKinematics,
+    matrix_from_quat,
+    mount_pose,
+)
+
+ROWS, POINTS = 20, 7
+
+
+def random_points(model, base, rng):
+    """Bodies that the base carries, itself included, and places on them."""
+    carried = [base.body]
+    for body in range(base.body + 1, model.nbody):
+        if model.body_parentid[body] in carried:
+            carried.append(body)
+    return rng.choice(carried, POINTS).tolist(), rng.normal(size=(POINTS, 3))
+
+
+def seen_by_the_base(model, base, data, body, point):
+    """Position and velocity of one point by MuJoCo, to a rider on the base, in B_t."""
+    world = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point
+    jacobian, velocity, turning = np.empty((3, model.nv)), np.zeros(3), np.zeros(3)
+    mujoco.mj_jac(model, data, jacobian, None, world, body)
+    if base.is_floating:
+        position = data.xpos[base.body]
+        rotation = data.xmat[base.body].reshape(3, 3)
+        v = base.dof_address
+        velocity = data.qvel[v : v + 3]
+        turning = rotation @ data.qvel[v + 3 : v + 6]
+    else:
+        position, rotation = mount_pose(model, base)
+    arm = world - position
+    relative = jacobian @ data.qvel - velocity - np.cross(turning, arm)
+    return rotation.T @ arm, rotation.T @ relative
+
+
+def check_against_mujoco(model, rng):
+    base, data = Base.from_model(model), mujoco.MjData(model)
+    bodies, places = random_points(model, base, rng)
+    qpos, qvel = random_states(model, ROWS, rng)
+    positions, velocities = PointKinematics(model, base, bodies, places)(qpos, qvel)
+    assert positions.shape == velocities.shape == (ROWS, POINTS, 3)
+    for row in range(ROWS):
+        data.qpos, data.qvel = qpos[row].numpy(), qvel[row].numpy()
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for point, (body, place) in enumerate(zip(bodies, places, strict=True)):
+            where, speed = seen_by_the_base(model, base, data, body, place)
+            np.testing.assert_allclose(positions[row, point], where, 0, 1e-11)
+            np.testing.assert_allclose(velocities[row, point], speed, 0, 1e-10)
+
+
+@pytest.mark.parametrize("is_floating", [True, False], ids=["floating", "fixed"])
+@pytest.mark.parametrize("draw", range(4))
+def test_random_robots_move_as_in_mujoco(is_floating, draw, rng):
+    check_against_mujoco(random_tree(rng, is_floating), rng)
+
+
+@every_scene
+def test_scenes_move_as_in_mujoco(scene, rng):
+    check_against_mujoco(scene.model, rng)
+
+
+def test_distance_from_the_origin_costs_no_digits(rng):
+    model = random_tree(rng, is_floating=True)
+    base = Base.from_model(model)
+    kinematics = PointKinematics(model, base, *random_points(model, base, rng))
+    qpos, qvel = random_states(model, ROWS, rng)
+    far = qpos.clone()
+    far[:, :3] += 1e6 * torch.from_numpy(rng.normal(size=3))
+    for here, there in zip(kinematics(qpos, qvel), kinematics(far, qvel), strict=True):
+        assert torch.equal(here, there)
+
+
+def test_velocities_are_the_derivative_of_positions(rng):
+    model = random_tree(rng, is_floating=False)
+    base = Base.from_model(model)
+    kinematics = PointKinematics(model, base, *random_points(model, base, rng))
+    qpos, qvel = random_states(model, ROWS, rng)
+    step, moved = 1e-6, []
+    for sign in (-1.0, 1.0):
+        there = qpos.numpy().copy()
+        for q, v in zip(there, qvel.numpy(), strict=True):
+            mujoco.mj_integratePos(model, q, v, sign * step)
+        moved.append(kinematics(torch.from_numpy(there), qvel)[0])
+    slope = (moved[1] - moved[0]) / (2.0 * step)
+    torch.testing.assert_close(slope, kinematics(qpos, qvel)[1], rtol=1e-6, atol=1e-6)
+
+
+def test_leading_dimensions_are_kept(rng):
+    model = random_tree(rng, is_floating=True)
+    base = Base.from_model(model)
+    kinematics = PointKinematics(model, base, *random_points(model, base, rng))
+    qpos, qvel = random_states(model, 6, rng)
+    flat = kinematics(qpos, qvel)
+    batch = kinematics(qpos.reshape(2, 3, -1), qvel.reshape(2, 3, -1))
+    one = kinematics(qpos[4], qvel[4])
+    for x, y, z in zip(flat, batch, one, strict=True):
+        torch.testing.assert_close(y.reshape(6, POINTS, 3), x, rtol=0.0, atol=1e-14)
+        torch.testing.assert_close(z, x[4], rtol=0.0, atol=1e-14)
+
+
+def test_matrices_are_mujocos(generator):
+    for quat in random_quats(50, generator):
+        want = np.empty(9)
+        mujoco.mju_quat2Mat(want, quat.numpy())
+        got = matrix_from_quat(quat).reshape(9)
+        np.testing.assert_allclose(got, want, 0, 1e-15)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "found"),
+    [
+        ('<body><geom size="1"/></body>', "no joint"),
+        ('<body><freejoint/><geom size="1"/></body>' * 2, "2 moving trees"),
+    ],
+)
+def test_a_scene_is_one_robot(bodies, found):
+    xml = f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"
+    with pytest.raises(ValueError, match=f"one robot, got {found}"):
+        Base.from_model(mujoco.MjModel.from_xml_string(xml))
+
+
+def test_points_must_be_on_the_robot(rng):
+    model = random_tree(rng, is_floating=False)
+    base = Base.from_model(model)
+    assert model.body_parentid[base.body] == 1  # body 1 is fixed in the world
+    with pytest.raises(ValueError, match="moving bodies of the robot"):
+        PointKinematics(model, base, [1], np.zeros((1, 3)))
