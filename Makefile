@@ -67,7 +67,8 @@ build: $(STAMP) ## wheel and source archive in dist/
 lock: ## write the newest versions that pyproject.toml allows to constraints.txt
 	rm -rf $(VENV)
 	$(MAKE) setup CONSTRAINTS=/dev/null
-	$(PY) -m pip freeze -qq --exclude-editable | sed 's/+.*//' > constraints.txt
+	echo "# The versions that make installs; written by make lock." > constraints.txt
+	$(PY) -m pip freeze -qq --exclude-editable | sed 's/+.*//' >> constraints.txt
 
 clean: ## remove .venv, caches and built files; runs/ and datasets/ stay
 	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache

@@ -203,6 +203,7 @@ class CausalTransformer(nn.Module):
 
 PRESETS = {
     "tiny": TransformerConfig(2, 64, 4),
+    "wide": TransformerConfig(2, 128, 4),
     "small": TransformerConfig(4, 128, 4),
     "paper": TransformerConfig(6, 192, 12),
     "paper-large": TransformerConfig(6, 384, 12),

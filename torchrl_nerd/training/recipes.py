@@ -23,7 +23,9 @@ RECIPES: dict[str, Recipe] = {
     ),
     "double_pendulum": Recipe(
         DataConfig(trajectories=40_000, steps=100),
-        TrainConfig(steps=60_000, rollout_steps=3_000),
+        TrainConfig(
+            network="wide", steps=36_000, rollout_steps=2_000, softening=0.3
+        ),
         "double_pendulum/passive",
     ),
 }

@@ -34,7 +34,7 @@ class TrainConfig:
 
     | field | meaning |
     |---|---|
-    | ``network`` | name of a network: tiny, small, paper, paper-large, mlp, gru |
+    | ``network`` | name in `NETWORKS`: tiny, wide, small, paper, paper-large, mlp, gru |
     | ``steps`` | updates on one-step targets |
     | ``rollout_steps`` | further updates on the model's own rollouts |
     | ``rows``, ``length`` | sequences per update and tokens of each |
