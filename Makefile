@@ -71,5 +71,5 @@ lock: ## write the newest versions that pyproject.toml allows to constraints.txt
 	$(PY) -m pip freeze -qq --exclude-editable | sed 's/+.*//' >> constraints.txt
 
 clean: ## remove .venv, caches and built files; runs/ and datasets/ stay
-	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache MUJOCO_LOG.TXT
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,7 +1,9 @@
 """Learned models whose history matters, and envs in every dynamics, for the tests."""
 
+import json
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor, nn
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd.checkpoint import CARD
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import (
     DMControlDynamics,
@@ -143,9 +146,10 @@ def act_all(env: SceneEnv, actions: Tensor) -> TensorDict:
     return torch.stack([act(env, action) for action in actions], 1)
 
 
-def reset_rows(env: SceneEnv, rows: Tensor) -> TensorDict:
-    """A partial reset of ``rows`` (bool ``(num_envs,)``)."""
-    return env.reset(TensorDict({"_reset": rows[:, None]}, env.batch_size))
+def reset_rows(env: SceneEnv, rows: Tensor, state: TensorDict | None = None):
+    """A partial reset of ``rows`` (bool ``(num_envs,)``); the others show ``state``."""
+    given = TensorDict({}, env.batch_size) if state is None else state.clone()
+    return env.reset(given.set("_reset", rows[:, None]))
 
 
 def start_at(env: SceneEnv, state: TensorDict) -> TensorDict:
@@ -169,9 +173,26 @@ def unequal_keys(a: Mapping, b: Mapping) -> list:
     ]
 
 
+MOTION = ("qpos", "qvel", "observation", "reward", "joint_torque")
+
+
+def assert_same_motion(got: TensorDict, expected: TensorDict, tolerance: float) -> None:
+    """All that moves, within ``tolerance`` of the largest number; 0: bit for bit."""
+    for key in set(MOTION) & set(expected.keys()):
+        limit = tolerance * (1.0 + expected[key].abs().max())
+        difference = (got[key] - expected[key]).abs().max()
+        assert difference <= limit, f"{key} differs by {difference}"
+
+
 def random_mask(rows: int, generator: Generator, share: float = 0.5) -> Tensor:
     """Some rows, never none and never all of them."""
     mask = torch.rand(rows, generator=generator) < share
     first, last = torch.randperm(rows, generator=generator)[:2]
     mask[first], mask[last] = True, False
     return mask
+
+
+def edit_card(folder: Path, **changes: object) -> None:
+    """Replace entries of a checkpoint's card."""
+    card = json.loads((folder / CARD).read_text())
+    (folder / CARD).write_text(json.dumps({**card, **changes}))

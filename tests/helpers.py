@@ -39,7 +39,7 @@ ARM = """
 <mujoco><option timestep="0.002" integrator="Euler" cone="elliptic"/><worldbody>
   <geom name="floor" type="plane" size="0 0 1" quat="0.97 0.2 0.1 0"
     contype="1" conaffinity="0"/>
-  <body pos="0.3 -0.2 0.8" quat="0.8 0.3 -0.4 0.3">
+  <body pos="0.3 -0.2 0.4" quat="0.8 0.3 -0.4 0.3">
     <joint name="shoulder" type="ball"/>
     <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.06" mass="2"
       contype="0" conaffinity="1"/>
@@ -60,7 +60,7 @@ def make_scene(model: mujoco.MjModel | str, name: str = "handmade") -> Scene:
     return Scene(name, model, 2, TorqueController(torque), sampling)
 
 
-HANDMADE = {"floater": make_scene(FLOATER), "arm": make_scene(ARM)}
+HANDMADE = {"floater": make_scene(FLOATER, "floater"), "arm": make_scene(ARM, "arm")}
 
 every_scene = pytest.mark.parametrize(
     "scene",
@@ -133,7 +133,9 @@ def moved_scene(scene: Scene, yaw: float, shift: Tensor) -> Scene:
     for positions, quats, index in fixed:
         position = torch.from_numpy(positions[index].copy())
         positions[index] = (rotate(turn, position) + shift).numpy()
-        quats[index] = quat_multiply(turn, torch.from_numpy(quats[index].copy())).numpy()
+        quats[index] = quat_multiply(
+            turn, torch.from_numpy(quats[index].copy())
+        ).numpy()
     return replace(scene, model=model)
 
 
@@ -149,7 +151,8 @@ def moved_rows(scene: Scene, rows: TensorDict, yaw: float, shift: Tensor) -> Ten
             q, v = scene.base.qpos_address, scene.base.dof_address
             qpos, qvel = state[QPOS], state[QVEL]
             qpos[..., q : q + 3] = rotate(turn, qpos[..., q : q + 3]) + shift
-            qpos[..., q + 3 : q + 7] = quat_multiply(turn, qpos[..., q + 3 : q + 7])
+            quat = qpos[..., q + 3 : q + 7]
+            qpos[..., q + 3 : q + 7] = quat_multiply(turn.expand_as(quat), quat)
             qvel[..., v : v + 3] = rotate(turn, qvel[..., v : v + 3])
     return rows
 

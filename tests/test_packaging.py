@@ -26,7 +26,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
 
 def read(wheel: ZipFile, name: str) -> str:
     """A file of the wheel's ``.dist-info`` folder."""
-    path = next(path for path in wheel.namelist() if path.endswith(f".dist-info/{name}"))
+    ending = f".dist-info/{name}"
+    path = next(path for path in wheel.namelist() if path.endswith(ending))
     return wheel.read(path).decode()
 
 
@@ -43,15 +44,16 @@ def test_wheel_holds_every_file_of_the_package(wheel):
 
 
 def test_every_shipped_model_is_small_and_complete(wheel):
-    prefix = "torchrl_nerd/pretrained/"
-    files = [i for i in wheel.infolist() if i.filename.startswith(prefix)]
-    if not files:
-        pytest.skip("no model is shipped yet")
-    files = [i for i in files if not i.filename.endswith(".py")]
-    for folder in {Path(info.filename).parent for info in files}:
-        names = {Path(i.filename).name for i in files if folder in Path(i.filename).parents}
-        assert {"card.json", "model.safetensors"} == names, folder
-    assert all(info.file_size < 2_000_000 for info in files)
+    sizes = {
+        Path(info.filename).relative_to("torchrl_nerd/pretrained"): info.file_size
+        for info in wheel.infolist()
+        if info.filename.startswith("torchrl_nerd/pretrained/")
+    }
+    models = {path.parent for path in sizes}
+    assert models
+    for model in models:
+        assert model / "card.json" in sizes
+        assert 0 < sizes[model / "model.safetensors"] < 2_000_000
 
 
 def test_wheel_installs_the_nerd_command_and_the_licence(wheel):

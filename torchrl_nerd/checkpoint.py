@@ -81,7 +81,9 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
             or weights of another robot.
     """
     if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
-        raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint")
+        raise ValueError(
+            f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint"
+        )
     card = read_json(folder / CARD)
     scene = scene or _scene_of(card, folder)
     _compare(card, scene, folder)
@@ -179,4 +181,6 @@ def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         return load_file(path)
     except SafetensorError as error:
-        raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None
+        raise ValueError(
+            f"{path} is truncated or no safetensors file: {error}"
+        ) from None

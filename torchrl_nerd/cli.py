@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 import tyro
@@ -13,7 +13,6 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.nerd import Inference
-from torchrl_nerd.evaluation.policy_transfer import transfer
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_json
@@ -49,7 +48,9 @@ class Data:
         out = self.out or Path("datasets") / self.scene
         generate(scene, self.config, out, self.quiet)
         card = read_json(out / CARD)
-        print(f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped")
+        print(
+            f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
+        )
         return card
 
 
@@ -181,6 +182,8 @@ class Transfer:
     """Of the resets."""
     json: Path | None = None
     """Write the figures to this file."""
+
+
 """The command line grows a command by a class here and a line in COMMANDS."""
 
 
@@ -200,7 +203,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     kind = COMMANDS[argv[0]]
     try:
         command = tyro.cli(
-            kind, args=argv[1:], prog=f"nerd {argv[0]}", default=_default(kind, argv[1:])
+            kind,
+            args=argv[1:],
+            prog=f"nerd {argv[0]}",
+            default=_default(kind, argv[1:]),
         )
         figures = command.run()
         if command.json is not None:

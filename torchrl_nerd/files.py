@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Replace ``path`` by what ``write(temporary path)`` leaves, durably.
 
     A crash at any moment leaves the old file or the new one, never a part.
@@ -31,7 +31,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON object atomically."""
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    write_atomically(path, lambda aside: aside.write_text(text) and None)
+    write_atomically(path, lambda aside: aside.write_text(text))
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -43,7 +43,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text())
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"expected JSON in {path}, got something else: {error}") from None
+        raise ValueError(
+            f"expected JSON in {path}, got something else: {error}"
+        ) from None
     if not isinstance(content, dict):
         kind = type(content).__name__
         raise ValueError(f"expected a JSON object in {path}, got a {kind}")

@@ -45,6 +45,11 @@ CONTACT_VELOCITY = "contact_velocity"
 """Velocity of each contact point in B_t, along and across the ground's normal
 ``(*batch, num_points * 4)``, m/s, zero beyond the margin."""
 
+CONTACT_DEPTH = "contact_depth"
+"""How deep each point's surface would lie in the ground at a few times within the control
+step if ``qvel`` stayed as it is ``(*batch, num_points * K)``, m, at least zero, and zero
+beyond the margin."""
+
 CONTACT_NORMAL = "contact_normal"
 """Ground normal at each point in B_t ``(*batch, num_points * 3)``, zero beyond the
 margin. Only where it does not follow from gravity."""

@@ -8,6 +8,7 @@ import torch
 from dynamics_helpers import (
     TRUE,
     DynamicsMaker,
+    assert_same_motion,
     each_dynamics,
     random_drive,
     random_mask,
@@ -28,13 +29,9 @@ def test_a_row_of_a_batch_moves_as_it_would_alone(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
     drive = random_drive(scene, ROWS, STEPS, generator)
     together = roll(make(), *drive)
-    tolerance = 0.0 if dynamics in TRUE else 1e-6
     for row in range(ROWS):
         alone = roll(make(), *rows_of(slice(row, row + 1), *drive))
-        for key in ("qpos", "qvel"):
-            torch.testing.assert_close(
-                together[key][row], alone[key][0], atol=tolerance, rtol=tolerance
-            )
+        assert_same_motion(alone[0], together[row], 0.0 if dynamics in TRUE else 1e-6)
 
 
 @each_dynamics
@@ -52,13 +49,9 @@ def test_a_partial_reset_forgets_its_rows_and_no_others(scene, dynamics, generat
     undisturbed = roll(untouched, middle, torques[STEPS:], terrain)
     assert not unequal_keys(after[~rows], undisturbed[~rows])
     fresh = roll(make(), state, torques[STEPS:], terrain)
-    if dynamics == "streaming":  # another place in the ring sums in another order
-        for key in ("qpos", "qvel"):
-            torch.testing.assert_close(
-                after[key][rows], fresh[key][rows], atol=1e-6, rtol=1e-6
-            )
-    else:
-        assert not unequal_keys(after[rows], fresh[rows])
+    # another place in the ring of keys and values sums in another order
+    tolerance = 1e-6 if dynamics == "streaming" else 0.0
+    assert_same_motion(after[rows], fresh[rows], tolerance)
 
 
 @each_dynamics
@@ -103,7 +96,9 @@ def test_a_step_keeps_its_inputs_and_shares_no_memory(scene, dynamics, generator
 
 
 @each_dynamics
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
 def test_a_copy_moves_like_the_original_and_apart_from_it(
     scene, dynamics, duplicate, generator
 ):

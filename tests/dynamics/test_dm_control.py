@@ -49,9 +49,7 @@ def test_a_state_written_from_outside_is_where_a_row_goes_on(scene, generator):
     used, fresh = DMControlDynamics(scene), DMControlDynamics(scene)
     roll(used, *drive)
     for key in ("qpos", "qvel"):
-        moved, expected = (
-            roll(d, start, torques, terrain)[key] for d in (used, fresh)
-        )
+        moved, expected = (roll(d, start, torques, terrain)[key] for d in (used, fresh))
         used.reset(start)
         fresh.reset(start)
         assert torch.equal(moved, expected)

@@ -81,7 +81,9 @@ def test_gradients_are_those_of_finite_differences(scene, inference, generator):
     (gradient,) = torch.autograd.grad(objective(push), push)
     with torch.no_grad():
         h = torch.tensor(1e-5, dtype=torch.float64)
-        slopes = [(objective(k * h) - objective(-k * h)) / (2.0 * k * h) for k in (1, 2)]
+        slopes = [
+            (objective(k * h) - objective(-k * h)) / (2.0 * k * h) for k in (1, 2)
+        ]
     slope = (4.0 * slopes[0] - slopes[1]) / 3.0
     assert gradient != 0.0
     torch.testing.assert_close(gradient, slope, atol=1e-6, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Same seed, same bits; another seed, other numbers; the global generators untouched."""
+"""Same seed, same bits; another seed, other numbers; global generators left alone."""
 
 import hashlib
 import os

@@ -9,6 +9,7 @@ from dynamics_helpers import (
     LEARNED,
     EnvMaker,
     act_all,
+    assert_same_motion,
     each_dynamics,
     random_actions,
     random_drive,
@@ -68,10 +69,8 @@ def test_a_mask_says_which_rows_are_set(task_id, dynamics, generator):
     fresh = make(ROWS)
     start_at(fresh, state)
     expected = act_all(fresh, actions[STEPS:])
-    for key in ("qpos", "qvel"):
-        size = expected[key].abs().max()
-        difference = (path[key][rows] - expected[key][rows]).abs().max()
-        assert difference <= (1e-6 if dynamics == "streaming" else 0.0) * (1.0 + size)
+    tolerance = 1e-6 if dynamics == "streaming" else 0.0
+    assert_same_motion(path[rows], expected[rows], tolerance)
 
 
 @pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
@@ -122,8 +121,7 @@ def test_state_dict_restores_the_physical_state(task_id, dynamics, generator):
     assert not unequal_keys(other.state, env.state)
     if dynamics not in LEARNED:
         after, expected = (act_all(each, actions[STEPS:]) for each in (other, env))
-        for key in ("qpos", "qvel"):  # a solver's warm start is no state
-            torch.testing.assert_close(after[key], expected[key], atol=1e-9, rtol=1e-9)
+        assert_same_motion(after, expected, 1e-9)  # a solver's warm start is no state
     again, expected = (each.reset() for each in (other, env))
     assert torch.equal(again["qpos"], expected["qpos"])
 
@@ -141,12 +139,13 @@ def test_state_dict_leaves_no_history_of_another_life(task_id, dynamics, generat
     for each in (used, fresh):
         each.load_state_dict(copy.deepcopy(source.state_dict()))
     after, expected = (act_all(each, actions[STEPS:]) for each in (used, fresh))
-    for key in ("qpos", "qvel"):
-        torch.testing.assert_close(after[key], expected[key], atol=1e-6, rtol=1e-6)
+    assert_same_motion(after, expected, 1e-6)
 
 
 @each_dynamics
-@pytest.mark.parametrize("way", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+@pytest.mark.parametrize(
+    "way", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
 def test_a_copied_env_lives_a_life_of_its_own(task_id, dynamics, way, generator):
     make = EnvMaker(task_id, dynamics, generator)
     env, expected = make(ROWS), make(ROWS)

@@ -144,3 +144,12 @@ def test_precision_and_leading_dimensions_are_kept(dtype, generator):
     assert turned.shape == (2, 3, 5, 3) and turned.dtype == dtype
     assert quat_log(quat).dtype == quat_exp(v).dtype == dtype
     assert_close(turned[1, 2, 4], rotate(quat[1, 2, 0], v[4]), 1e-6)
+
+
+def test_one_rotation_meets_many(generator):
+    one, many = random_quats(1, generator)[0], random_quats(6, generator)
+    for first, second in ((one, many), (many, one)):
+        want = quat_multiply(first.expand(6, 4), second.expand(6, 4))
+        assert torch.equal(quat_multiply(first, second), want)
+        want = orientation_error(first.expand(6, 4), second.expand(6, 4))
+        assert torch.equal(orientation_error(first, second), want)

@@ -110,8 +110,8 @@ def test_the_learned_step_does_not_see_where_its_statistics_live(scene, generato
     token = model.encode(*inputs)
     assert torch.equal(twin.encode(*inputs), token)
     output = model.network(token[:, None])[:, 0]
-    for a, b in zip(model.decode(*inputs[:2], output), twin.decode(*inputs[:2], output)):
-        assert torch.equal(a, b)
+    decoded, expected = (each.decode(*inputs[:2], output) for each in (twin, model))
+    assert torch.equal(decoded[0], expected[0]) and torch.equal(decoded[1], expected[1])
 
 
 def test_a_deep_copy_owns_its_weights_and_statistics(generator):

@@ -86,7 +86,9 @@ def test_gradients_through_streaming_equal_the_full_sequence(
     weight = randn(generator, 3, tokens.shape[1], OUTPUTS)
     resets = random_resets(3, tokens.shape[1], generator) & has_resets
     wanted = [tokens, *network.parameters()]
-    streamed = torch.autograd.grad((weight * stream(network, tokens, resets)).sum(), wanted)
+    streamed = torch.autograd.grad(
+        (weight * stream(network, tokens, resets)).sum(), wanted
+    )
     expected = torch.autograd.grad(
         (weight * episodes(network, tokens, resets)).sum(), wanted
     )

@@ -37,7 +37,9 @@ def recompute(window: WindowNetwork, tokens: Tensor, resets: Tensor) -> Tensor:
         for t in range(tokens.shape[1]):
             start = t if resets[row, t] else start
             first = max(start, t - window.size + 1)
-            outputs[row, t] = window.network(tokens[row : row + 1, first : t + 1])[0, -1]
+            outputs[row, t] = window.network(tokens[row : row + 1, first : t + 1])[
+                0, -1
+            ]
     return outputs
 
 

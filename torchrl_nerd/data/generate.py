@@ -8,6 +8,7 @@ JSON card beside it.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 import mujoco
 import torch
@@ -62,10 +63,10 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
         following = next_state.clone(False).set("joint_torque", torque)
         transitions.append(state.clone(False).set("next", following))
         state = next_state
-    data = torch.stack(transitions, 1)
+    data = cast(TensorDict, TensorDict.stack(transitions, 1))
     if terrain is not None:
         data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
-    return data  # pyright: ignore
+    return data
 
 
 def is_sound(data: TensorDictBase) -> torch.Tensor:
@@ -74,7 +75,9 @@ def is_sound(data: TensorDictBase) -> torch.Tensor:
     return (state.abs() < LARGEST).all(-1).all(-1)
 
 
-def generate(scene: Scene, config: DataConfig, folder: Path, quiet: bool = False) -> Path:
+def generate(
+    scene: Scene, config: DataConfig, folder: Path, quiet: bool = False
+) -> Path:
     """Write a data set, or go on with one that was cut short.
 
     Args:
@@ -128,7 +131,9 @@ def load_data(scene: Scene, folder: Path) -> TensorDict:
             f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
         )
     if card["chunks_done"] * CHUNK < card["config"]["trajectories"]:
-        raise ValueError(f"the data in {folder} are not finished: run the command again")
+        raise ValueError(
+            f"the data in {folder} are not finished: run the command again"
+        )
     return TensorDict.load_memmap(folder)[: card["trajectories"]]
 
 
@@ -163,5 +168,4 @@ def _open_store(scene: Scene, config: DataConfig, folder: Path) -> TensorDictBas
         return TensorDict.load_memmap(folder)
     example = simulate(scene, 1, 1, Generator().manual_seed(0))
     shape = [config.trajectories, config.steps]
-    return example.expand(*shape).memmap_like(folder)
-
+    return example.expand(*shape).memmap_like(str(folder))

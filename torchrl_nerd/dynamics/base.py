@@ -49,8 +49,12 @@ def check_step(
     }
     if scene.terrain is not None and scene.terrain.is_per_row:
         if terrain is None:
-            raise ValueError(f"scene '{scene.name}' has a ground per row: got no terrain")
+            raise ValueError(
+                f"scene '{scene.name}' has a ground per row: got no terrain"
+            )
         expected["terrain"] = (terrain, (rows, scene.terrain.size))
     for name, (value, shape) in expected.items():
         if tuple(value.shape) != shape:
-            raise ValueError(f"expected {name} of shape {shape}, got {tuple(value.shape)}")
+            raise ValueError(
+                f"expected {name} of shape {shape}, got {tuple(value.shape)}"
+            )

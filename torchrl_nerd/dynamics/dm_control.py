@@ -41,7 +41,7 @@ class DMControlDynamics:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._rows: "list[Physics]" = []
+        self._rows: list[Physics] = []
 
     def __getstate__(self) -> dict:
         """A copy in another process builds its own `Physics` objects."""
@@ -68,14 +68,17 @@ class DMControlDynamics:
         if len(self._rows) != len(joint_torque):
             self.reset(state)
         qpos, qvel, force = (
-            x.double().cpu().numpy() for x in (state[QPOS], state[QVEL], joint_torque)
+            np.asarray(x.double().cpu())
+            for x in (state[QPOS], state[QVEL], joint_torque)
         )
         pose = None
         if terrain is not None and self.scene.terrain is not None:
             pose = self.scene.terrain.mocap_pose(terrain.double().cpu()).numpy()
         next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
         for row, physics in enumerate(self._rows):
-            self._place(physics, qpos[row], qvel[row], None if pose is None else pose[row])
+            self._place(
+                physics, qpos[row], qvel[row], None if pose is None else pose[row]
+            )
             physics.data.qfrc_applied[self.scene.actuated] = force[row]
             with physics.suppress_physics_errors():
                 physics.step(self.scene.substeps)

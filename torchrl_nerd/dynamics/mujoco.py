@@ -15,12 +15,17 @@ from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.scene import Scene
 
 STATE = mujoco.mjtState
-CONTROL = STATE.mjSTATE_QFRC_APPLIED | STATE.mjSTATE_MOCAP_POS | STATE.mjSTATE_MOCAP_QUAT
+CONTROL = int(
+    STATE.mjSTATE_QFRC_APPLIED | STATE.mjSTATE_MOCAP_POS | STATE.mjSTATE_MOCAP_QUAT
+)
 
 
 def torque_model(scene: Scene) -> mujoco.MjModel:
-    """The scene's model driven by joint torques alone: its own actuators are off, since
-    the controller already turned actions into torques; no silent reset on bad numbers."""
+    """The scene's model driven by joint torques alone.
+
+    Its own actuators are off, since the controller already turned actions into torques;
+    no silent reset on bad numbers.
+    """
     model = copy.copy(scene.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -73,7 +78,7 @@ class MujocoDynamics:
     ) -> TensorDictBase:
         """See `Dynamics.step`. Rows that MuJoCo gave up on come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
-        qpos, qvel = (state[key].double().cpu().numpy() for key in (QPOS, QVEL))
+        qpos, qvel = (np.asarray(state[key].double().cpu()) for key in (QPOS, QVEL))
         trajectory = self._rollout(qpos, qvel, self._control(joint_torque, terrain))
         nq, nv = self._model.nq, self._model.nv
         last = trajectory[:, -1]
@@ -82,7 +87,9 @@ class MujocoDynamics:
         self._warmstart = (next_qvel - before) / self._model.opt.timestep
         next_state = torch.from_numpy(last[:, 1 : 1 + nq + nv].copy())
         # a row that MuJoCo gave up on stopped before the end: its clock is behind
-        is_late = abs(last[:, 0] - self.scene.control_step) > 0.5 * self._model.opt.timestep
+        is_late = (
+            abs(last[:, 0] - self.scene.control_step) > 0.5 * self._model.opt.timestep
+        )
         if is_late.any():
             next_state[torch.from_numpy(is_late)] = torch.nan
             self._warmstart[is_late] = 0.0
@@ -127,7 +134,7 @@ class MujocoDynamics:
             self._data,
             start,
             np.repeat(control[:, None], self._steps, 1),
-            control_spec=int(CONTROL),
+            control_spec=CONTROL,
             initial_warmstart=self._warmstart,
         )
         return states

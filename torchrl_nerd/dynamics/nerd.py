@@ -12,7 +12,7 @@ from torch._inductor.exc import InductorError
 
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.modules.nerd import Memory, NeRD
+from torchrl_nerd.modules.nerd import Memory, NeRD, Network
 from torchrl_nerd.modules.window import WindowNetwork
 
 Inference = Literal["streaming", "window"]
@@ -54,7 +54,7 @@ class NeRDDynamics:
         self.model = model.eval()
         self.compile = compile
         self.differentiable = differentiable
-        self.network = model.network
+        self.network: Network = model.network
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.tokens.size)
         self._memory: Memory | None = None

@@ -1,7 +1,5 @@
 """A scene, a task and a dynamics joined into a batched TorchRL env."""
 
-from typing import ClassVar
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -38,8 +36,9 @@ class SceneEnv(EnvBase):
         ValueError: no rows, or a dynamics of another scene.
     """
 
-    batch_locked = True
-    _supports_set_state: ClassVar[bool] = True
+    _supports_set_state = True
+    _episode: Tensor
+    _age: Tensor
 
     def __init__(
         self,
@@ -76,19 +75,28 @@ class SceneEnv(EnvBase):
         rows, device = self.batch_size, self.device
         sizes = {**self._state_sizes, "joint_torque": len(self.scene.actuated)}
         state = {
-            key: Unbounded((*rows, size), dtype=torch.float64, device=device)
+            key: Unbounded(
+                torch.Size((*rows, size)), dtype=torch.float64, device=device
+            )
             for key, size in sizes.items()
         }
         width = self.task.observation_size
-        state[OBSERVATION] = Unbounded((*rows, width), dtype=torch.float32, device=device)
+        state[OBSERVATION] = Unbounded(
+            torch.Size((*rows, width)), dtype=torch.float32, device=device
+        )
         self.observation_spec = Composite(state, shape=rows, device=device)
         num_actions = self.scene.controller.num_actions
         self.action_spec = Bounded(
-            -1.0, 1.0, (*rows, num_actions), dtype=torch.float32, device=device
+            -1.0,
+            1.0,
+            torch.Size((*rows, num_actions)),
+            dtype=torch.float32,
+            device=device,
         )
-        self.reward_spec = Unbounded((*rows, 1), dtype=torch.float32, device=device)
+        column = torch.Size((*rows, 1))
+        self.reward_spec = Unbounded(column, dtype=torch.float32, device=device)
         flags = {
-            name: Categorical(2, shape=(*rows, 1), dtype=torch.bool, device=device)
+            name: Categorical(2, shape=column, dtype=torch.bool, device=device)
             for name in ("done", "terminated", "truncated")
         }
         self.full_done_spec = Composite(flags, shape=rows, device=device)
@@ -134,7 +142,7 @@ class SceneEnv(EnvBase):
         self._age = self._age.masked_fill(rows, 0)
         state = self._state()
         self.dynamics.reset(state, rows)
-        torque = state[QPOS].new_zeros(*self.batch_size, len(self.scene.actuated))
+        torque = state.get(QPOS).new_zeros(*self.batch_size, len(self.scene.actuated))
         return self._output(state, torque)
 
     def _given_state(
@@ -168,12 +176,12 @@ class SceneEnv(EnvBase):
                 f"got {tuple(action.shape)}"
             )
         state = self._state()
-        is_fine = action.isfinite().all(-1, keepdim=True)
+        is_fine = torch.all(action.isfinite(), -1, keepdim=True)
         action = torch.where(is_fine, action, 0.0)
         torque = self.scene.controller(action, state[QPOS], state[QVEL])
         moved = self.dynamics.step(state, torque, state.get(TERRAIN, None))
         for key in (QPOS, QVEL):
-            is_fine = is_fine & moved[key].isfinite().all(-1, keepdim=True)
+            is_fine = is_fine & torch.all(moved[key].isfinite(), -1, keepdim=True)
         next_values = {
             key: torch.where(is_fine, moved[key], state[key]) for key in (QPOS, QVEL)
         }

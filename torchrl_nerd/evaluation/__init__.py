@@ -1,0 +1,1 @@
+"""Figures that compare learned with true dynamics, alone and under a policy."""

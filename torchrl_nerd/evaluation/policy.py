@@ -1,4 +1,4 @@
-"""A policy as numbers: a small network, its normalisation, two files on disk."""
+"""A policy that TorchRL can train and that two plain files can hold."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,50 +7,143 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.keys import ACTION, OBSERVATION
+from torchrl_nerd.tasks import Task
 
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
+MIN_STD = 1e-3  # of an observation: a constant one is not blown up
 
 
-def mlp(sizes: Sequence[int]) -> nn.Sequential:
-    """Linear layers with tanh between; orthogonal weights, zero biases."""
-    layers: list[nn.Module] = []
-    for width, next_width in zip(sizes[:-1], sizes[1:], strict=True):
-        linear = nn.Linear(width, next_width)
-        nn.init.orthogonal_(linear.weight, 2.0**0.5)
+def mlp(sizes: Sequence[int], last_gain: float = 1.0) -> nn.Sequential:
+    """Linear layers with tanh between, orthogonal weights, zero biases.
+
+    Args:
+        sizes: widths from input to output.
+        last_gain: scale of the last layer's weights; small for a cautious start.
+    """
+    linears = [nn.Linear(*pair) for pair in zip(sizes[:-1], sizes[1:], strict=True)]
+    for linear in linears:
+        gain = last_gain if linear is linears[-1] else nn.init.calculate_gain("tanh")
+        nn.init.orthogonal_(linear.weight, gain)
         nn.init.zeros_(linear.bias)
-        layers += [linear, nn.Tanh()]
+    layers = [layer for linear in linears for layer in (linear, nn.Tanh())]
     return nn.Sequential(*layers[:-1])
 
 
 class Standardize(nn.Module):
-    """(x - mean) / std with constants, ``(*batch, size)``."""
+    """(x - mean) / std, with constants that are saved with the weights."""
+
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, size: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("std", torch.ones(size))
 
-    def fit(self, samples: Tensor) -> None:
-        """Take mean and std from samples ``(*batch, size)``."""
+    def fit(self, samples: Tensor) -> "Standardize":
+        """Take mean and standard deviation from ``samples``, ``(*batch, size)``."""
         samples = samples.flatten(0, -2).double()
         self.mean.copy_(samples.mean(0))
-        self.std.copy_(samples.std(0).clamp_min(1e-3))
+        self.std.copy_(samples.std(0).clamp_min(MIN_STD))
+        return self
 
     def forward(self, x: Tensor) -> Tensor:
+        """Of ``x``, ``(*batch, size)``."""
         return (x - self.mean) / self.std
 
 
-class Policy(nn.Module):
-    def __init__(self, observation_size, num_actions, widths=(64, 64)):
+class GaussianPolicy(nn.Module):
+    """Observation ``(*batch, D)`` -> mean and standard deviation ``(*batch, A)``.
+
+    A tanh network gives the mean; the standard deviation is learned and the same in every
+    state (paper, appendix B). Both are before the squashing that `make_actor` adds.
+
+    Args:
+        observation_size: D.
+        num_actions: A.
+        widths: of the hidden layers.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        num_actions: int,
+        widths: Sequence[int] = (64, 64),
+    ) -> None:
         super().__init__()
-        self.normalize = Standardize(observation_size)
-        self.mean = mlp((observation_size, *widths, num_actions))
-        nn.init.orthogonal_(self.mean[-1].weight, 0.01)
+        self.sizes = (observation_size, *widths, num_actions)
+        self.standardize = Standardize(observation_size)
+        self.mlp = mlp(self.sizes, last_gain=0.01)
         self.log_std = nn.Parameter(torch.zeros(num_actions))
 
-    def forward(self, observation):
-        loc = self.mean(self.normalize(observation))
-        return loc, self.log_std.exp().expand_as(loc)
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the action before squashing."""
+        mean = self.mlp(self.standardize(observation))
+        return mean, self.log_std.exp().expand_as(mean)
+
+
+def make_actor(policy: GaussianPolicy) -> ProbabilisticActor:
+    """The policy as TorchRL knows it: ``observation`` -> ``action`` in [-1, 1]."""
+    return ProbabilisticActor(
+        TensorDictModule(policy, [OBSERVATION], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=[ACTION],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+
+
+def save_policy(
+    policy: GaussianPolicy, folder: Path, card: dict[str, Any] | None = None
+) -> Path:
+    """Write weights, then card, each whole or not at all; nothing is pickled.
+
+    Args:
+        policy: what to save.
+        folder: where; made if missing.
+        card: what else to say: task, dynamics it was trained in, configuration.
+    """
+    folder = writable_folder(folder)
+    tensors = {k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}
+    write_atomically(folder / WEIGHTS, lambda aside: save_file(tensors, aside))
+    write_json(folder / CARD, {"format": 1, "sizes": list(policy.sizes), **(card or {})})
+    return folder
+
+
+def load_policy(folder: Path, task: Task | None = None) -> GaussianPolicy:
+    """A policy from a folder that `save_policy` wrote.
+
+    Args:
+        folder: where.
+        task: what it must fit; not checked where not given.
+
+    Raises:
+        ValueError: in one sentence, what is missing, broken or of another shape.
+    """
+    if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
+        raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no policy")
+    sizes = read_json(folder / CARD).get("sizes")
+    is_list = isinstance(sizes, list) and len(sizes) >= 2
+    if not is_list or not all(type(size) is int and size > 0 for size in sizes):
+        raise ValueError(f"expected the layer sizes in {folder / CARD}, got {sizes!r}")
+    if task is not None:
+        expected = (task.observation_size, task.scene.controller.num_actions)
+        if (sizes[0], sizes[-1]) != expected:
+            raise ValueError(
+                f"the policy in {folder} has {sizes[0]} observations and {sizes[-1]} "
+                f"actions, the task has {expected[0]} and {expected[1]}"
+            )
+    policy = GaussianPolicy(sizes[0], sizes[-1], sizes[1:-1])
+    try:
+        policy.load_state_dict(load_file(folder / WEIGHTS))
+    except SafetensorError as error:
+        raise ValueError(f"{folder / WEIGHTS} is no safetensors file: {error}") from None
+    except RuntimeError:
+        raise ValueError(f"weights in {folder} do not fit layers of {sizes}") from None
+    return policy.eval()

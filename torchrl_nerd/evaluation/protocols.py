@@ -39,7 +39,8 @@ def cartpole() -> Protocol:
 def double_pendulum() -> Protocol:
     """Paper, appendix C.2: no ground in reach (0) and grounds 1 to 6."""
     cases: dict[str, Task] = {
-        f"ground {number}": DoublePendulumPassive(number) for number in range(len(GROUNDS))
+        f"ground {number}": DoublePendulumPassive(number)
+        for number in range(len(GROUNDS))
     }
     first = (0.004, 0.012, 0.008, 0.005, 0.011, 0.029, 0.008)
     second = (0.007, 0.015, 0.011, 0.011, 0.018, 0.056, 0.013)

@@ -62,7 +62,7 @@ def open_loop(
     """
     rows, terrain = start.batch_size[0], start.get(TERRAIN, None)
     state = start.select(QPOS, "qvel")
-    idle = state[QPOS].new_zeros(rows, len(dynamics.scene.actuated))
+    idle = state.get(QPOS).new_zeros(rows, len(dynamics.scene.actuated))
     dynamics.reset(state)
     positions = []
     for step in range(steps):
@@ -106,7 +106,7 @@ def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, T
 
 
 def unit_of(scene: Scene, quantity: str) -> str:
-    """m or rad."""
+    """M or rad."""
     if quantity == "base_position":
         return "m"
     if quantity in ("base_orientation", "joints"):

@@ -1,0 +1,1 @@
+"""Rotations, manifolds, kinematics and surfaces, batched and differentiable."""

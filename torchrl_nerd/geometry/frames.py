@@ -91,4 +91,6 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 def orientation_error(a: Tensor, b: Tensor) -> Tensor:
     """Geodesic angle between two unit quaternions, rad, ``(*batch,)``."""
-    return torch.linalg.vector_norm(quat_log(quat_multiply(quat_conjugate(a), b)), dim=-1)
+    return torch.linalg.vector_norm(
+        quat_log(quat_multiply(quat_conjugate(a), b)), dim=-1
+    )

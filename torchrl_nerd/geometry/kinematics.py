@@ -51,7 +51,8 @@ class Base:
         roots = [
             body
             for body in range(1, model.nbody)
-            if model.body_dofnum[body] > 0 and model.body_weldid[body] == body
+            if model.body_dofnum[body] > 0
+            and model.body_weldid[body] == body
             and model.body_weldid[model.body_parentid[body]] == 0
         ]
         if len(roots) != 1:
@@ -107,7 +108,11 @@ class PointKinematics(nn.Module):
     """
 
     def __init__(
-        self, model: mujoco.MjModel, base: Base, bodies: list[int], positions: np.ndarray
+        self,
+        model: mujoco.MjModel,
+        base: Base,
+        bodies: list[int],
+        positions: np.ndarray,
     ) -> None:
         super().__init__()
         self.base = base
@@ -234,16 +239,18 @@ def matrix_from_quat(q: Tensor) -> Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def _bodies_on_path(
-    model: mujoco.MjModel, base: Base, bodies: list[int]
-) -> list[int]:
-    """Bodies between the base and any point's body, parents first; a floating base,
-    which is B_t itself, is left out."""
+def _bodies_on_path(model: mujoco.MjModel, base: Base, bodies: list[int]) -> list[int]:
+    """Bodies between the base and any point's body, parents first.
+
+    A floating base, which is B_t itself, is left out.
+    """
     needed: set[int] = set()
     for body in bodies:
         while body != base.body:
             if body == 0:
-                raise ValueError("expected contact points on moving bodies of the robot")
+                raise ValueError(
+                    "expected contact points on moving bodies of the robot"
+                )
             needed.add(body)
             body = int(model.body_parentid[body])
         if not base.is_floating:

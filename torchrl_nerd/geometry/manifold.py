@@ -28,7 +28,7 @@ class JointLayout:
     |---|---|
     | ``nq``, ``nv`` | lengths of ``qpos`` and ``qvel`` |
     | ``linear`` | (qpos address, dof address) of every entry that adds like a number |
-    | ``rotations`` | (qpos address of the quaternion, dof address) of ball and free joints |
+    | ``rotations`` | (qpos address of the quaternion, dof address), ball and free joints |
     """
 
     nq: int
@@ -86,8 +86,6 @@ def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor
     for q, v in layout.linear:
         tangent[..., v] = end[..., q] - start[..., q]
     for q, v in layout.rotations:
-        turn = quat_multiply(
-            quat_conjugate(start[..., q : q + 4]), end[..., q : q + 4]
-        )
+        turn = quat_multiply(quat_conjugate(start[..., q : q + 4]), end[..., q : q + 4])
         tangent[..., v : v + 3] = quat_log(turn)
     return tangent

@@ -1,0 +1,1 @@
+"""The learned model: networks with a memory, features and statistics around them."""

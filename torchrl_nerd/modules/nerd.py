@@ -1,14 +1,22 @@
 """A Neural Robot Dynamics model: features of a scene, a network, statistics."""
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.transforms import ContactFeatures, Normalize, RobotCentric, StateDelta, Stats
+from torchrl_nerd.transforms import (
+    ContactFeatures,
+    Normalize,
+    RobotCentric,
+    StateDelta,
+    Stats,
+)
 
 NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 
@@ -31,13 +39,15 @@ class Memory(Protocol):
 
 
 class Network(Protocol):
-    """What the transformer, the MLP and the GRU have in common."""
+    """What every network can do; `step` takes the memory that its own kind makes."""
 
-    def __call__(self, tokens: Tensor) -> Tensor: ...
+    def empty_memory(self, rows: int) -> Memory:
+        """A history of nothing for ``rows`` rows."""
+        ...
 
-    def empty_memory(self, rows: int) -> Memory: ...
-
-    def step(self, token: Tensor, memory: Memory) -> Tensor: ...
+    def step(self, token: Tensor, memory: Any) -> Tensor:
+        """The next token of every row, ``(rows, F) -> (rows, D)``."""
+        ...
 
 
 class NeRD(nn.Module):
@@ -51,7 +61,10 @@ class NeRD(nn.Module):
     """
 
     def __init__(
-        self, scene: Scene, config: NetworkConfig, stats: dict[str, Stats] | None = None
+        self,
+        scene: Scene,
+        config: NetworkConfig,
+        stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
         super().__init__()
         self.scene, self.config = scene, config
@@ -84,8 +97,13 @@ class NeRD(nn.Module):
 
 
 class SceneTokens(nn.Module):
-    """The features of a scene as one vector per state: `RobotCentric`, torques and
-    `ContactFeatures`, in this order."""
+    """The features of a scene as one vector per state.
+
+    `RobotCentric`, torques and `ContactFeatures`, in this order.
+
+    Args:
+        scene: the robot.
+    """
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()

@@ -8,6 +8,7 @@ view: ``layers * (band - 1) + 1`` tokens reach the output, in training as in str
 """
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -110,7 +111,9 @@ class Attention(nn.Module):
         offset = (cache.slot - 1 - slots) % size + 1
         is_seen = offset <= cache.age[:, None]
         past = torch.einsum("bhd,bhsd->bhs", query, past_keys) * self.scale
-        past = (past + self.offset_bias[:, offset]).masked_fill(~is_seen[:, None], MASKED)
+        past = (past + self.offset_bias[:, offset]).masked_fill(
+            ~is_seen[:, None], MASKED
+        )
         own = (query * key).sum(-1, keepdim=True) * self.scale + self.offset_bias[:, :1]
         weights = torch.cat((past, own), -1).softmax(-1)
         mixed = torch.einsum("bhs,bhsd->bhd", weights[..., :-1], past_values)
@@ -190,20 +193,22 @@ class CausalTransformer(nn.Module):
         keys, values = (
             [weight.new_zeros(shape) for _ in range(c.layers)] for _ in range(2)
         )
-        return KeyValueCache(keys, values, torch.zeros(rows, dtype=torch.long, device=weight.device))
+        return KeyValueCache(
+            keys, values, torch.zeros(rows, dtype=torch.long, device=weight.device)
+        )
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
         """The next token of every row, ``(rows, F) -> (rows, D)``; advances ``memory``."""
         x = self.embed(token)
         for layer, block in enumerate(self.blocks):
-            x = block.step(x, memory, layer)
+            x = cast(Block, block).step(x, memory, layer)
         memory.advance()
         return self.head(x)
 
 
 PRESETS = {
     "tiny": TransformerConfig(2, 64, 4),
-    "wide": TransformerConfig(2, 128, 4),
+    "wide": TransformerConfig(2, 96, 4),
     "small": TransformerConfig(4, 128, 4),
     "paper": TransformerConfig(6, 192, 12),
     "paper-large": TransformerConfig(6, 384, 12),

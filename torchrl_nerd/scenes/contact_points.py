@@ -31,7 +31,7 @@ class ContactPoints:
     |---|---|
     | ``bodies`` | body id of each point |
     | ``positions`` | ``(P, 3)``, m, body frame |
-    | ``radii`` | ``(P,)``, m: the surface touches when a point's distance equals its radius |
+    | ``radii`` | ``(P,)``, m: a point at this distance from the ground touches it |
     | ``margins`` | ``(P,)``, m: xi, the distance beyond which a point has no features |
     | ``count_found`` | how many the shapes have before merging and dropping |
     """

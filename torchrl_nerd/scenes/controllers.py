@@ -24,5 +24,6 @@ class TorqueController:
         self.num_actions = len(gain)
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
+        """Joint torques ``(*batch, num_actuated)`` in the dtype of ``qpos``."""
         gain = torch.tensor(self.gain, dtype=qpos.dtype, device=qpos.device)
         return action.to(qpos.dtype).clamp(-1.0, 1.0) * gain

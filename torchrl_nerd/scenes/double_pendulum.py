@@ -81,7 +81,9 @@ def evaluation_ground(number: int) -> Tensor:
         ValueError: no such number.
     """
     if not 0 <= number < len(GROUNDS):
-        raise ValueError(f"expected a ground from 0 to {len(GROUNDS) - 1}, got {number}")
+        raise ValueError(
+            f"expected a ground from 0 to {len(GROUNDS) - 1}, got {number}"
+        )
     offset, (a, b, c) = GROUNDS[number]
     # R_z(c) R_y(b) R_x(a) applied to y, then the reference's axes (y up) to ours (z up)
     x, y, z = 0.0, cos(a), sin(a)

@@ -23,6 +23,7 @@ def set_penalty_contact(
     """Give every shape of a moving body the penalty law against the ground.
 
     Args:
+        model: compiled; changed in place.
         ke: stiffness, N/m.
         kd: normal damping, N s/m.
         kf: tangential damping below the friction limit, N s/m.
@@ -46,6 +47,7 @@ def set_penalty_limit(
     """Give a limited joint a spring and damper that act beyond its range.
 
     Args:
+        model: compiled; changed in place.
         joint: its name.
         ke: stiffness, N/m or N m/rad.
         kd: damping, N s/m or N m s/rad.

@@ -27,7 +27,8 @@ _HASHED_FIELDS = (
     *("jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp", "dof_armature"),
     *("dof_damping", "dof_frictionloss", "geom_type", "geom_size", "geom_pos"),
     *("geom_quat", "geom_friction", "geom_solref", "geom_solimp", "geom_contype"),
-    *("geom_conaffinity", "actuator_trnid", "actuator_gear", "qpos0"),
+    *("geom_conaffinity", "geom_condim", "geom_margin", "geom_gap", "geom_solmix"),
+    *("geom_priority", "jnt_margin", "actuator_trnid", "actuator_gear", "qpos0"),
 )
 
 
@@ -97,7 +98,9 @@ class Scene:
         """The ground, or None where nothing can touch it."""
         grounds = ground_geoms(self.model) if len(self.contacts) else []
         if len(grounds) > 1:
-            raise ValueError(f"expected one ground, got {len(grounds)} in '{self.name}'")
+            raise ValueError(
+                f"expected one ground, got {len(grounds)} in '{self.name}'"
+            )
         return Terrain.from_model(self.model, grounds[0]) if grounds else None
 
     @cached_property
@@ -113,6 +116,7 @@ class Scene:
             digest.update(np.ascontiguousarray(getattr(self.model, field)).tobytes())
         option = self.model.opt
         numbers = [option.timestep, self.substeps, *option.gravity, option.impratio]
+        numbers += [option.density, option.viscosity, *option.wind]
         numbers += [int(option.integrator), int(option.disableflags), int(option.cone)]
         digest.update(np.array(numbers, float).tobytes())
         return digest.hexdigest()[:16]

@@ -25,7 +25,7 @@ class CartpoleSwingup(Task):
     observation_size = 4
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """x +-1 m, theta +-pi, velocities +-1."""
+        """X +-1 m, theta +-pi, velocities +-1."""
         start = (2.0 * u - 1.0) * u.new_tensor(START)
         return {QPOS: start[..., :2], QVEL: start[..., 2:]}
 

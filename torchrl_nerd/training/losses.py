@@ -1,10 +1,12 @@
 """What training minimises: one step ahead, then several."""
 
+from typing import cast
+
 import torch
 from torch import Tensor
 
 from torchrl_nerd.geometry.manifold import differentiate_pos
-from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.modules.nerd import TARGET, NeRD, Network
 
 
 def relative_weights(targets: Tensor, softening: float) -> Tensor:
@@ -20,9 +22,7 @@ def relative_weights(targets: Tensor, softening: float) -> Tensor:
     return 1.0 / (targets.square().mean(-1, keepdim=True) + softening)
 
 
-def one_step_loss(
-    outputs: Tensor, targets: Tensor, softening: float
-) -> Tensor:
+def one_step_loss(outputs: Tensor, targets: Tensor, softening: float) -> Tensor:
     """Weighted mean square error of normalised targets, NeRD eq. 2 made relative."""
     weights = relative_weights(targets, softening)
     return (weights * (outputs - targets).square()).mean()
@@ -51,12 +51,13 @@ def rollout_loss(
     """
     delta, layout = model.state_delta, model.scene.layout
     scale = model.normalize.std(TARGET)[: layout.nv]
-    memory = model.network.empty_memory(len(qpos))
+    network = cast(Network, model.network)
+    memory = network.empty_memory(len(qpos))
     position, velocity = qpos[:, 0], qvel[:, 0]
     errors = []
     for step in range(joint_torque.shape[1]):
         token = model.encode(position, velocity, joint_torque[:, step], terrain)
-        output = model.network.step(token, memory)
+        output = network.step(token, memory)
         position, velocity = model.decode(position, velocity, output)
         slip = differentiate_pos(layout, qpos[:, step + 1], position)
         slip = slip / (scale * delta.step_size)

@@ -9,6 +9,7 @@ forward and backward together).
 """
 
 from collections.abc import Iterable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -63,11 +64,11 @@ class Muon(Optimizer):
     ) -> None:
         updates = []
         for weight in weights:
-            state = self.state[weight]
+            state, gradient = self.state[weight], cast(Tensor, weight.grad)
             if "momentum" not in state:
                 state["momentum"] = torch.zeros_like(weight)
-            state["momentum"].lerp_(weight.grad, 1.0 - momentum)
-            updates.append(weight.grad.lerp(state["momentum"], momentum))
+            state["momentum"].lerp_(gradient, 1.0 - momentum)
+            updates.append(gradient.lerp(state["momentum"], momentum))
         scale = lr * max(1.0, shape[0] / shape[1]) ** 0.5
         for weight, update in zip(
             weights, orthogonalize(torch.stack(updates)), strict=True

@@ -23,9 +23,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "double_pendulum": Recipe(
         DataConfig(trajectories=40_000, steps=100),
-        TrainConfig(
-            network="wide", steps=36_000, rollout_steps=2_000, softening=0.3
-        ),
+        TrainConfig(network="wide", steps=18_000, rollout_steps=800, softening=0.1),
         "double_pendulum/passive",
     ),
 }

@@ -1,7 +1,10 @@
 """Training data on the device: tokens and targets once, batches by one gather."""
 
+from typing import cast
+
 import torch
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
@@ -31,7 +34,9 @@ class Sequences:
         self.data = data.to(device)
         self.steps = data.batch_size[1]
 
-    def pick(self, rows: int, length: int, generator: Generator) -> tuple[Tensor, Tensor]:
+    def pick(
+        self, rows: int, length: int, generator: Generator
+    ) -> tuple[Tensor, Tensor]:
         """Random trajectories and times: indices ``(rows, 1), (rows, length)``."""
         device = self.tokens.device
         row = torch.randint(len(self.tokens), (rows, 1), generator=generator)
@@ -39,7 +44,9 @@ class Sequences:
         start = torch.randint(last, (rows, 1), generator=generator)
         return row.to(device), (start + torch.arange(length)).to(device)
 
-    def one_step(self, rows: int, length: int, generator: Generator) -> tuple[Tensor, Tensor]:
+    def one_step(
+        self, rows: int, length: int, generator: Generator
+    ) -> tuple[Tensor, Tensor]:
         """Tokens and targets ``(rows, length, D)``."""
         row, time_index = self.pick(rows, length, generator)
         return self.tokens[row, time_index], self.targets[row, time_index]
@@ -49,7 +56,7 @@ class Sequences:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """True states ``(rows, length + 1, ...)``, torques and ground."""
         row, time_index = self.pick(rows, length, generator)
-        batch = self.data[row, time_index]
+        batch = cast(TensorDict, self.data[row, time_index])
         qpos = torch.cat((batch[QPOS], batch[NEXT_QPOS][:, -1:]), 1)
         qvel = torch.cat((batch[QVEL], batch[NEXT_QVEL][:, -1:]), 1)
         terrain = batch.get(TERRAIN, None)
@@ -67,11 +74,11 @@ def raw_tokens(
     return token, target
 
 
-def data_stats(scene: Scene, data: TensorDict) -> dict[str, Stats]:
+def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
     """Exact statistics of tokens and targets over a data set."""
     tokens, state_delta = SceneTokens(scene), StateDelta(scene)
     parts = [raw_tokens(tokens, state_delta, part) for part in data.split(PART)]
-    stats = {}
+    stats: dict[NestedKey, Stats] = {}
     for index, key in enumerate((TOKEN, TARGET)):
         merged, *rest = (Stats.of(part[index]) for part in parts)
         for other in rest:

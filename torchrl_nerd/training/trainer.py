@@ -119,7 +119,9 @@ class Trainer:
         self.scene, self.task, self.config = scene, task, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.horizons, self.quiet = horizons, quiet
-        longest = max(config.length, config.rollout_length if config.rollout_steps else 1)
+        longest = max(
+            config.length, config.rollout_length if config.rollout_steps else 1
+        )
         if data.batch_size[1] < longest:
             raise ValueError(
                 f"expected trajectories of at least {longest} steps, "
@@ -208,7 +210,9 @@ class Trainer:
         """Share of the peak step size: up, then down to zero, in each of two phases."""
         config, step = self.config, self.step
         if step < config.steps:
-            return min(1.0, (step + 1) / max(config.warmup, 1)) * (1 - step / config.steps)
+            return min(1.0, (step + 1) / max(config.warmup, 1)) * (
+                1 - step / config.steps
+            )
         left = 1.0 - (step - config.steps) / config.rollout_steps
         return config.rollout_lr * left
 
@@ -243,7 +247,9 @@ class Trainer:
             for horizon, by_name in summaries.items()
             for name, summary in by_name.items()
         }
-        score = sum(v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}"))
+        score = sum(
+            v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}")
+        )
         if score < self.best:
             self.best = score
             self._save_model("best", summaries)
@@ -321,4 +327,6 @@ def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
 
 
 def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    return {
+        k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)
+    }

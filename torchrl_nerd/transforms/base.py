@@ -1,12 +1,13 @@
 """What the scene's transforms share: reading inputs, writing outputs, specs, no inverse."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 
@@ -41,6 +42,7 @@ class FeatureTransform(Transform):
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        """Write the features beside the state."""
         return self._call(tensordict)
 
     def _reset(
@@ -58,11 +60,14 @@ class FeatureTransform(Transform):
                 )
         return tensordict
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        spec = observation_spec.clone()
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the features."""
+        spec = cast(Composite, observation_spec.clone())
         for key, size in self._observed_sizes().items():
             spec[key] = Unbounded(
-                (*spec.shape, size), dtype=torch.float32, device=spec.device
+                torch.Size((*spec.shape, size)),
+                dtype=torch.float32,
+                device=spec.device,
             )
         return spec
 

@@ -3,16 +3,21 @@
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
 zeroed beyond the margin xi. Over one plane, p1 follows from kinematics, n and d, so it is
 left out; where the plane is the same for all rows, n follows from gravity and is left
-out too. Added is what decides an impact: the point's velocity. All of it fades to zero at
-the margin without a jump.
+out too. Added is what decides an impact: the point's velocity, and how deep it will be if
+it goes on: whether a point touches within the step is a threshold, which a network learns
+slowly from distance and speed. All of it fades to zero at the margin without a jump.
 """
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.geometry.kinematics import PointKinematics, matrix_from_quat
+from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import (
+    CONTACT_DEPTH,
     CONTACT_DISTANCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
@@ -23,6 +28,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
+MAX_GLANCES = 5  # times within a step at which the coming penetration is foreseen
 FADE = 0.25  # share of the way from margin to touching over which velocities fade in
 
 
@@ -35,9 +41,12 @@ class ContactFeatures(FeatureTransform):
     |---|---|---|
     | ``contact_distance`` | min(d - xi, 0), m | P |
     | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
+    | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed, m | K P |
     | ``contact_normal`` | g * n; only where the ground varies from row to row | 3 P |
 
-    A scene without contact gives no keys at all.
+    The K = min(substeps, 5) times are spread evenly from the step's start on: with few
+    substeps they are just those at which the true solver looks for contact. A scene
+    without contact gives no keys at all.
 
     Args:
         scene: the robot and its ground.
@@ -49,18 +58,28 @@ class ContactFeatures(FeatureTransform):
     """
 
     why_no_inverse = "distances do not determine a pose"
+    radii: Tensor
+    margins: Tensor
+    plane: Tensor
+    mount_pos: Tensor
+    mount_rot: Tensor
+    glances: Tensor
 
     def __init__(self, scene: Scene) -> None:
         count, terrain = len(scene.contacts), scene.terrain
-        sizes, in_keys = {}, []
+        glances = min(scene.substeps, MAX_GLANCES)
+        sizes: dict[NestedKey, int] = {}
+        in_keys: list[NestedKey] = []
         if terrain is not None:
             in_keys = [QPOS, QVEL]
             sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
+            sizes[CONTACT_DEPTH] = glances * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
+        self.layout, self.step_size = scene.layout, scene.control_step
         if terrain is None:
             return
         points = scene.contacts
@@ -69,6 +88,7 @@ class ContactFeatures(FeatureTransform):
         )
         constants = {"radii": points.radii, "margins": points.margins}
         constants |= {"plane": terrain.default}
+        constants |= {"glances": np.arange(glances) / glances}
         constants |= dict(zip(("mount_pos", "mount_rot"), scene.mount, strict=True))
         for name, value in constants.items():
             tensor = torch.as_tensor(value, dtype=torch.float64).clone()
@@ -97,14 +117,34 @@ class ContactFeatures(FeatureTransform):
         plane = self.plane.expand(*qpos.shape[:-1], -1) if terrain is None else terrain
         distance, normal = self.terrain.distance(points, plane, position, rotation)
         beyond = distance - self.margins
-        gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)[..., None]
+        gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
+        gate = gate[..., None]
         speed = (velocity * normal).sum(-1, keepdim=True)
         sliding = velocity - speed * normal
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
+        depth = self._coming_depth(qpos, qvel, plane, distance, speed)
+        features.append((gate * depth).flatten(-2))
         if self.terrain.is_per_row:
             features.append((gate * normal).flatten(-2))
         return features
+
+    def _coming_depth(
+        self, qpos: Tensor, qvel: Tensor, plane: Tensor, distance: Tensor, speed: Tensor
+    ) -> Tensor:
+        """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
+
+        The distance is the parabola through its value and slope now and its value after
+        a whole step at constant ``qvel``.
+        """
+        step = self.step_size
+        later = integrate_pos(self.layout, qpos, step * qvel)
+        points, _ = self.kinematics(later, qvel)
+        end, _ = self.terrain.distance(points, plane, *self._base_pose(later))
+        distance, slope = distance[..., None], step * speed
+        bend = end[..., None] - distance - slope
+        path = distance + slope * self.glances + bend * self.glances**2
+        return (self.radii[:, None] - path).clamp_min(0.0)
 
     def _base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""

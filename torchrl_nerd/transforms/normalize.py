@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite
 from torchrl.envs import Transform
 
 FLOOR = 1e-6
@@ -109,6 +108,7 @@ class Normalize(Transform):
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        """Normalise the keys that are there."""
         return self._call(tensordict)
 
     def _reset(
@@ -124,9 +124,6 @@ class Normalize(Transform):
             if x is not None:
                 tensordict.set(key, self.denormalize(key, x))
         return tensordict
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
 
 
 def _parts(key: NestedKey) -> tuple[str, ...]:

@@ -25,21 +25,21 @@ class RobotCentric(FeatureTransform):
 
     | out key | what | width |
     |---|---|---|
-    | ``robot_state`` | floating base: linear velocity, angular velocity, unit gravity in B_t | 9 |
+    | ``robot_state`` | floating base: linear, angular velocity, unit gravity in B_t | 9 |
     | | unlimited hinge: sin, cos | 2 |
     | | other hinge, slide: position, unless the dynamics ignore it | 1 |
     | | ball: first two columns of its rotation matrix | 6 |
     | | limited joint: gaps to both limits, minus the margin, at most 0 | 2 |
     | | velocity of every dof; one that the free dynamics ignore only near a limit | 1 |
-    | ``robot_torque`` | ``("next", "joint_torque")``, where the tensordict holds it | actuated dofs |
+    | ``robot_torque`` | ``("next", "joint_torque")``, where there is one | actuated dofs |
 
     Args:
         scene: the robot.
 
     Examples:
         >>> transform = RobotCentric(load_scene("cartpole"))
-        >>> state = TensorDict(qpos=torch.zeros(3, 2).double(), qvel=torch.zeros(3, 2).double())
-        >>> transform(state)["robot_state"].shape
+        >>> zero = torch.zeros(3, 2).double()
+        >>> transform(TensorDict(qpos=zero, qvel=zero))["robot_state"].shape
         torch.Size([3, 6])
     """
 
@@ -97,7 +97,10 @@ class _JointFeatures:
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
         for joint in range(model.njnt):
-            kind, is_limited = int(model.jnt_type[joint]), bool(model.jnt_limited[joint])
+            kind, is_limited = (
+                int(model.jnt_type[joint]),
+                bool(model.jnt_limited[joint]),
+            )
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             if kind == FREE:
                 continue

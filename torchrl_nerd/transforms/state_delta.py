@@ -6,11 +6,12 @@ rotations live in the tangent space: 2 nv numbers, no quaternion.
 """
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_nerd.geometry.frames import quat_exp, rotate, rotate_inverse
@@ -68,7 +69,9 @@ class StateDelta(Transform):
         residual = moved - 0.5 * self.step_size * (qvel + after)
         change = after - qvel
         if self.base.is_floating:
-            change, residual = (self._turn(qpos, x, rotate_inverse) for x in (change, residual))
+            change, residual = (
+                self._turn(qpos, x, rotate_inverse) for x in (change, residual)
+            )
         return torch.cat((change, residual), -1)
 
     def integrate(
@@ -93,6 +96,7 @@ class StateDelta(Transform):
         return _replace(x, v, turn(qpos[..., q : q + 4], x[..., v : v + 3]))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        """Write the change between the state and the one under ``next``."""
         missing = [key for key in self.in_keys if key not in tensordict.keys(True)]
         if missing:
             found = sorted(map(str, tensordict.keys(True, True)))
@@ -115,23 +119,29 @@ class StateDelta(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         qvel = tensordict_reset[QVEL]
-        return tensordict_reset.set(STATE_DELTA, torch.cat((0.0 * qvel, 0.0 * qvel), -1))
+        zero = torch.zeros_like(torch.cat((qvel, qvel), -1))
+        return tensordict_reset.set(STATE_DELTA, zero)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None and STATE_DELTA in tensordict.keys():
             missing = [key for key in (QPOS, QVEL) if key not in tensordict.keys()]
             if missing:
-                raise KeyError(f"the inverse of StateDelta needs {missing}: a start state")
+                raise KeyError(
+                    f"the inverse of StateDelta needs {missing}: a start state"
+                )
             state = (tensordict[QPOS], tensordict[QVEL], tensordict[STATE_DELTA])
             next_qpos, next_qvel = self.integrate(*state)
             tensordict.set(NEXT_QPOS, next_qpos)
             tensordict.set(NEXT_QVEL, next_qvel)
         return tensordict
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        spec = observation_spec.clone()
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the change of the state."""
+        spec = cast(Composite, observation_spec.clone())
         spec[STATE_DELTA] = Unbounded(
-            (*spec.shape, self.size), dtype=torch.float64, device=spec.device
+            torch.Size((*spec.shape, self.size)),
+            dtype=torch.float64,
+            device=spec.device,
         )
         return spec
 

@@ -1,0 +1,174 @@
+"""Data sets: true transitions in TorchRL's layout, the same bits for the same seed."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import true_step
+from tensordict import TensorDict
+from torch import Generator
+
+from torchrl_nerd.data.generate import (
+    LARGEST,
+    DataConfig,
+    generate,
+    is_sound,
+    load_data,
+    simulate,
+)
+from torchrl_nerd.files import read_json
+from torchrl_nerd.scenes import SCENES, load_scene
+
+SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
+STATE = ("qpos", "qvel")
+
+
+def unequal(data: TensorDict, expected: TensorDict) -> list:
+    """Keys whose bits differ."""
+    assert data.batch_size == expected.batch_size
+    keys = set(data.keys(True, True)) | set(expected.keys(True, True))
+    return [key for key in keys if not torch.equal(data[key], expected[key])]
+
+
+def test_layout_is_torchrls(scene, tmp_path, seed):
+    config = DataConfig(trajectories=7, steps=5, seed=seed)
+    data = load_data(scene, generate(scene, config, tmp_path, quiet=True))
+    model = scene.model
+    widths = {"qpos": model.nq, "qvel": model.nv, ("next", "qpos"): model.nq}
+    widths |= {("next", "qvel"): model.nv, ("next", "joint_torque"): model.nu}
+    if scene.terrain is not None:
+        widths["terrain"] = scene.terrain.size
+    assert data.batch_size == (7, 5)
+    assert {k: data[k].shape for k in data.keys(True, True)} == {
+        key: (7, 5, width) for key, width in widths.items()
+    }
+    assert all(data[key].dtype == torch.float64 for key in widths)
+    card = read_json(tmp_path / "data.json")
+    assert (card["trajectories"], card["dropped"]) == (7, 0)
+    assert card["scene_hash"] == scene.hash and card["config"]["seed"] == seed
+
+
+def test_every_transition_obeys_the_true_dynamics(scene, generator):
+    data = simulate(scene, 16, 6, generator)
+    data = data[is_sound(data)]
+    for key in STATE:
+        assert torch.equal(data["next", key][:, :-1], data[key][:, 1:])
+    first = true_step(
+        scene, data[:, 0].exclude("next"), data[:, 0]["next", "joint_torque"]
+    )
+    for key in STATE:  # without a past there is nothing that could differ
+        expected, got = first["next", key], data[:, 0]["next", key]
+        torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
+    every = data.reshape(-1)  # later steps had a solver that started warm
+    again = true_step(scene, every.exclude("next"), every["next", "joint_torque"])
+    for key in STATE:
+        expected, got = again["next", key], every["next", key]
+        torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-6)
+    if scene.terrain is not None:
+        assert torch.equal(data["terrain"], data["terrain"][:, :1].expand(-1, 6, -1))
+
+
+def test_starts_and_torques_lie_within_the_ranges(scene, generator):
+    ranges, data = scene.sampling, simulate(scene, 500, 3, generator)
+    for key in STATE:
+        low, high = (
+            torch.tensor(getattr(ranges, f"{key}_{end}")) for end in ("low", "high")
+        )
+        start = data[key][:, 0]
+        assert ((start >= low) & (start <= high)).all()
+        spread = start.amax(0) - start.amin(0)
+        assert (spread > 0.9 * (high - low)).all()
+    assert (data["next", "joint_torque"].abs() <= torch.tensor(ranges.torque)).all()
+
+
+def test_passive_and_quiet_rows_have_their_shares(scene, generator):
+    rows, steps = 1000, 30
+    data = simulate(scene, rows, steps, generator)
+    relative = data["next", "joint_torque"] / torch.tensor(scene.sampling.torque)
+    peak = relative.abs().amax((1, 2))
+    passive = peak == 0.0
+    assert abs(passive.double().mean() - scene.sampling.passive_share) < 0.07
+    calm = (peak > 0.0) & (peak < 0.7)  # a loud row peaks above 0.7, but for 0.7^30
+    share = scene.sampling.quiet_share * 0.72
+    assert abs(calm.double().mean() - share) < 0.07
+    speed = data["qvel"][:, 0].abs().mean(-1)
+    assert 0.35 < speed[passive].mean() / speed[peak > 0.9].mean() < 0.75
+
+
+def test_shares_of_none_and_all(generator):
+    for passive, quiet in ((1.0, 0.0), (0.0, 0.0), (0.0, 1.0)):
+        shares = {"passive_share": passive, "quiet_share": quiet}
+        scene = replace(SCENE, sampling=replace(SCENE.sampling, **shares))
+        torque = simulate(scene, 200, 40, generator)["next", "joint_torque"]
+        peak = (torque / torch.tensor(scene.sampling.torque)).abs().amax((1, 2))
+        if passive:
+            assert (peak == 0.0).all()
+        else:
+            assert (peak > 0.0).all()
+            assert (peak < 0.7).double().mean() > 0.4 if quiet else (peak > 0.7).all()
+
+
+def test_the_seed_decides_every_bit(scene, tmp_path, seed):
+    sets = []
+    for folder, number in (("a", seed), ("b", seed), ("c", seed + 1)):
+        torch.rand(seed % 7)  # other random numbers do not matter
+        config = DataConfig(trajectories=9, steps=3, seed=number)
+        path = generate(scene, config, tmp_path / folder, quiet=True)
+        sets.append(load_data(scene, path))
+    assert not unequal(sets[0], sets[1])
+    assert not (sets[0]["qpos"] == sets[2]["qpos"]).any()
+    torques = (data["next", "joint_torque"] for data in (sets[0], sets[2]))
+    assert not torch.equal(*torques)
+
+
+def test_soundness_is_finite_and_bounded(generator):
+    sound = torch.randn(6, 4, 2, generator=generator).double()
+    for key in STATE:
+        for row, bad in enumerate((torch.nan, torch.inf, -2 * LARGEST, LARGEST)):
+            data = TensorDict({k: sound.clone() for k in STATE}, batch_size=[6, 4])
+            column = int(torch.randint(8, (), generator=generator))
+            data[key][row].view(-1)[column] = bad
+            expected = torch.arange(6) != row
+            wrapped = TensorDict({"next": data}, batch_size=[6, 4])
+            assert torch.equal(is_sound(wrapped), expected)
+
+
+def test_broken_trajectories_are_dropped_and_counted(scene, tmp_path, seed):
+    strong = tuple(1e9 * torque for torque in scene.sampling.torque)
+    ranges = {"torque": strong, "passive_share": 0.5, "quiet_share": 0.0}
+    wild = replace(scene, sampling=replace(scene.sampling, **ranges))
+    config = DataConfig(trajectories=60, steps=2, seed=seed)
+    data = load_data(wild, generate(wild, config, tmp_path, quiet=True))
+    card = read_json(tmp_path / "data.json")
+    assert card["trajectories"] == len(data) == 60 - card["dropped"]
+    assert 10 < len(data) < 50
+    assert is_sound(data).all()
+    assert (data["next", "joint_torque"] == 0.0).all()
+    drawn = simulate(wild, 60, 2, Generator().manual_seed(seed << 24))
+    assert not unequal(data, drawn[is_sound(drawn)])
+
+
+@pytest.mark.parametrize("size", [0, -3])
+@pytest.mark.parametrize("name", ["trajectories", "steps"])
+def test_sizes_below_one_are_refused(name, size):
+    with pytest.raises(ValueError, match=f"expected {name} of at least 1, got {size}"):
+        DataConfig(**{name: size})
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    config = DataConfig(trajectories=2, steps=1)
+    place = tmp_path / "taken"
+    place.write_text("not a folder")
+    for folder in (place, place / "below"):
+        with pytest.raises(ValueError, match=f"can be written, got {folder}"):
+            generate(SCENE, config, folder, quiet=True)
+    assert place.read_text() == "not a folder"
+
+
+def test_loading_says_what_is_wrong(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path}, found no data.json"):
+        load_data(SCENE, tmp_path)
+    generate(SCENE, DataConfig(trajectories=2, steps=1), tmp_path, quiet=True)
+    assert load_data(SCENE, tmp_path).batch_size == (2, 1)
+    with pytest.raises(ValueError, match=f"'{SCENE.name}'.*expected '{OTHER.name}'"):
+        load_data(OTHER, tmp_path)

@@ -1,0 +1,65 @@
+"""Every robot is measured as in the paper, beside the figures that the paper prints."""
+
+from torchrl_nerd.evaluation.protocols import PROTOCOLS
+from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.training.recipes import RECIPES
+
+CARTPOLE = """
+                        100     500     1000
+    slider              0.0002  0.004   0.033
+    hinge               0.0004  0.013   0.075
+"""  # Fig. 3: base position (m), non-base joint (rad)
+DOUBLE_PENDULUM = """
+            0      1      2      3      4      5      6
+    joint1  0.004  0.012  0.008  0.005  0.011  0.029  0.008
+    joint2  0.007  0.015  0.011  0.011  0.018  0.056  0.013
+"""  # appendix C.2, rad, 100 steps; 0 is no ground in reach
+
+
+def table(text: str) -> dict[tuple[int, str], float]:
+    """(column, row) -> entry."""
+    head, *rows = (line.split() for line in text.strip().splitlines())
+    return {
+        (int(column), name): float(entry)
+        for name, *entries in rows
+        for column, entry in zip(head, entries, strict=True)
+    }
+
+
+def test_every_scene_has_a_protocol_and_a_recipe():
+    assert set(PROTOCOLS) == set(SCENES) == set(RECIPES)
+
+
+def test_protocols_fit_their_scene(scene):
+    protocol = PROTOCOLS[scene.name]()
+    joints = {scene.model.joint(i).name for i in range(scene.model.njnt)}
+    assert protocol.cases and protocol.horizons
+    assert list(protocol.horizons) == sorted(set(protocol.horizons))
+    assert all(task.scene is scene for task in protocol.cases.values())
+    for (case, horizon, quantity), figure in protocol.published.items():
+        assert case in protocol.cases and horizon in protocol.horizons
+        assert quantity in joints and 0.0 < figure < 1.0
+
+
+def test_recipes_fit_their_scene(scene):
+    recipe = RECIPES[scene.name]
+    assert recipe.task in TASKS and make_task(recipe.task).scene is scene
+    assert recipe.train.network in NETWORKS
+    assert recipe.data.steps >= max(recipe.train.length, recipe.train.rollout_length)
+
+
+def test_published_figures_of_the_cartpole():
+    expected = {("passive", *key): value for key, value in table(CARTPOLE).items()}
+    assert len(expected) == 6
+    assert PROTOCOLS["cartpole"]().published == expected
+
+
+def test_published_figures_of_the_double_pendulum():
+    expected = {
+        (f"ground {ground}", 100, joint): value
+        for (ground, joint), value in table(DOUBLE_PENDULUM).items()
+    }
+    assert len(expected) == 14
+    assert PROTOCOLS["double_pendulum"]().published == expected

@@ -1,0 +1,206 @@
+"""Open-loop error: the documented formulas, zero for the truth against itself."""
+
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import HANDMADE, make_scene, random_quats, random_states
+from tensordict import TensorDict
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.rollout_error import (
+    initial_states,
+    open_loop,
+    passive_errors,
+    position_errors,
+    summarize,
+    unit_of,
+)
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.tasks import TASKS, make_task
+
+ROWS, STEPS = 6, 5
+
+
+def each(names):
+    return pytest.mark.parametrize("name", names)
+
+
+def random_paths(scene, rng):
+    """Two sets of positions ``(ROWS, STEPS, nq)``."""
+    for _ in range(2):
+        qpos, _ = random_states(scene.model, ROWS * STEPS, rng)
+        yield qpos.reshape(ROWS, STEPS, -1)
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two unit quaternions, whatever their signs."""
+    return 2.0 * np.arccos(np.clip(np.abs((a * b).sum(-1)), 0.0, 1.0))
+
+
+def wrapped(difference: np.ndarray) -> np.ndarray:
+    return np.abs(np.angle(np.exp(1j * difference)))
+
+
+def heavier(scene):
+    """The same robot with stronger gravity."""
+    model = copy(scene.model)
+    model.opt.gravity[2] *= 1.1
+    return replace(scene, model=model)
+
+
+def test_the_truth_against_itself_has_no_error(task_id, seed):
+    task = make_task(task_id)
+    dynamics = [MujocoDynamics(task.scene, num_threads=n) for n in (1, 2)]
+    summaries = passive_errors(task, *dynamics, [3, 12], ROWS, seed)
+    assert list(summaries) == [3, 12]
+    for by_name in summaries.values():
+        assert by_name
+        for error in by_name.values():
+            assert error.mean == error.interval == error.final == error.p95 == 0.0
+
+
+def test_fixed_base_by_hand(rng):
+    scene = load_scene("cartpole")
+    truth, learned = (10.0 * path for path in random_paths(scene, rng))
+    errors = position_errors(scene, truth, learned)
+    difference = (truth - learned).numpy()
+    np.testing.assert_allclose(errors["slider"], np.abs(difference[..., 0]))
+    np.testing.assert_allclose(errors["hinge"], wrapped(difference[..., 1]), atol=1e-12)
+    assert list(errors) == ["slider", "hinge"]
+
+
+def test_ball_joint_by_hand(rng):
+    scene = HANDMADE["arm"]
+    truth, learned = random_paths(scene, rng)
+    errors = position_errors(scene, truth, learned)
+    a, b = truth.numpy(), learned.numpy()
+    expected = angle_between(a[..., :4], b[..., :4])
+    np.testing.assert_allclose(errors["shoulder"], expected, atol=1e-7)
+    np.testing.assert_allclose(errors["elbow"], wrapped(a[..., 4] - b[..., 4]))
+
+
+def test_floating_base_by_hand(rng):
+    scene = HANDMADE["floater"]
+    truth, learned = random_paths(scene, rng)
+    errors = position_errors(scene, truth, learned)
+    a, b = truth.numpy(), learned.numpy()
+    offset = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
+    np.testing.assert_allclose(errors["base_position"], offset)
+    turn = angle_between(a[..., 3:7], b[..., 3:7])
+    np.testing.assert_allclose(errors["base_orientation"], turn, atol=1e-7)
+    knee = wrapped(a[..., 7] - b[..., 7])
+    hip = angle_between(a[..., 8:12], b[..., 8:12])
+    rod = np.abs(a[..., 12] - b[..., 12])
+    np.testing.assert_allclose(errors["joints"], (knee + hip + rod) / 3, atol=1e-7)
+    assert set(errors) == {"base_position", "base_orientation", "joints"}
+
+
+def test_full_turns_and_quaternion_signs_are_no_error(rng, generator):
+    scene = HANDMADE["floater"]
+    truth, _ = random_paths(scene, rng)
+    other = truth.clone()
+    other[..., 7] += 2.0 * torch.pi * torch.randint(-3, 4, (ROWS, STEPS)).double()
+    other[..., 3:7] *= -1.0
+    other[..., 8:12] *= torch.where(torch.rand(ROWS, STEPS, 1) < 0.5, -1.0, 1.0)
+    for error in position_errors(scene, truth, other).values():
+        assert error.abs().max() < 1e-6
+    quats = random_quats(ROWS * STEPS, generator).reshape(ROWS, STEPS, 4)
+    other[..., 3:7] = quats
+    there, back = (
+        position_errors(scene, *paths)["base_orientation"]
+        for paths in ((truth, other), (other, truth))
+    )
+    torch.testing.assert_close(there, back)
+    assert (there <= torch.pi + 1e-9).all() and there.max() > 0.1
+
+
+def test_a_slide_is_never_wrapped(rng):
+    scene = load_scene("cartpole")
+    truth, _ = random_paths(scene, rng)
+    errors = position_errors(scene, truth, truth + 2.0 * torch.pi)
+    assert (errors["slider"] - 2.0 * torch.pi).abs().max() < 1e-9
+    assert errors["hinge"].max() < 1e-9
+
+
+def test_units():
+    cartpole, floater = load_scene("cartpole"), HANDMADE["floater"]
+    assert unit_of(cartpole, "slider") == "m" and unit_of(cartpole, "hinge") == "rad"
+    assert unit_of(HANDMADE["arm"], "shoulder") == "rad"
+    assert unit_of(HANDMADE["arm"], "elbow") == "rad"
+    assert unit_of(floater, "base_position") == "m"
+    assert unit_of(floater, "base_orientation") == unit_of(floater, "joints") == "rad"
+
+
+def test_summaries_by_hand(rng):
+    scene, rows = load_scene("cartpole"), int(rng.integers(2, 90))
+    error = rng.exponential(size=(rows, 7))
+    summary = summarize(scene, {"slider": torch.from_numpy(error)})["slider"]
+    per_row = error.mean(1)
+    assert summary.unit == "m"
+    assert summary.mean == pytest.approx(error.mean())
+    half = 1.96 * np.std(per_row, ddof=1) / np.sqrt(rows)
+    assert summary.interval == pytest.approx(half)
+    assert summary.final == pytest.approx(error[:, -1].mean())
+    assert summary.p95 == pytest.approx(np.quantile(per_row, 0.95))
+
+
+def test_non_finite_errors_stay_visible(rng):
+    error = rng.exponential(size=(20, 7))
+    error[int(rng.integers(20)), int(rng.integers(7))] = np.nan
+    scene = load_scene("cartpole")
+    summary = summarize(scene, {"hinge": torch.from_numpy(error)})["hinge"]
+    assert np.isnan(summary.mean) and np.isnan(summary.p95)
+
+
+def test_horizons_are_prefixes_of_one_rollout(task_id, seed):
+    task = make_task(task_id)
+    truth, other = MujocoDynamics(task.scene), MujocoDynamics(heavier(task.scene))
+    together = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed)
+    for horizon, by_name in together.items():
+        alone = passive_errors(task, other, truth, [horizon], ROWS, seed)
+        assert alone == {horizon: by_name}
+        assert any(error.mean > 0.0 for error in by_name.values())
+    again = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed)
+    assert again == together
+    unlike = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed + 1)
+    assert unlike != together
+
+
+@each(TASKS)
+def test_starts_are_the_tasks_and_of_their_seed(name, seed):
+    task = make_task(name)
+    torch.manual_seed(1)
+    first = initial_states(task, 50, seed)
+    expected = torch.rand(1)
+    torch.manual_seed(1)
+    assert torch.equal(torch.rand(1), expected), "global random numbers were used"
+    second, third = initial_states(task, 50, seed), initial_states(task, 50, seed + 1)
+    assert first.batch_size == (50,)
+    for key in first.keys():
+        assert torch.equal(first[key], second[key])
+    assert not (first["qpos"] == third["qpos"]).any()
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.rand(50, task.num_uniforms, dtype=torch.float64, generator=generator)
+    assert torch.equal(first["qpos"], task.initial_state(u)["qpos"])
+
+
+@each(HANDMADE)
+def test_open_loop_is_step_after_step(name, rng):
+    scene = make_scene(HANDMADE[name].model)
+    qpos, qvel = random_states(scene.model, ROWS, rng)
+    start = TensorDict({"qpos": qpos, "qvel": qvel}, batch_size=[ROWS])
+    torque = torch.from_numpy(rng.normal(size=(ROWS, STEPS, scene.model.nu)))
+    before = start.clone()
+    path = open_loop(MujocoDynamics(scene), start, STEPS, torque)
+    assert all(torch.equal(start[key], before[key]) for key in before.keys())
+    dynamics, state = MujocoDynamics(scene), start
+    dynamics.reset(state)
+    for step in range(STEPS):
+        state = dynamics.step(state, torque[:, step])
+        assert torch.equal(path[:, step], state["qpos"])
+    passive = open_loop(MujocoDynamics(scene), start, STEPS)
+    idle = open_loop(MujocoDynamics(scene), start, STEPS, torch.zeros_like(torque))
+    assert torch.equal(passive, idle) and not torch.equal(passive, path)

@@ -1,0 +1,155 @@
+"""What can touch the ground, what is left out of it, and that nothing is lost."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from helpers import every_scene, make_scene, random_states, random_transitions
+
+from torchrl_nerd.keys import CONTACT_DISTANCE, CONTACT_NORMAL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes.contact_points import MARGIN_PER_RADIUS, MIN_MARGIN
+from torchrl_nerd.transforms import ContactFeatures
+
+PLANE = '<geom type="plane" size="0 0 1"/>'
+SHAPES = {
+    "sphere": ('type="sphere" size="0.2"', 1, 0.2),
+    "capsule": ('type="capsule" size="0.1 0.3"', 2, 0.1),
+    "box": ('type="box" size="0.1 0.2 0.3"', 8, 0.0),
+}
+
+
+def one_shape(shape, ground=PLANE):
+    """A floating base of one shape, off its origin and turned."""
+    body = f'<geom name="foot" {shape} pos="0.1 -0.2 0.3" quat="0.7 0.1 -0.3 0.4"/>'
+    body = f'<body pos="0 0 2"><freejoint/>{body}</body>'
+    return make_scene(f"<mujoco><worldbody>{ground}{body}</worldbody></mujoco>")
+
+
+def world_points(model, qpos, bodies, places):
+    """Points in the world by MuJoCo at every row of ``qpos``, ``(rows, P, 3)``."""
+    data, found = mujoco.MjData(model), []
+    for row in qpos:
+        data.qpos = row
+        mujoco.mj_kinematics(model, data)
+        turns = data.xmat[bodies].reshape(-1, 3, 3)
+        found.append(data.xpos[bodies] + np.einsum("pij,pj->pi", turns, places))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_nearest_point_gives_a_shapes_clearance(shape, rng):
+    attributes, count, radius = SHAPES[shape]
+    scene = one_shape(attributes)
+    model, points = scene.model, scene.contacts
+    assert len(points) == points.count_found == count
+    assert (points.radii == radius).all()
+    data, poses = mujoco.MjData(model), random_states(model, 30, rng)[0].numpy()
+    places = world_points(model, poses, points.bodies, points.positions)
+    for pose, height in zip(poses, places[..., 2], strict=True):
+        data.qpos = pose
+        mujoco.mj_kinematics(model, data)
+        want = mujoco.mj_geomDistance(model, data, 0, 1, 1e3, None)
+        assert abs((height - points.radii).min() - want) < 1e-12
+
+
+@every_scene
+def test_margins_are_the_papers(scene):
+    points = scene.contacts
+    want = np.maximum(MARGIN_PER_RADIUS * points.radii, MIN_MARGIN)
+    np.testing.assert_array_equal(points.margins, want)
+    assert (MARGIN_PER_RADIUS, MIN_MARGIN) == (4.0, 0.1)
+    assert len(points) <= points.count_found
+
+
+def test_pendulum_keeps_elbow_and_tip():
+    scene = load_scene("double_pendulum")
+    points, model = scene.contacts, scene.model
+    places = world_points(model, np.zeros((1, 2)), points.bodies, points.positions)[0]
+    order = np.argsort(places[:, 0])
+    np.testing.assert_allclose(places[order], [[1.5, 0, 2], [3.0, 0, 2]], atol=1e-12)
+    np.testing.assert_allclose(points.radii, 0.1)
+    assert points.count_found == 4
+
+
+def test_merged_points_never_part(rng):
+    model = load_scene("double_pendulum").model
+    ends = [model.body("link1").id, model.body("link2").id]
+    qpos = 3.0 * random_states(model, 30, rng)[0].numpy()
+    places = world_points(model, qpos, ends, [[1.5, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(places[:, 0], places[:, 1], rtol=0.0, atol=1e-14)
+
+
+def test_the_papers_contacts_follow_from_the_pendulums_features(generator):
+    scene = load_scene("double_pendulum")
+    model, points, root = scene.model, scene.contacts, scene.mount[0]
+    rows = random_transitions(scene, 400, generator)
+    qpos, planes = rows[QPOS].numpy(), rows[TERRAIN].numpy()
+    transform = ContactFeatures(scene)
+    values = transform.contact_features(rows[QPOS], rows[QVEL], rows[TERRAIN])
+    features = dict(zip(transform.out_keys, values, strict=True))
+    below = features[CONTACT_DISTANCE].numpy()
+    normals = features[CONTACT_NORMAL].unflatten(-1, (-1, 3)).numpy()
+    bodies = [model.body(f"link{number}").id for number in (1, 1, 2, 2)]
+    caps = [[0, 0, 0], [1.5, 0, 0], [0, 0, 0], [1.5, 0, 0]]  # all four, as in the paper
+    found = world_points(model, qpos, bodies, caps) - root
+    kept = world_points(model, qpos, points.bodies, points.positions) - root
+    rebuilt = 0
+    for row, (n, offset) in enumerate((plane[:3], plane[3]) for plane in planes):
+        distance = found[row] @ n + root @ n - offset
+        is_seen = distance < 0.4
+        if not is_seen[1:].any():
+            assert not below[row].any()  # all there is to see is the unmoving root
+            continue
+        index = below[row].argmin()
+        normal = normals[row, index] / np.linalg.norm(normals[row, index])
+        d = (found[row] - kept[row, index]) @ normal
+        d += below[row, index] + points.margins[index]
+        p1 = found[row] - d[:, None] * normal
+        np.testing.assert_allclose(normal, n, 0.0, 1e-9)
+        np.testing.assert_allclose(d[is_seen], distance[is_seen], 0.0, 1e-9)
+        closest = found[row] - distance[:, None] * n
+        np.testing.assert_allclose(p1[is_seen], closest[is_seen], 0.0, 1e-9)
+        rebuilt += 1
+    assert rebuilt > 10
+
+
+def test_a_ground_that_only_a_dropped_point_touches_does_nothing(rng):
+    """The pendulum's root: its links point away from a plane that it dips into."""
+    scene = load_scene("double_pendulum")
+    model, terrain = scene.model, scene.terrain
+    for _ in range(20):
+        angle, depth = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 0.05)
+        normal = np.array([np.cos(angle), 0.0, np.sin(angle)])
+        qpos, qvel, after = np.array([angle, 0.0]), rng.normal(size=2), []
+        for distance in (0.1 - depth, 10.0):
+            plane = torch.tensor([*normal, 2.0 * normal[2] - distance])
+            pose = terrain.mocap_pose(plane.double()).numpy()
+            data = mujoco.MjData(model)
+            data.mocap_pos[0], data.mocap_quat[0] = pose[:3], pose[3:]
+            data.qpos, data.qvel = qpos, qvel
+            mujoco.mj_step(model, data)
+            after.append(data.qvel.copy())
+            assert data.ncon == (distance < 0.1)
+        np.testing.assert_allclose(after[0], after[1], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])
+def test_shapes_without_points_are_refused_by_name(kind):
+    size = f'type="{kind}" size="0.1 0.2 0.3"'
+    with pytest.raises(ValueError, match=f"'foot' .* is a {kind}; expected sphere"):
+        _ = one_shape(size).contacts
+    assert len(one_shape(size, ground="").contacts) == 0
+    assert len(one_shape(f'{size} contype="0" conaffinity="0"').contacts) == 0
+
+
+def test_only_what_can_touch_has_points():
+    ball = 'type="sphere" size="0.2"'
+    assert len(one_shape(f'{ball} contype="2" conaffinity="4"').contacts) == 0
+    assert len(one_shape(f'{ball} contype="0" conaffinity="1"').contacts) == 1
+    assert one_shape(ball, ground="").terrain is None
+    second = '<geom type="plane" size="0 0 1" pos="0 0 -1"/>'
+    with pytest.raises(ValueError, match="expected one ground, got 2"):
+        _ = one_shape(ball, PLANE + second).terrain
+    with pytest.raises(ValueError, match="expected a plane as ground, got a box"):
+        _ = one_shape(ball, '<geom type="box" size="1 1 1"/>').terrain

@@ -1,0 +1,126 @@
+"""Dropped coordinates do not matter to MuJoCo, and kept ones do."""
+
+import mujoco
+import pytest
+import torch
+from helpers import (
+    every_scene,
+    make_scene,
+    random_states,
+    random_transitions,
+    true_step,
+)
+from tensordict import TensorDict
+
+from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.transforms import StateDelta
+
+ROWS = 100
+RAIL = """
+<mujoco><option gravity="{gravity}"/><worldbody><body>
+  <joint name="a" type="{kind}" axis="{axis}" {extra}/>
+  <geom pos="0.1 0 0" size="0.1"/><body pos="0.3 0 0">
+  <joint name="b" axis="0 1 0" damping="0.1"/><geom pos="0.2 0 0.1" size="0.1"/></body>
+</body></worldbody></mujoco>"""
+
+
+def change_of(scene, steps):
+    """The true target: the change of state over one control step."""
+    after = steps["next"]
+    target = StateDelta(scene).delta
+    return target(steps[QPOS], steps[QVEL], after[QPOS], after[QVEL])
+
+
+def redrawn(scene, steps, key, address, generator):
+    """One coordinate drawn anew, well inside its limits, and one true step from there."""
+    moved = steps.exclude("next").clone()
+    draw = torch.rand(len(steps), dtype=torch.float64, generator=generator)
+    value = 4.0 * draw - 2.0
+    if key == QPOS:
+        joint = list(scene.model.jnt_qposadr).index(address)
+        if scene.model.jnt_limited[joint]:
+            low, high = scene.model.jnt_range[joint]
+            value = low + (0.2 + 0.6 * draw) * (high - low)
+    moved[key][:, address] = value
+    return true_step(scene, moved, steps["next", "joint_torque"])
+
+
+def scalar_joints(scene):
+    """Addresses (qpos, dof) of hinges and slides."""
+    model = scene.model
+    kinds = {j: int(model.jnt_type[j]) for j in range(model.njnt)}
+    scalar = [j for j, kind in kinds.items() if kind in (HINGE, SLIDE)]
+    return [(int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])) for j in scalar]
+
+
+@every_scene
+def test_a_coordinate_is_dropped_exactly_when_steps_ignore_it(scene, generator):
+    drawn = random_transitions(scene, ROWS, generator)
+    found = {QPOS: scene.symmetries.positions, QVEL: scene.symmetries.velocities}
+    for addresses in scalar_joints(scene):
+        for key, address in zip((QPOS, QVEL), addresses, strict=True):
+            steps = redrawn(
+                scene, drawn, QPOS, addresses[0], generator
+            )  # no limit near
+            moved = redrawn(scene, steps, key, address, generator)
+            before, after = change_of(scene, steps), change_of(scene, moved)
+            difference = (after - before).abs().max() / before.abs().max()
+            if address in found[key]:
+                assert difference < 1e-9, f"{key}[{address}] matters"
+            else:
+                assert difference > 1e-6, f"{key}[{address}] does not matter"
+
+
+def test_cartpole_ignores_where_it_is_and_how_fast_it_rolls():
+    symmetries = load_scene("cartpole").symmetries
+    assert symmetries.positions == symmetries.velocities == {0}
+
+
+def test_pendulum_ignores_nothing():
+    symmetries = load_scene("double_pendulum").symmetries
+    assert not symmetries.positions and not symmetries.velocities
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "extra", "gravity", "position", "velocity"),
+    [
+        ("slide", "1 0 0", "", "0 0 -9.81", True, True),
+        ("slide", "0 0 1", "", "0 0 -9.81", True, True),
+        ("slide", "1 2 3", 'damping="0.1"', "0 0 -9.81", True, False),
+        ("slide", "1 0 0", 'stiffness="0.1"', "0 0 -9.81", False, False),
+        ("slide", "1 0 0", 'frictionloss="0.1"', "0 0 -9.81", True, False),
+        ("hinge", "0 0 1", "", "0 0 -9.81", True, False),
+        ("hinge", "0 1 0", "", "0 0 -9.81", False, False),
+        ("hinge", "0 1 0", "", "0 0 0", True, False),
+        ("slide", "1 0 0", 'range="-2 2" limited="true"', "0 0 -9.81", True, True),
+    ],
+)
+def test_symmetries_follow_from_the_physics(
+    kind, axis, extra, gravity, position, velocity
+):
+    xml = RAIL.format(kind=kind, axis=axis, extra=extra, gravity=gravity)
+    symmetries = make_scene(xml).symmetries
+    assert (0 in symmetries.positions, 0 in symmetries.velocities) == (
+        position,
+        velocity,
+    )
+    assert 1 not in symmetries.velocities
+
+
+def test_looking_for_symmetries_leaves_the_model_alone(scene, rng):
+    qpos, qvel = random_states(scene.model, 5, rng)
+    torque = torch.zeros(5, len(scene.actuated), dtype=torch.float64)
+    state = TensorDict({QPOS: qpos, QVEL: qvel}, batch_size=[5])
+    if scene.terrain is not None and scene.terrain.is_per_row:
+        state["terrain"] = torch.from_numpy(scene.terrain.default).expand(5, -1)
+    before = true_step(scene, state, torque)
+    flags = int(scene.model.opt.disableflags)
+    scene.__dict__.pop("symmetries", None)
+    assert scene.symmetries is not None
+    assert scene.model.opt.disableflags == flags
+    assert not flags & mujoco.mjtDisableBit.mjDSBL_LIMIT
+    assert torch.equal(
+        true_step(scene, state, torque)["next", QVEL], before["next", QVEL]
+    )

@@ -1,0 +1,136 @@
+"""A checkpoint comes back bit for bit, and a crash while saving leaves the old one."""
+
+import json
+import re
+import warnings
+from pathlib import Path
+
+import mujoco
+import pytest
+import torch
+from dynamics_helpers import edit_card, random_drive, random_model, roll, unequal_keys
+
+import torchrl_nerd
+from torchrl_nerd import from_pretrained, load_scene
+from torchrl_nerd.checkpoint import (
+    CARD,
+    WEIGHTS,
+    load_checkpoint,
+    make_card,
+    save_checkpoint,
+)
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.files import write_atomically, write_json
+from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.scenes import SCENES
+
+SCENE = load_scene(next(iter(SCENES)))
+
+
+@pytest.fixture
+def folder(tmp_path, generator) -> Path:
+    """A sound checkpoint."""
+    model = random_model(SCENE, generator)
+    return save_checkpoint(model, tmp_path / "model", make_card(model))
+
+
+@pytest.mark.parametrize("network", ["tiny", "mlp", "gru", "small"])
+def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
+    model = random_model(scene, generator, network)
+    card = make_card(model, {"note": "made by a test"})
+    save_checkpoint(model, tmp_path, card)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        copies = [load_checkpoint(tmp_path), from_pretrained(tmp_path, scene)]
+    drive = random_drive(scene, 4, 5, generator)
+    expected = roll(NeRDDynamics(model), *drive)
+    for copy in copies:
+        assert copy.config == NETWORKS[network] and copy.scene.hash == scene.hash
+        assert not unequal_keys(roll(NeRDDynamics(copy), *drive), expected)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [CARD, WEIGHTS]
+    assert json.loads((tmp_path / CARD).read_text()) == json.loads(json.dumps(card))
+
+
+def test_saving_again_replaces_the_old_model(folder, generator):
+    newer = random_model(SCENE, generator)
+    save_checkpoint(newer, folder, make_card(newer))
+    for key, value in load_checkpoint(folder).state_dict().items():
+        assert torch.equal(value, newer.state_dict()[key])
+
+
+@pytest.mark.parametrize("versions", [None, [], "3.17", {"mujoco": 3}, {}])
+def test_a_card_without_versions_is_only_warned_of(folder, versions):
+    edit_card(folder, versions=versions)
+    with pytest.warns(UserWarning, match="mujoco is"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"versions": {"mujoco": "2.3.7"}}, "mujoco is 2.3 there"),
+        ({"scene_hash": "0" * 16}, f"scene_hash is {'0' * 16} there and {SCENE.hash}"),
+        ({"control_step": 0.5}, "control_step is 0.5 there"),
+    ],
+)
+def test_other_physics_are_warned_of_in_one_sentence(folder, changes, named):
+    edit_card(folder, **changes)
+    with pytest.warns(UserWarning, match=re.escape(named)) as caught:
+        load_checkpoint(folder)
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
+
+
+def test_a_patch_release_of_mujoco_is_no_news(folder):
+    version = mujoco.__version__.rsplit(".", 1)[0] + ".99"
+    edit_card(folder, versions={"mujoco": version})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("inside", ["", "deeper"])
+def test_a_file_where_the_folder_should_be(tmp_path, inside, generator):
+    path = tmp_path / "model"
+    path.write_text("not a folder")
+    model = random_model(SCENE, generator, "mlp")
+    with pytest.raises(ValueError, match="folder that can be written") as caught:
+        save_checkpoint(model, path / inside, make_card(model))
+    assert str(path) in str(caught.value)
+    assert path.read_text() == "not a folder"
+
+
+class Killed(Exception):
+    """Stands for a process that ends in the midst of writing."""
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_write_cut_short_leaves_the_old_file_whole(folder, share):
+    path, content = folder / WEIGHTS, (folder / WEIGHTS).read_bytes()
+
+    def write(aside: Path) -> None:
+        aside.write_bytes(content[::-1][: int(share * len(content))])
+        raise Killed
+
+    with pytest.raises(Killed):
+        write_atomically(path, write)
+    assert path.read_bytes() == content
+    assert sorted(p.name for p in folder.iterdir()) == [CARD, WEIGHTS]
+    load_checkpoint(folder)
+
+
+def test_a_card_that_json_cannot_hold_leaves_the_old_one(folder):
+    old = (folder / CARD).read_text()
+    for junk in (float("nan"), object()):
+        with pytest.raises((ValueError, TypeError)):
+            write_json(folder / CARD, {"error": junk})
+        assert (folder / CARD).read_text() == old
+
+
+def test_nothing_is_ever_unpickled():
+    """No checkpoint may run code; a copy in memory is another matter."""
+    sources = list(Path(torchrl_nerd.__file__).parent.rglob("*.py"))
+    assert len(sources) > 20
+    for path in sources:
+        text = path.read_text()
+        found = re.search(r"\b(import pickle|pickle\.\w+\(|torch\.(load|save)\()", text)
+        assert found is None, f"{path.name}: {found}"

@@ -1,0 +1,186 @@
+"""The ``nerd`` command: data to figures, and bad input in one sentence."""
+
+import json
+import math
+import subprocess
+import sys
+
+import pytest
+
+from torchrl_nerd.cli import COMMANDS, main
+from torchrl_nerd.evaluation.protocols import PROTOCOLS
+from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.training.recipes import RECIPES
+
+TINY = ["--network", "mlp", "--rows", "64", "--rollout-rows", "8", "--quiet"]
+
+
+def refusal(capsys, *argv: str) -> str:
+    """The one sentence that a refused command leaves."""
+    try:
+        status = main(list(argv))
+    except SystemExit as stop:
+        status = stop.code
+    captured = capsys.readouterr()
+    assert status == 2
+    assert captured.err.startswith("nerd: ") and captured.err.count("\n") == 1
+    return captured.err
+
+
+def assert_finite(content) -> None:
+    if isinstance(content, dict):
+        content = list(content.values())
+    if isinstance(content, list):
+        for entry in content:
+            assert_finite(entry)
+    elif isinstance(content, float):
+        assert math.isfinite(content)
+
+
+def read(path) -> dict:
+    content = json.loads(path.read_text())
+    assert_finite(content)
+    return content
+
+
+@pytest.mark.parametrize("argv", [[], ["--help"], ["-h"]])
+def test_help_names_every_command(argv, capsys):
+    assert main(argv) == 0
+    text = capsys.readouterr().out
+    assert set(COMMANDS) >= {"data", "train", "eval"}
+    assert all(f"  {name}" in text for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", ["data", "train", "eval"])
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert f"nerd {command}" in text and "--json" in text and "Example:" in text
+
+
+@pytest.mark.parametrize("command", ["data", "train"])
+def test_help_shows_the_recipe_of_the_scene(command, scene, capsys):
+    recipe = RECIPES[scene.name]
+    with pytest.raises(SystemExit) as stop:
+        main([command, scene.name, "--help"])
+    text = capsys.readouterr().out
+    assert stop.value.code == 0
+    count = recipe.data.trajectories if command == "data" else recipe.train.steps
+    assert f"default: {count})" in text
+
+
+def test_an_unknown_command_is_refused(capsys):
+    text = refusal(capsys, "fly")
+    assert "'fly'" in text and "data, train, eval" in text
+
+
+@pytest.mark.parametrize("command", ["data", "train", "eval"])
+def test_an_unknown_scene_is_refused(command, capsys):
+    text = refusal(capsys, command, "unicorn")
+    assert "'unicorn'" in text and all(name in text for name in SCENES)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ("data cartpole --trajectories -5", "trajectories of at least 1, got -5"),
+        ("data cartpole --steps 0", "steps of at least 1, got 0"),
+        ("train cartpole --steps -1", "steps of at least 0, got -1"),
+        ("train cartpole --rows -8", "rows of at least 0, got -8"),
+        ("train cartpole --network huge", "unknown network 'huge'"),
+        ("train cartpole --save-every 0", "save_every of at least 1"),
+        ("train cartpole --threads -1", "threads"),
+        ("train cartpole --device nowhere", "nowhere"),
+        ("eval cartpole --rows 1", "at least 2 rows, got 1"),
+        ("eval cartpole --rows -3", "at least 2 rows, got -3"),
+        ("eval cartpole --device nowhere", "nowhere"),
+        ("eval cartpole --model nowhere", "checkpoint folder, got 'nowhere'"),
+    ],
+)
+def test_bad_input_is_refused(argv, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    argv = argv.split()
+    if argv[:2] == ["train", "cartpole"]:
+        sizes = ["--trajectories", "8", "--steps", "20", "--out", "d", "--quiet"]
+        assert main(["data", "cartpole", *sizes]) == 0
+        argv += ["--data", "d", "--quiet"]
+        capsys.readouterr()
+    assert words in refusal(capsys, *argv)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ("data cartpole --trajectories many", "many"),
+        ("train cartpole --speed 3", "--speed"),
+        ("eval", "Name of the robot"),
+    ],
+)
+def test_what_cannot_be_read_is_pointed_at(argv, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(argv.split())
+    captured = capsys.readouterr()
+    assert stop.value.code == 2
+    assert words in captured.err and captured.out == ""
+
+
+@pytest.mark.parametrize("command", ["data", "train"])
+def test_a_folder_that_cannot_be_written_is_refused(command, tmp_path, capsys):
+    place = tmp_path / "taken"
+    place.write_text("not a folder")
+    argv = [command, "cartpole", "--out", str(place), "--data", str(tmp_path / "d")]
+    text = refusal(capsys, *(argv if command == "train" else argv[:4]))
+    assert str(place) in text
+    assert place.read_text() == "not a folder"
+    assert sorted(tmp_path.iterdir()) == [place]
+
+
+def test_no_traceback_reaches_the_terminal():
+    command = [sys.executable, "-m", "torchrl_nerd.cli", "data", "unicorn"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith("nerd: unknown")
+
+
+def test_from_data_to_figures(scene, tmp_path, seed, capsys):
+    name = scene.name
+    data, run, best = (str(tmp_path / x) for x in ("data", "run", "best"))
+    figures = {x: tmp_path / f"{x}.json" for x in ("data", "train", "eval")}
+    argv = ["data", name, "--out", data, "--trajectories", "300", "--steps", "20"]
+    argv += ["--seed", str(seed), "--quiet", "--json", str(figures["data"])]
+    assert main(argv) == 0
+    card = read(figures["data"])
+    assert card["trajectories"] + card["dropped"] == 300
+    assert card["config"] == {"trajectories": 300, "steps": 20, "seed": seed}
+
+    argv = ["train", name, "--data", data, "--out", run, "--export", best, *TINY]
+    argv += ["--steps", "120", "--rollout-steps", "2", "--validate-every", "122"]
+    assert main([*argv, "--json", str(figures["train"])]) == 0
+    assert read(figures["train"])["training"]["steps_done"] == 122
+    assert main(argv) == 0  # finished: nothing to do
+
+    rows = "16"
+    argv = ["eval", name, "--model", best, "--rows", rows, "--seed", str(seed)]
+    capsys.readouterr()
+    assert main([*argv, "--json", str(figures["eval"])]) == 0
+    table = capsys.readouterr().out.splitlines()[1:]
+    content, protocol = read(figures["eval"]), PROTOCOLS[name]()
+    assert (content["scene"], content["rows"], content["seed"]) == (name, 16, seed)
+    expected = len(protocol.cases) * len(protocol.horizons) * scene.model.njnt
+    assert len(content["errors"]) == len(table) == expected
+    for row, line in zip(content["errors"], table, strict=True):
+        assert all(row[key] >= 0.0 for key in ("mean", "interval", "final", "p95"))
+        key = (row["case"], row["steps"], row["quantity"])
+        assert row["paper"] == protocol.published.get(key)
+        assert row["case"] in line and row["quantity"] in line
+
+
+def test_the_shipped_cartpole_is_as_good_as_the_paper(tmp_path):
+    path = tmp_path / "figures.json"
+    assert main(["eval", "cartpole", "--rows", "64", "--json", str(path)]) == 0
+    rows = [row for row in read(path)["errors"] if row["steps"] == 100]
+    assert {row["quantity"] for row in rows} == {"slider", "hinge"}
+    for row in rows:
+        assert 0.0 < row["mean"] < 2.0 * row["paper"]

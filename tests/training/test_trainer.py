@@ -1,0 +1,185 @@
+"""Training: the loss falls on every robot, and bad requests are refused in a sentence."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Generator
+
+from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
+from torchrl_nerd.files import read_json
+from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.tasks import make_task
+from torchrl_nerd.training.log import TrainingLog
+from torchrl_nerd.training.losses import one_step_loss
+from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.training.trainer import TrainConfig, Trainer, split_parameters
+
+SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
+BRIEF = TrainConfig(
+    steps=40,
+    rollout_steps=5,
+    rows=32,
+    length=8,
+    rollout_rows=8,
+    rollout_length=4,
+    warmup=5,
+    save_every=15,
+    validate_every=20,
+)
+
+
+def make_trainer(scene: Scene, config: TrainConfig, folder: Path, steps=12) -> Trainer:
+    data = simulate(scene, 200, steps, Generator().manual_seed(config.seed))
+    task = make_task(RECIPES[scene.name].task)
+    data, horizons = data[is_sound(data)], (2, 5)
+    return Trainer(scene, data, task, config, folder, horizons=horizons, quiet=True)
+
+
+def loss_of(trainer: Trainer, seed: int) -> float:
+    generator = Generator().manual_seed(seed)
+    tokens, targets = trainer.sequences.one_step(256, 8, generator)
+    with torch.no_grad():
+        return float(one_step_loss(trainer.model.network(tokens), targets, 0.01))
+
+
+@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
+    trainer = make_trainer(scene, replace(BRIEF, network=network, seed=seed), tmp_path)
+    before = loss_of(trainer, seed)
+    model = trainer.run()
+    assert loss_of(trainer, seed) < 0.8 * before
+    start = initial_states(trainer.task, 5, seed)
+    expected = open_loop(NeRDDynamics(model), start, 20)
+    for name in ("last", "best"):
+        loaded = load_checkpoint(tmp_path / name)
+        assert loaded.config == NETWORKS[network] and loaded.scene is scene
+        path = open_loop(NeRDDynamics(loaded), start, 20)
+        assert path.isfinite().all()
+        if name == "last":
+            assert torch.equal(path, expected)
+    card = read_json(tmp_path / "best" / "card.json")
+    assert card["training"]["network"] == network
+    assert set(card["validation_error"]) == {"2", "5"}
+
+
+def test_the_log_has_every_validation_once(tmp_path):
+    make_trainer(SCENE, BRIEF, tmp_path).run()
+    rows = TrainingLog(tmp_path, BRIEF.total_steps).rows
+    assert [row["step"] for row in rows] == ["20", "40", "45"]
+    assert all(float(value) >= 0.0 for row in rows for value in row.values())
+
+
+def test_a_log_is_replaced_and_never_cut(tmp_path):
+    """Whoever reads, or dies, in the midst of a write has the old log or the new one."""
+    log = TrainingLog(tmp_path, 0)
+    log.write({"step": 1, "loss": 0.5})
+    old = (tmp_path / "log.csv").read_text()
+    with open(tmp_path / "log.csv") as reader:
+        log.write({"step": 2, "loss": 0.25})
+        assert reader.read() == old
+    assert [row["step"] for row in TrainingLog(tmp_path, 2).rows] == ["1", "2"]
+
+
+def test_rows_after_the_resumed_step_are_dropped(tmp_path):
+    log = TrainingLog(tmp_path, 0)
+    for step in (10, 20, 30):
+        log.write({"step": step, "loss": 1.0 / step})
+    log = TrainingLog(tmp_path, 20)
+    log.write({"step": 30, "loss": 0.5})
+    rows = TrainingLog(tmp_path, 30).rows
+    assert [row["step"] for row in rows] == ["10", "20", "30"]
+    assert float(rows[-1]["loss"]) == 0.5
+
+
+@pytest.mark.parametrize(
+    "change", [{"steps": 41}, {"network": "mlp"}, {"seed": 1}, {"lr": 0.02}]
+)
+def test_another_configuration_is_refused_and_nothing_lost(change, tmp_path):
+    make_trainer(SCENE, BRIEF, tmp_path).run(until=15)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    with pytest.raises(ValueError, match=f"{tmp_path} holds a run.*another folder"):
+        make_trainer(SCENE, replace(BRIEF, **change), tmp_path)
+    after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    assert after == before and len(before) >= 4
+
+
+def test_another_robot_is_refused(tmp_path):
+    make_trainer(SCENE, BRIEF, tmp_path).run(until=15)
+    with pytest.raises(ValueError, match=f"{tmp_path} holds a run with scene_hash"):
+        make_trainer(OTHER, BRIEF, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "longest"),
+    [({"length": 13}, 13), ({"rollout_length": 14}, 14), ({"length": 20}, 20)],
+)
+def test_too_short_trajectories_are_refused(change, longest, tmp_path):
+    with pytest.raises(ValueError, match=f"at least {longest} steps, got 12"):
+        make_trainer(SCENE, replace(BRIEF, **change), tmp_path)
+    unused = replace(BRIEF, rollout_length=14, rollout_steps=0)
+    make_trainer(SCENE, unused, tmp_path / "unused")
+
+
+def test_unusable_settings_are_refused(tmp_path):
+    for name in ("steps", "rows", "lr", "ema", "seed", "save_every"):
+        with pytest.raises(ValueError, match=f"{name} of at least 0, got -1"):
+            TrainConfig(**{name: -1})
+    with pytest.raises(ValueError, match="unknown network 'huge', expected.*tiny"):
+        TrainConfig(network="huge")
+    (tmp_path / "taken").write_text("not a folder")
+    with pytest.raises(ValueError, match=f"got {tmp_path / 'taken'}"):
+        make_trainer(SCENE, BRIEF, tmp_path / "taken")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rows",
+        "length",
+        "rollout_rows",
+        "rollout_length",
+        "save_every",
+        "validate_every",
+    ],
+)
+def test_counts_of_zero_are_refused(name):
+    """An empty batch has no loss, and nothing happens every zero updates."""
+    with pytest.raises(ValueError, match=f"{name} of at least 1, got 0"):
+        TrainConfig(**{name: 0})
+
+
+@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+def test_every_weight_has_one_optimizer(network, tmp_path):
+    trainer = make_trainer(SCENE, replace(BRIEF, network=network), tmp_path)
+    matrices, others = split_parameters(trainer.model.network)
+    ids = [id(weight) for weight in (*matrices, *others)]
+    parameters = list(trainer.model.network.parameters())
+    assert sorted(ids) == sorted(map(id, parameters))
+    assert all(weight.ndim == 2 for weight in matrices)
+    trainer.run(until=3)
+    for name, weights in (("muon", matrices), ("adamw", others)):
+        held = trainer.optimizers[name].param_groups[0]["params"]
+        assert list(map(id, held)) == list(map(id, weights))
+
+
+def test_step_sizes_rise_and_fall_to_zero_in_both_phases(tmp_path):
+    config = replace(BRIEF, steps=30, rollout_steps=10, warmup=10)
+    trainer = make_trainer(SCENE, config, tmp_path)
+    sizes = []
+    for trainer.step in range(config.total_steps):
+        trainer.update()
+        rates = [trainer.optimizers[n].param_groups[0]["lr"] for n in ("muon", "adamw")]
+        assert rates[0] / config.lr == pytest.approx(rates[1] / config.lr_other)
+        sizes.append(rates[0] / config.lr)
+    first, second = sizes[:30], sizes[30:]
+    top = first.index(max(first))
+    assert first[: top + 1] == sorted(first[: top + 1]) and 7 <= top <= 10
+    assert first[top:] == sorted(first[top:], reverse=True) and first[-1] < 0.05
+    assert second[0] == pytest.approx(config.rollout_lr)
+    assert second == sorted(second, reverse=True) and second[-1] < 0.02

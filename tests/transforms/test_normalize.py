@@ -1,0 +1,147 @@
+"""Statistics that are exact, merge, travel and stay as they were."""
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_nerd.transforms import Normalize, Stats
+
+ROWS, WIDTH = 1000, 4
+
+
+def samples(generator, rows=ROWS, offset=0.0, scale=1.0):
+    draw = torch.randn(rows, WIDTH, dtype=torch.float64, generator=generator)
+    return offset + scale * draw
+
+
+def as_rows(**values):
+    return TensorDict(values, batch_size=[len(next(iter(values.values())))])
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e8])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+def test_mean_becomes_zero_and_spread_one(offset, scale, generator):
+    scale = max(scale, 1e-5 * offset)  # above the floor
+    x = samples(generator, offset=offset, scale=scale)
+    out = Normalize({"x": Stats.of(x)})(as_rows(x=x.clone()))["x"]
+    assert out.mean(0).abs().max() < 1e-9 * (1.0 + offset / scale)
+    assert (out.std(0, correction=0) - 1.0).abs().max() < 1e-6
+
+
+def test_statistics_are_torchs(generator):
+    x = samples(generator, offset=3.0, scale=2.0)
+    stats = Stats.of(x.reshape(10, 5, -1, WIDTH))
+    assert stats.count == ROWS and stats.mean.dtype == torch.float64
+    torch.testing.assert_close(stats.mean, x.mean(0))
+    torch.testing.assert_close(stats.std, x.std(0, correction=0))
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e8])
+def test_merged_statistics_are_those_of_everything(offset, generator):
+    scale = 1.0 + 100.0 * (offset > 0.0)
+    x = samples(generator, offset=offset, scale=scale)
+    x += torch.linspace(0.0, 5.0, ROWS, dtype=torch.float64)[:, None]  # unequal parts
+    cuts = torch.randperm(ROWS - 1, generator=generator)[:4].sort().values + 1
+    parts = [Stats.of(part) for part in x.tensor_split(cuts)]
+    forth, back = parts[0], parts[-1]
+    for part in parts[1:]:
+        forth = forth.merge(part)
+    for part in parts[-2::-1]:
+        back = part.merge(back)
+    whole = Stats.of(x)
+    for merged in (forth, back):
+        assert merged.count == whole.count
+        torch.testing.assert_close(merged.mean, whole.mean, rtol=1e-14, atol=1e-12)
+        torch.testing.assert_close(merged.m2, whole.m2, rtol=1e-10, atol=0.0)
+
+
+def test_the_order_of_merging_two_does_not_matter(generator):
+    a, b = (Stats.of(samples(generator, rows, rows)) for rows in (1, 500))
+    one, other = a.merge(b), b.merge(a)
+    torch.testing.assert_close(one.mean, other.mean)
+    torch.testing.assert_close(one.m2, other.m2)
+
+
+def test_a_constant_stays_finite_and_comes_back(generator):
+    x = samples(generator)
+    x[:, 0], x[:, 1], x[:, 2] = 0.0, 7.0, -1e9
+    transform = Normalize({"x": Stats.of(x)})
+    out = transform(as_rows(x=x.clone()))["x"]
+    assert out.isfinite().all() and out[:, :3].abs().max() < 1e-6
+    torch.testing.assert_close(transform.denormalize("x", out), x)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_inverse_returns_what_went_in(dtype, generator):
+    x = samples(generator, offset=50.0, scale=0.1).to(dtype)
+    transform = Normalize({"x": Stats.of(x)})
+    normal = transform.normalize("x", x)
+    back = transform.denormalize("x", normal)
+    assert normal.dtype == back.dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-13
+    torch.testing.assert_close(back, x, rtol=tolerance, atol=0.0)
+
+
+def test_huge_offsets_cost_no_digits(generator):
+    """float64 inside: features at 1e6 with a spread of 1e-2 keep nine digits of it."""
+    x = samples(generator, offset=1e6, scale=3.0)
+    normal = Normalize({"x": Stats.of(x)}).normalize("x", x)
+    want = (x - 1e6 - (x - 1e6).mean(0)) / (x - 1e6).std(0, correction=0)
+    torch.testing.assert_close(normal, want, rtol=0.0, atol=1e-9)
+
+
+def test_a_deep_copy_has_statistics_of_its_own(generator):
+    x = samples(generator)
+    transform = Normalize({"x": Stats.of(x)})
+    other = copy.deepcopy(transform)
+    for buffer in other.buffers():
+        buffer.add_(1.0)
+    before, after = (t.normalize("x", x) for t in (transform, other))
+    assert torch.equal(before, Normalize({"x": Stats.of(x)}).normalize("x", x))
+    assert not torch.allclose(before, after)
+
+
+def test_it_shares_no_memory_with_the_statistics_it_got(generator):
+    x = samples(generator)
+    stats = Stats.of(x)
+    transform = Normalize({"x": stats})
+    before = transform.normalize("x", x)
+    stats.mean.add_(5.0)
+    stats.m2.mul_(4.0)
+    assert torch.equal(transform.normalize("x", x), before)
+
+
+def test_statistics_travel_in_the_state_dict(generator):
+    x, y = samples(generator, offset=2.0), samples(generator, offset=-3.0)
+    stats = {"x": Stats.of(x), ("next", "y"): Stats.of(y)}
+    other = Normalize({"x": Stats.of(y), ("next", "y"): Stats.of(x)})
+    transform = Normalize(stats)
+    other.load_state_dict(transform.state_dict())
+    for key, value in (("x", x), (("next", "y"), y)):
+        got, want = other.normalize(key, value), transform.normalize(key, value)
+        assert torch.equal(got, want)
+    assert not list(transform.parameters())
+
+
+def test_running_changes_no_statistics(generator):
+    transform = Normalize({"x": Stats.of(samples(generator))}).train()
+    before = copy.deepcopy(transform.state_dict())
+    for _ in range(3):
+        transform(as_rows(x=samples(generator, offset=100.0)))
+    after = transform.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_nested_keys_and_absent_ones(generator):
+    x, y = samples(generator), samples(generator, offset=9.0)
+    transform = Normalize({"x": Stats.of(x), ("next", "y"): Stats.of(y)})
+    rows = as_rows(x=x.clone(), z=y.clone())
+    rows["next", "y"] = y.clone()
+    out = transform(rows)
+    assert torch.equal(out["z"], y)
+    torch.testing.assert_close(
+        out["next", "y"], (y - y.mean(0)) / y.std(0, correction=0)
+    )
+    assert "x" not in transform(as_rows(z=y.clone())).keys()
