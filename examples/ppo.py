@@ -1,15 +1,14 @@
 """Swing up a cart-pole in learned dynamics, then measure the policy in true physics.
 
-    python examples/ppo.py                       # train in NeRD
-    python examples/ppo.py --dynamics mujoco     # the same, in MuJoCo: nothing else changes
+    python examples/ppo.py                       # learn in NeRD
+    python examples/ppo.py --dynamics mujoco     # the same in MuJoCo: nothing else changes
 
-True physics is measured, never trained on. Policy and figures are written to `--out`.
+True physics is measured, never learned from. Policy and figures are written to `--out`.
 """
 
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from time import perf_counter
 
 import torch
 import tyro
@@ -18,16 +17,28 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import Collector
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl.envs import EnvBase
+from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_nerd import make_env
-from torchrl_nerd.evaluation import plots, policy_transfer
-from torchrl_nerd.evaluation.policy import Policy, Standardize, make_actor, mlp, save_policy
-from torchrl_nerd.files import write_atomically, write_json
+from torchrl_nerd.evaluation.plots import plot_learning_curve, plot_states
+from torchrl_nerd.evaluation.policy import (
+    Policy,
+    Standardize,
+    make_actor,
+    mlp,
+    save_policy,
+)
+from torchrl_nerd.evaluation.policy_transfer import (
+    hardest_episode,
+    transfer,
+    transfer_table,
+)
+from torchrl_nerd.files import write_json
+from torchrl_nerd.tasks import make_task
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 
@@ -36,58 +47,107 @@ logging.getLogger("torchrl").setLevel(logging.ERROR)
 class PPOConfig:
     """Proximal policy optimisation: Schulman et al., https://arxiv.org/abs/1707.06347."""
 
-    task: str = "cartpole/swingup"
-    """what to learn"""
-    dynamics: str = "nerd"
-    """where to learn it: nerd, mujoco, dm_control or the folder of a checkpoint"""
-    seed: int = 0
-    """of weights, exploration and starts"""
-    total_frames: int = 6_000_000
-    """control steps to learn from"""
-    num_envs: int = 2048
-    """rows stepped together"""
-    horizon: int = 32
-    """steps of each row between two updates"""
-    epochs: int = 4
-    """passes over those steps in an update"""
-    minibatch: int = 8192
-    """steps per gradient"""
-    lr: float = 3e-3
-    """Adam's step size at the start; falls linearly to zero"""
-    gamma: float = 0.99
-    """discount per step"""
-    lmbda: float = 0.95
-    """advantage estimation: 0 trusts the critic, 1 the rewards"""
-    clip: float = 0.2
-    """how far the probability of an action may move, as a ratio, in one update"""
-    max_grad_norm: float = 1.0
-    """longer gradients are shortened"""
-    widths: tuple[int, ...] = (64, 64)
-    """hidden layers of actor and critic"""
-    evaluate_every: int = 10
-    """updates between two points of the learning curve"""
-    episodes: int = 2048
-    """in the final evaluation; an eighth of them on dm_control, where each row is slow"""
-    out: Path = Path("runs/ppo")
-    """folder for policy, curve and figures"""
+    task: str = "cartpole/swingup"  # what to learn
+    dynamics: str = "nerd"  # where: nerd, mujoco, dm_control, a checkpoint folder
+    seed: int = 0  # of weights, exploration and starts
+    total_frames: int = 6_000_000  # control steps to learn from
+    num_envs: int = 1024  # rows stepped together
+    horizon: int = 32  # steps of every row between two updates
+    epochs: int = 4  # passes over those steps
+    minibatch: int = 4096  # steps per gradient
+    lr: float = 4e-3  # Adam's step size at the start; falls linearly to zero
+    gamma: float = 0.99  # discount per step
+    lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
+    clip: float = 0.2  # how far an action's probability ratio counts
+    widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic
+    evaluate_every: int = 20  # updates between two points of the learning curve
+    episodes: int = 2048  # of the final evaluation
+    out: Path = Path("runs/ppo")  # folder for policy, numbers and figures
 
 
-def train(cfg: PPOConfig) -> tuple[ProbabilisticActor, dict[str, list[float]]]:
-    """A policy trained in ``cfg.dynamics`` alone, and its learning curve."""
-    env = make_env(cfg.task, cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed)
-    actor, critic = make_actor_critic(env, cfg.widths)
+def make_policy_and_critic(
+    env: EnvBase, cfg: PPOConfig
+) -> tuple[Policy, ValueOperator]:
+    """Both see observations standardised by what random actions meet."""
+    seen = env.rollout(cfg.horizon, break_when_any_done=False)["observation"]
+    size, num_actions = seen.shape[-1], env.action_spec.shape[-1]
+    policy = Policy((size, *cfg.widths, num_actions))
+    policy.standardize.fit(seen)
+    critic = nn.Sequential(Standardize(size).fit(seen), mlp((size, *cfg.widths, 1)))
+    return policy, ValueOperator(critic)
+
+
+def update(
+    batch: TensorDictBase,
+    advantage: GAE,
+    loss: ClipPPOLoss,
+    optimizer: Adam,
+    cfg: PPOConfig,
+) -> None:
+    """Several passes over a batch ``[num_envs, horizon]``."""
+    batch["next", "reward"] *= 1 - cfg.gamma  # values become means of rewards, not sums
+    keys = ("observation", "action", "action_log_prob", "advantage", "value_target")
+    steps = advantage(batch).select(*keys).reshape(-1)
+    for _ in range(cfg.epochs):
+        for rows in torch.randperm(len(steps)).split(cfg.minibatch):
+            losses = loss(steps[rows])
+            optimizer.zero_grad()
+            (losses["loss_objective"] + losses["loss_critic"]).backward()
+            nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
+            optimizer.step()
+
+
+def train(cfg: PPOConfig) -> tuple[Policy, list[dict[str, float]]]:
+    """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
+    env = make_env(
+        cfg.task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed
+    )
+    policy, critic = make_policy_and_critic(env, cfg)
+    actor = make_actor(policy)
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
     loss = ClipPPOLoss(
-        actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False, normalize_advantage=True
+        actor,
+        critic,
+        clip_epsilon=cfg.clip,
+        entropy_bonus=False,
+        normalize_advantage=True,
     )
     optimizer = Adam(loss.parameters(), lr=cfg.lr)
     frames = cfg.num_envs * cfg.horizon
-    updates = cfg.total_frames // frames
-    schedule = LinearLR(optimizer, start_factor=1.0, end_factor=0.0, total_iters=updates)
+    total = cfg.total_frames // frames * frames
+    schedule = LinearLR(optimizer, 1.0, end_factor=0.0, total_iters=total // frames)
     collector = Collector(
-        env,
-        actor,
-        frames_per_batch=frames,
-        total_frames=updates * frames,
-        track_traj_ids=False,
+        env, actor, frames_per_batch=frames, total_frames=total, track_traj_ids=False
     )
+    curve = []
+    progress = tqdm(total=total, unit="frame", unit_scale=True)
+    for number, batch in enumerate(collector, 1):
+        update(batch, advantage, loss, optimizer, cfg)
+        schedule.step()
+        progress.update(frames)
+        if number % cfg.evaluate_every == 0 or number * frames == total:
+            returns = transfer(cfg.task, actor, [cfg.dynamics], 256, seed=cfg.seed + 1)
+            means = {name: summary.mean for name, summary in returns.items()}
+            progress.set_postfix(means)
+            curve.append({"frames": number * frames, **means})
+    return policy, curve
+
+
+def main(cfg: PPOConfig) -> None:
+    """Learn in one dynamics, measure in all of them, write down what came out."""
+    torch.manual_seed(cfg.seed)
+    policy, curve = train(cfg)
+    save_policy(policy, cfg.out, {"task": cfg.task, "dynamics": cfg.dynamics})
+    plot_learning_curve(curve, cfg.out / "learning_curve.png")
+
+    actor, seed = make_actor(policy), cfg.seed + 2
+    everywhere = (cfg.dynamics, "nerd", "mujoco", "dm_control")
+    returns = transfer(cfg.task, actor, everywhere, cfg.episodes, seed=seed)
+    print(transfer_table(returns))
+    write_json(cfg.out / "returns.json", {k: asdict(v) for k, v in returns.items()})
+    episodes = hardest_episode(cfg.task, actor, everywhere[:3], seed)
+    plot_states(episodes, make_task(cfg.task).scene, cfg.out / "swing_up.png")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(PPOConfig))

@@ -87,7 +87,10 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
     card = read_json(folder / CARD)
     scene = scene or _scene_of(card, folder)
     _compare(card, scene, folder)
-    model = NeRD(scene, _network_config(card, folder))
+    with torch.random.fork_rng(
+        devices=[]
+    ):  # its first weights are drawn, then replaced
+        model = NeRD(scene, _network_config(card, folder))
     tensors = _read_tensors(folder / WEIGHTS)
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in tensors.items()}

@@ -13,6 +13,8 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_json
@@ -183,8 +185,16 @@ class Transfer:
     json: Path | None = None
     """Write the figures to this file."""
 
-
-"""The command line grows a command by a class here and a line in COMMANDS."""
+    def run(self) -> dict[str, Any]:
+        """Print a table and return its rows."""
+        if self.episodes < 2:
+            raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
+        policy = load_policy(self.policy, make_task(self.task))
+        actor = make_actor(policy)
+        summaries = transfer(self.task, actor, self.dynamics, self.episodes, self.seed)
+        print(transfer_table(summaries))
+        figures = {name: asdict(summary) for name, summary in summaries.items()}
+        return {"task": self.task, "seed": self.seed, "returns": figures}
 
 
 COMMANDS = {"data": Data, "train": Train, "eval": Eval, "transfer": Transfer}
@@ -222,7 +232,9 @@ def _default(kind: type, args: list[str]) -> Any:
     if scene is None or kind not in (Data, Train):
         return tyro.MISSING_NONPROP
     recipe = RECIPES[scene]
-    return kind(scene, config=recipe.data if kind is Data else recipe.train)
+    if kind is Data:
+        return Data(scene, config=recipe.data)
+    return Train(scene, config=recipe.train)
 
 
 def _fail(sentence: str) -> int:

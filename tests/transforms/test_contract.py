@@ -12,7 +12,6 @@ from torchrl.envs import (
     check_env_specs,
 )
 from transform_helpers import (
-    ENVS,
     STEPS,
     TASK_OF,
     TRANSFORMS,

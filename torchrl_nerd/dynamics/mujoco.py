@@ -2,6 +2,7 @@
 
 import copy
 import os
+from typing import Any
 
 import mujoco
 import mujoco.rollout
@@ -14,7 +15,7 @@ from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.scene import Scene
 
-STATE = mujoco.mjtState
+STATE: Any = mujoco.mjtState
 CONTROL = int(
     STATE.mjSTATE_QFRC_APPLIED | STATE.mjSTATE_MOCAP_POS | STATE.mjSTATE_MOCAP_QUAT
 )

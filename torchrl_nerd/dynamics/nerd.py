@@ -58,6 +58,7 @@ class NeRDDynamics:
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.tokens.size)
         self._memory: Memory | None = None
+        self._rows = 0
         self._compiled: Callable | None = None
 
     def __getstate__(self) -> dict:
@@ -67,9 +68,9 @@ class NeRDDynamics:
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""
         count = state[QPOS].shape[0]
-        if rows is None or self._memory is None:
-            self._memory = self.network.empty_memory(count)
-        elif rows.any():
+        if rows is None or rows.all() or self._rows != count:
+            self._memory, self._rows = self.network.empty_memory(count), count
+        elif self._memory is not None and rows.any():
             self._memory.clear(rows.reshape(count))
 
     def step(
@@ -81,8 +82,9 @@ class NeRDDynamics:
         """See `Dynamics.step`."""
         check_step(self.scene, state, joint_torque, terrain)
         qpos, qvel = state[QPOS], state[QVEL]
-        if self._memory is None:
-            self._memory = self.network.empty_memory(len(qpos))
+        if self._memory is None or self._rows != len(qpos):
+            self._rows = len(qpos)
+            self._memory = self.network.empty_memory(self._rows)
         predict = self._run_compiled if self.compile else self._predict
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel = predict(

@@ -1,5 +1,7 @@
 """A scene, a task and a dynamics joined into a batched TorchRL env."""
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -11,7 +13,7 @@ from torchrl_nerd.envs.streams import row_uniforms
 from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 
-MAX_SEED = 2**31
+MAX_SEED = 2**63
 
 
 class SceneEnv(EnvBase):
@@ -107,6 +109,12 @@ class SceneEnv(EnvBase):
             raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed}")
         self.seed = seed
         self._episode.zero_()
+
+    def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
+        """Restore states and episode counts; the history of every row starts empty."""
+        result = super().load_state_dict(state_dict, *args, **kwargs)
+        self.dynamics.reset(self._state())
+        return result
 
     @property
     def state(self) -> TensorDict:

@@ -35,7 +35,7 @@ def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
     """
     device = episode.device
     row = torch.arange(len(episode), device=device)
-    key = torch.full_like(row, seed) * GOLDEN
+    key = _mix(torch.full_like(row, seed) * GOLDEN)
     for part in (row, episode):
         key = _mix(key + (part + 1) * GOLDEN)
     index = torch.arange(1, count + 1, device=device)

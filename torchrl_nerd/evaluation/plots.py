@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
 from mujoco import mjtJoint
-from torch import Tensor
+from tensordict import TensorDictBase
 
 from torchrl_nerd.files import write_atomically
 from torchrl_nerd.scenes import Scene
@@ -29,54 +30,61 @@ STYLES = ("-", "--", ":", "-.")
 PANEL = (7.0, 2.0)  # inches
 
 
-def plot_learning_curve(
-    frames: Sequence[int], returns: Mapping[str, Sequence[float]], path: Path
-) -> None:
-    """Mean return over training.
+def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> None:
+    """Mean return over training, and beside it the numbers as CSV.
 
     Args:
-        frames: env steps at each point.
-        returns: mean return at each point, by name of the dynamics it was measured in.
-        path: of the PNG.
+        curve: points: ``frames`` (env steps) and the mean return by name of the dynamics
+            it was measured in.
+        path: of the PNG; the table's name ends in ``.csv`` instead.
     """
     figure, (axes,) = _figure(1, height=4.0)
-    for number, (name, values) in enumerate(returns.items()):
-        millions = [count / 1e6 for count in frames]
-        axes.plot(millions, values, STYLES[number % 4], color=COLORS[number % 4], label=name)
-    axes.set(xlabel="env steps (millions)", ylabel="mean return")
+    millions = [point["frames"] / 1e6 for point in curve]
+    names = list(curve[0])
+    for number, name in enumerate(names[1:]):
+        returns = [point[name] for point in curve]
+        axes.plot(millions, returns, STYLES[number], color=COLORS[number], label=name)
+    axes.set(xlabel="environment steps (millions)", ylabel="mean return")
     axes.legend(frameon=False)
     _save(figure, path)
+    rows = [names, *([str(point[name]) for name in names] for point in curve)]
+    text = "".join(",".join(row) + "\n" for row in rows)
+    write_atomically(
+        path.with_suffix(".csv"), lambda aside: aside.write_text(text) and None
+    )
 
 
 def plot_states(
-    states: Mapping[str, Tensor], names: Sequence[str], control_step: float, path: Path
+    episodes: Mapping[str, TensorDictBase], scene: Scene, path: Path
 ) -> None:
-    """One panel per state coordinate, one line per dynamics.
+    """Positions and reward over time, one panel each, one line per dynamics.
 
     Args:
-        states: ``(steps, len(names))`` each, by name of the dynamics; lengths may differ.
-        names: of the coordinates, with units.
-        control_step: s.
+        episodes: ``qpos`` and ``reward`` after each step, ``[steps]``, by name of the
+            dynamics; lengths may differ.
+        scene: the robot.
         path: of the PNG.
     """
-    figure, panels = _figure(len(names), height=PANEL[1] * len(names))
-    for coordinate, (axes, label) in enumerate(zip(panels, names, strict=True)):
-        for number, (name, values) in enumerate(states.items()):
-            seconds = [control_step * (step + 1) for step in range(len(values))]
-            y = values[:, coordinate].tolist()
-            axes.plot(seconds, y, STYLES[number % 4], color=COLORS[number % 4], label=name)
+    labels = [*_qpos_names(scene), "reward"]
+    figure, panels = _figure(len(labels), height=PANEL[1] * len(labels))
+    for number, (name, steps) in enumerate(episodes.items()):
+        values = torch.cat((steps["qpos"], steps["reward"]), -1)
+        seconds = scene.control_step * torch.arange(1, len(values) + 1)
+        for axes, line in zip(panels, values.unbind(-1), strict=True):
+            axes.plot(seconds, line, STYLES[number], color=COLORS[number], label=name)
+    for axes, label in zip(panels, labels, strict=True):
         axes.set_ylabel(label)
     panels[-1].set_xlabel("time (s)")
-    panels[0].legend(frameon=False, ncols=len(states))
+    panels[0].legend(frameon=False, ncols=len(episodes))
     _save(figure, path)
 
 
-def qpos_names(scene: Scene) -> list[str]:
-    """Name and unit of every entry of ``qpos``, for `plot_states`."""
+def _qpos_names(scene: Scene) -> list[str]:
+    """Name and unit of every entry of ``qpos``."""
     model, names = scene.model, []
     for joint in range(model.njnt):
         name = model.joint(joint).name
-        names += [f"{name} {part}".strip() for part in PARTS[model.jnt_type[joint]]]
+        names += [f"{name} {part}" for part in PARTS[mjtJoint(model.jnt_type[joint])]]
     return names
 
 

@@ -58,29 +58,22 @@ class Standardize(nn.Module):
         return (x - self.mean) / self.std
 
 
-class GaussianPolicy(nn.Module):
+class Policy(nn.Module):
     """Observation ``(*batch, D)`` -> mean and standard deviation ``(*batch, A)``.
 
     A tanh network gives the mean; the standard deviation is learned and the same in every
     state (paper, appendix B). Both are before the squashing that `make_actor` adds.
 
     Args:
-        observation_size: D.
-        num_actions: A.
-        widths: of the hidden layers.
+        sizes: D, the widths of the hidden layers, A.
     """
 
-    def __init__(
-        self,
-        observation_size: int,
-        num_actions: int,
-        widths: Sequence[int] = (64, 64),
-    ) -> None:
+    def __init__(self, sizes: Sequence[int]) -> None:
         super().__init__()
-        self.sizes = (observation_size, *widths, num_actions)
-        self.standardize = Standardize(observation_size)
+        self.sizes = tuple(sizes)
+        self.standardize = Standardize(self.sizes[0])
         self.mlp = mlp(self.sizes, last_gain=0.01)
-        self.log_std = nn.Parameter(torch.zeros(num_actions))
+        self.log_std = nn.Parameter(torch.zeros(self.sizes[-1]))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the action before squashing."""
@@ -88,7 +81,7 @@ class GaussianPolicy(nn.Module):
         return mean, self.log_std.exp().expand_as(mean)
 
 
-def make_actor(policy: GaussianPolicy) -> ProbabilisticActor:
+def make_actor(policy: Policy) -> ProbabilisticActor:
     """The policy as TorchRL knows it: ``observation`` -> ``action`` in [-1, 1]."""
     return ProbabilisticActor(
         TensorDictModule(policy, [OBSERVATION], ["loc", "scale"]),
@@ -100,7 +93,7 @@ def make_actor(policy: GaussianPolicy) -> ProbabilisticActor:
 
 
 def save_policy(
-    policy: GaussianPolicy, folder: Path, card: dict[str, Any] | None = None
+    policy: Policy, folder: Path, card: dict[str, Any] | None = None
 ) -> Path:
     """Write weights, then card, each whole or not at all; nothing is pickled.
 
@@ -112,11 +105,13 @@ def save_policy(
     folder = writable_folder(folder)
     tensors = {k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}
     write_atomically(folder / WEIGHTS, lambda aside: save_file(tensors, aside))
-    write_json(folder / CARD, {"format": 1, "sizes": list(policy.sizes), **(card or {})})
+    write_json(
+        folder / CARD, {"format": 1, "sizes": list(policy.sizes), **(card or {})}
+    )
     return folder
 
 
-def load_policy(folder: Path, task: Task | None = None) -> GaussianPolicy:
+def load_policy(folder: Path, task: Task | None = None) -> Policy:
     """A policy from a folder that `save_policy` wrote.
 
     Args:
@@ -128,10 +123,10 @@ def load_policy(folder: Path, task: Task | None = None) -> GaussianPolicy:
     """
     if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
         raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no policy")
-    sizes = read_json(folder / CARD).get("sizes")
-    is_list = isinstance(sizes, list) and len(sizes) >= 2
-    if not is_list or not all(type(size) is int and size > 0 for size in sizes):
-        raise ValueError(f"expected the layer sizes in {folder / CARD}, got {sizes!r}")
+    found = read_json(folder / CARD).get("sizes")
+    sizes = found if isinstance(found, list) else []
+    if len(sizes) < 2 or not all(type(size) is int and size > 0 for size in sizes):
+        raise ValueError(f"expected the layer sizes in {folder / CARD}, got {found!r}")
     if task is not None:
         expected = (task.observation_size, task.scene.controller.num_actions)
         if (sizes[0], sizes[-1]) != expected:
@@ -139,11 +134,13 @@ def load_policy(folder: Path, task: Task | None = None) -> GaussianPolicy:
                 f"the policy in {folder} has {sizes[0]} observations and {sizes[-1]} "
                 f"actions, the task has {expected[0]} and {expected[1]}"
             )
-    policy = GaussianPolicy(sizes[0], sizes[-1], sizes[1:-1])
+    policy = Policy(sizes)
     try:
         policy.load_state_dict(load_file(folder / WEIGHTS))
     except SafetensorError as error:
-        raise ValueError(f"{folder / WEIGHTS} is no safetensors file: {error}") from None
+        raise ValueError(
+            f"{folder / WEIGHTS} is no safetensors file: {error}"
+        ) from None
     except RuntimeError:
         raise ValueError(f"weights in {folder} do not fit layers of {sizes}") from None
     return policy.eval()

@@ -14,6 +14,7 @@ SMALL_ANGLE = 1e-3
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product a b, ``(*batch, 4)``: the rotation b followed by a."""
+    a, b = torch.broadcast_tensors(a, b)
     aw, av = a[..., :1], a[..., 1:]
     bw, bv = b[..., :1], b[..., 1:]
     real = aw * bw - (av * bv).sum(-1, keepdim=True)
@@ -86,7 +87,9 @@ def quat_log(q: Tensor) -> Tensor:
 
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle in [-pi, pi), rad."""
-    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+    wrapped = torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+    # an angle just below the border may have been rounded up to it
+    return torch.where(wrapped >= torch.pi, -torch.pi, wrapped)
 
 
 def orientation_error(a: Tensor, b: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """A Neural Robot Dynamics model: features of a scene, a network, statistics."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import torch
@@ -89,6 +89,16 @@ class NeRD(nn.Module):
         """Next ``qpos`` and ``qvel`` from the network's normalised output."""
         delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
         return self.state_delta.integrate(qpos, qvel, delta)
+
+    def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
+        """Move everything, but cast the network alone: constants stay float64."""
+        for part in (self.tokens, self.state_delta, self.normalize):
+            for module in part.modules():
+                for name, buffer in module._buffers.items():
+                    if buffer is not None:
+                        module._buffers[name] = buffer.to(fn(buffer).device)
+        self.network._apply(fn, recurse)
+        return self
 
     @property
     def dtype(self) -> torch.dtype:

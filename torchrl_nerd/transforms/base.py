@@ -14,7 +14,8 @@ from torchrl.envs import Transform
 class FeatureTransform(Transform):
     """Features of the state alone, written beside it wherever a state appears.
 
-    A subclass sets ``sizes`` (out key -> width) and defines ``_features``. At an env's
+    A subclass gives ``sizes`` (key -> width), the ``out_keys`` among them that an env's
+    observation holds (all, unless told) and defines ``_features``. At an env's
     reset and step, in a replay buffer and alone the same features come out.
     """
 
@@ -22,9 +23,13 @@ class FeatureTransform(Transform):
     why_no_inverse: str
 
     def __init__(
-        self, in_keys: Sequence[NestedKey], sizes: dict[NestedKey, int]
+        self,
+        in_keys: Sequence[NestedKey],
+        sizes: dict[NestedKey, int],
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(in_keys=list(in_keys), out_keys=list(sizes))
+        keys = list(sizes) if out_keys is None else list(out_keys)
+        super().__init__(in_keys=list(in_keys), out_keys=keys)
         self.sizes = sizes
 
     def _features(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
@@ -63,14 +68,10 @@ class FeatureTransform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the features."""
         spec = cast(Composite, observation_spec.clone())
-        for key, size in self._observed_sizes().items():
+        for key in self.out_keys:
             spec[key] = Unbounded(
-                torch.Size((*spec.shape, size)),
+                torch.Size((*spec.shape, self.sizes[key])),
                 dtype=torch.float32,
                 device=spec.device,
             )
         return spec
-
-    def _observed_sizes(self) -> dict[NestedKey, int]:
-        """Outputs that an env's observation holds."""
-        return self.sizes

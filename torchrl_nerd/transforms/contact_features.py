@@ -137,6 +137,7 @@ class ContactFeatures(FeatureTransform):
         The distance is the parabola through its value and slope now and its value after
         a whole step at constant ``qvel``.
         """
+        assert self.terrain is not None  # or there are no features
         step = self.step_size
         later = integrate_pos(self.layout, qpos, step * qvel)
         points, _ = self.kinematics(later, qvel)

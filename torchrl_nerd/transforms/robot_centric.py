@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.geometry.frames import rotate_inverse
@@ -48,8 +49,10 @@ class RobotCentric(FeatureTransform):
     def __init__(self, scene: Scene) -> None:
         joints = _JointFeatures.from_scene(scene)
         state_size = joints.size + 9 * scene.base.is_floating
-        sizes = {ROBOT_STATE: state_size, ROBOT_TORQUE: len(scene.actuated)}
-        super().__init__([QPOS, QVEL], {k: n for k, n in sizes.items() if n})
+        sizes: dict[NestedKey, int] = {ROBOT_STATE: state_size}
+        if scene.actuated:
+            sizes[ROBOT_TORQUE] = len(scene.actuated)
+        super().__init__([QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
         self.base = scene.base
         self.joints = joints
         self.down = -1.0 if scene.model.opt.gravity[2] <= 0.0 else 1.0
@@ -73,9 +76,6 @@ class RobotCentric(FeatureTransform):
         if torque is not None and ROBOT_TORQUE in self.sizes:
             features[ROBOT_TORQUE] = torque
         return features
-
-    def _observed_sizes(self) -> dict:
-        return {ROBOT_STATE: self.sizes[ROBOT_STATE]}
 
 
 @dataclass(frozen=True)
