@@ -50,7 +50,7 @@ class PPOConfig:
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # where: nerd, mujoco, dm_control, a checkpoint folder
     seed: int = 0  # of weights, exploration and starts
-    total_frames: int = 6_000_000  # control steps to learn from
+    total_frames: int = 3_000_000  # control steps to learn from
     num_envs: int = 1024  # rows stepped together
     horizon: int = 32  # steps of every row between two updates
     epochs: int = 4  # passes over those steps

@@ -3,7 +3,7 @@
 Importable by the workers of a ParallelEnv: nothing here is local to a test.
 """
 
-from functools import cache, partial
+from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -36,10 +36,11 @@ def plain_env(scene: str, seed: int = 0) -> GroundTruthEnv:
     return GroundTruthEnv(TASK_OF[scene], engine="mujoco", num_envs=ENVS, seed=seed)
 
 
-@cache
 def observation_stats(scene: str) -> Stats:
-    rollout = plain_env(scene).rollout(50, break_when_any_done=False)
-    return Stats.of(rollout[OBSERVATION])
+    """Some statistics, the same ones in every process."""
+    size = make_task(TASK_OF[scene]).observation_size
+    count = torch.arange(1.0, size + 1.0, dtype=torch.float64)
+    return Stats(10, 0.1 * count, 10.0 * count)
 
 
 def make_transform(name: str, scene: str) -> Transform:

@@ -1,0 +1,150 @@
+import csv
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from torchrl_nerd import make_env
+from torchrl_nerd.evaluation.plots import plot_learning_curve, plot_states
+from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
+from torchrl_nerd.evaluation.policy_transfer import (
+    hardest_episode,
+    policy_returns,
+    summarize,
+    transfer,
+    transfer_table,
+)
+from torchrl_nerd.tasks import make_task
+
+TASK = "cartpole/swingup"
+
+
+def brake_and_hold() -> TensorDictModule:
+    """Linear feedback: some rows survive, some run off the rail."""
+    linear = nn.Linear(4, 1, bias=False)
+    linear.weight.data = torch.tensor([[0.1, 1.0, 0.2, 0.3]])
+    return TensorDictModule(linear, ["observation"], ["action"])
+
+
+@pytest.fixture
+def policy() -> Policy:
+    torch.manual_seed(0)
+    policy = Policy((4, 16, 16, 1))
+    policy.standardize.fit(torch.randn(50, 4) * 3.0 + 1.0)
+    return policy
+
+
+def test_returns_equal_a_loop_over_rows_that_stops_at_each_end() -> None:
+    actor = brake_and_hold()
+    returns = policy_returns(make_env(TASK, "mujoco", num_envs=16, seed=3), actor)
+    env = make_env(TASK, "mujoco", num_envs=16, seed=3)
+    with torch.no_grad():
+        steps = env.rollout(300, actor, break_when_any_done=False)["next"]
+    lengths = []
+    for row in range(16):
+        total = 0.0
+        for step in range(300):
+            total += steps["reward"][row, step].item()
+            if steps["done"][row, step]:
+                break
+        lengths.append(step + 1)
+        assert returns[row].item() == pytest.approx(total, rel=1e-12)
+    assert min(lengths) < 300 and max(lengths) == 300
+
+
+def test_returns_do_not_depend_on_other_rows() -> None:
+    actor = brake_and_hold()
+    few, many = (
+        policy_returns(make_env(TASK, "mujoco", num_envs=rows, seed=1), actor)
+        for rows in (4, 9)
+    )
+    assert torch.equal(few, many[:4])
+
+
+def test_returns_take_the_mean_action(policy: Policy) -> None:
+    returns = [
+        policy_returns(make_env(TASK, "mujoco", num_envs=4, seed=1), make_actor(policy))
+        for _ in range(2)
+    ]
+    assert torch.equal(*returns)
+
+
+def test_summary_of_known_returns() -> None:
+    truth = torch.tensor([100.0, 300.0], dtype=torch.float64)
+    summary = summarize(torch.tensor([110.0, 330.0, 0.0], dtype=torch.float64), truth)
+    assert summary.episodes == 3
+    assert summary.mean == pytest.approx(440.0 / 3.0)
+    assert summary.gap == pytest.approx(0.1)
+    spread = torch.tensor([10.0, 30.0]).std().item()
+    assert summary.gap_interval == pytest.approx(1.96 * spread / 2**0.5 / 200.0)
+
+
+@pytest.mark.parametrize("truth", [torch.zeros(5), torch.ones(1)])
+def test_summary_says_what_it_cannot_measure(truth: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        summarize(torch.ones(len(truth)), truth)
+
+
+def test_true_engines_agree_and_truth_is_added(policy: Policy) -> None:
+    summaries = transfer(TASK, make_actor(policy), ["dm_control"], 6, slow_episodes=3)
+    assert {name: s.episodes for name, s in summaries.items()} == {
+        "dm_control": 3,
+        "mujoco": 6,
+    }
+    assert abs(summaries["dm_control"].gap) < 1e-6
+    assert summaries["mujoco"].gap == 0.0
+    assert len(transfer_table(summaries).splitlines()) == 3
+
+
+def test_hardest_episode_begins_in_one_state(policy: Policy) -> None:
+    episodes = hardest_episode(TASK, make_actor(policy), ["mujoco", "dm_control"])
+    true, slow = episodes["mujoco"], episodes["dm_control"]
+    torch.testing.assert_close(true["qpos"][:5], slow["qpos"][:5])
+    env = make_env(TASK, "mujoco", num_envs=64)
+    angle = env.reset()["observation"][:, 1].abs()
+    assert abs(true["qpos"][0, 1]) > 0.9 * angle.max()
+
+
+def test_policy_survives_disk(policy: Policy, tmp_path) -> None:
+    save_policy(policy, tmp_path / "policy", {"task": TASK})
+    loaded = load_policy(tmp_path / "policy", make_task(TASK))
+    observation = torch.randn(7, 4)
+    for one, other in zip(policy(observation), loaded(observation), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_actions_stay_in_the_spec(policy: Policy) -> None:
+    env = make_env(TASK, "mujoco", num_envs=8)
+    env.rollout(3, make_actor(policy))
+    rows = TensorDict({"observation": 1e6 * torch.randn(8, 4)}, batch_size=[8])
+    assert env.action_spec.is_in(make_actor(policy)(rows)["action"])
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated", "sizes", "card", "task"])
+def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> None:
+    save_policy(policy, tmp_path)
+    weights, card = tmp_path / "policy.safetensors", tmp_path / "policy.json"
+    if damage == "missing":
+        weights.unlink()
+    elif damage == "truncated":
+        weights.write_bytes(weights.read_bytes()[:100])
+    elif damage == "sizes":
+        card.write_text('{"sizes": [4, 8, 1]}')
+    elif damage == "card":
+        card.write_text('{"sizes": "many"}')
+    task = make_task("double_pendulum/passive") if damage == "task" else None
+    with pytest.raises(ValueError, match=str(tmp_path)):
+        load_policy(tmp_path, task)
+
+
+def test_figures_are_written_whole(policy: Policy, tmp_path) -> None:
+    curve = [{"frames": 10, "nerd": 1.0}, {"frames": 20, "nerd": 2.0}]
+    plot_learning_curve(curve, tmp_path / "curve.png")
+    with open(tmp_path / "curve.csv") as file:
+        assert [float(row["nerd"]) for row in csv.DictReader(file)] == [1.0, 2.0]
+    episodes = hardest_episode(TASK, make_actor(policy), ["mujoco"])
+    plot_states(episodes, make_task(TASK).scene, tmp_path / "states.png")
+    for name in ("curve.png", "states.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
