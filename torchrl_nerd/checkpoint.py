@@ -24,6 +24,7 @@ from torchrl_nerd.scenes import SCENES, Scene, load_scene
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
+LARGEST_SIZE = 2**14  # of any number in a network's configuration
 LFS_POINTER = b"version https://git-lfs"
 KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
@@ -131,15 +132,21 @@ def shipped_models() -> list[str]:
 
 def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
     name = card.get("scene")
-    if name not in SCENES:
+    if not isinstance(name, str) or name not in SCENES:
         raise ValueError(f"the card in {folder} names an unknown scene: {name!r}")
     return load_scene(str(name))
 
 
 def _network_config(card: dict[str, Any], folder: Path) -> NetworkConfig:
-    network = dict(card.get("network") or {})
+    found = card.get("network")
+    network = dict(found) if isinstance(found, dict) else {}
     kind = network.pop("kind", None)
+    sizes = network.values()
     try:
+        if not all(type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes):
+            raise TypeError
+        if network.get("width", 0) % network.get("heads", 1):
+            raise TypeError
         return KINDS[str(kind)](**network)
     except (KeyError, TypeError):
         raise ValueError(
@@ -160,7 +167,7 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
         "scene_hash": scene.hash,
         "mujoco": mujoco.__version__.rsplit(".", 1)[0],
     }
-    version = str((card.get("versions") or {}).get("mujoco"))
+    version = str(_versions(card).get("mujoco"))
     stored = {**card, "mujoco": version.rsplit(".", 1)[0]}
     differing = [
         f"{key} is {stored.get(key)} there and {value} here"
@@ -173,6 +180,11 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
             + ", ".join(differing),
             stacklevel=3,
         )
+
+
+def _versions(card: dict[str, Any]) -> dict[str, Any]:
+    found = card.get("versions")
+    return found if isinstance(found, dict) else {}
 
 
 def _read_tensors(path: Path) -> dict[str, torch.Tensor]:

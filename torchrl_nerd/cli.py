@@ -221,8 +221,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures = command.run()
         if command.json is not None:
             write_json(command.json, figures)
-    except (ValueError, OSError) as error:
-        return _fail(str(error))
+    except (ValueError, OSError, RuntimeError) as error:
+        return _fail(str(error).splitlines()[0])
     return 0
 
 

@@ -117,9 +117,9 @@ def test_policy_survives_disk(policy: Policy, tmp_path) -> None:
 
 def test_actions_stay_in_the_spec(policy: Policy) -> None:
     env = make_env(TASK, "mujoco", num_envs=8)
-    env.rollout(3, make_actor(policy))
     rows = TensorDict({"observation": 1e6 * torch.randn(8, 4)}, batch_size=[8])
-    assert env.action_spec.is_in(make_actor(policy)(rows)["action"])
+    with torch.no_grad():
+        assert env.action_spec.is_in(make_actor(policy)(rows)["action"])
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "sizes", "card", "task"])

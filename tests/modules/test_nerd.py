@@ -52,7 +52,7 @@ def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator)
         td["terrain"] = terrain
     robot, contact = RobotCentric(scene), ContactFeatures(scene)
     contact(robot(td))
-    keys = [*robot.out_keys, *contact.out_keys]
+    keys = [*robot.sizes, *contact.sizes]
     raw = torch.cat([td[key].double() for key in keys], -1)
     stats = scene_stats(scene)["token"]
     expected = (raw - stats.mean) / stats.std

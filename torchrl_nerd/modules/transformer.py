@@ -7,7 +7,7 @@ changes as time moves on, so its keys and values are kept in a ring. Depth widen
 view: ``layers * (band - 1) + 1`` tokens reach the output, in training as in streaming.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import cast
 
 import torch
@@ -161,6 +161,9 @@ class CausalTransformer(nn.Module):
         self, config: TransformerConfig, num_inputs: int, num_outputs: int
     ) -> None:
         super().__init__()
+        for name, size in asdict(config).items():
+            if size < (2 if name == "band" else 1):
+                raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
             raise ValueError(
                 f"expected heads to divide width {config.width}, got {config.heads}"

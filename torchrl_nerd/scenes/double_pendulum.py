@@ -17,7 +17,7 @@ SUBSTEPS = 5  # of 1/300 s: control step 1/60 s
 CONTACT = {"ke": 1e4, "kd": 1e3, "kf": 1e4, "mu": 0.5}  # N/m, N s/m, N s/m, -
 LINK_LENGTH = 1.5  # m
 RADIUS = 0.1  # m
-ROOT = (0.0, 0.0, 2.0)  # m, world
+ROOT = (0.0, -1.0, 2.0)  # m, world; (0, 2, 1) in the reference's axes
 
 # Evaluation grounds: offset (m) along the up axis of the plane's point, and extrinsic
 # xyz Euler angles (rad) of the normal, in the reference's axes (y up).

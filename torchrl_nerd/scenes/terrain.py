@@ -74,8 +74,12 @@ class Terrain:
         normal, offset = terrain[..., :3], terrain[..., 3:]
         x, y, z = normal.unbind(-1)
         # half way between z and the normal; a normal of -z is half a turn about x
-        half = torch.stack((1.0 + z, -y, x, torch.zeros_like(x)), -1)
+        flat = x * x + y * y
+        rise = torch.where(
+            z < 0.0, flat / (1.0 - z), 1.0 + z
+        )  # 1 + z, to the last digit
+        half = torch.stack((rise, -y, x, torch.zeros_like(x)), -1)
         down = torch.tensor([0.0, 1.0, 0.0, 0.0]).to(half)
-        half = torch.where(1.0 + z[..., None] < 1e-12, down, half)
+        half = torch.where((flat == 0.0)[..., None] & (z < 0.0)[..., None], down, half)
         half = half / torch.linalg.vector_norm(half, dim=-1, keepdim=True)
         return torch.cat((normal * offset, half), -1)

@@ -26,6 +26,10 @@ from torchrl_nerd.training.sequences import Sequences, data_stats
 
 VALIDATION_SEED = 1_000_003
 VALIDATION_ROWS = 256
+COUNTS = (
+    *("rows", "length", "rollout_rows", "rollout_length"),
+    *("save_every", "validate_every"),
+)
 
 
 @dataclass(frozen=True)
@@ -75,8 +79,11 @@ class TrainConfig:
             )
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if field.name != "network" and value < 0:
-                raise ValueError(f"expected {field.name} of at least 0, got {value}")
+            least = 1 if field.name in COUNTS else 0
+            if field.name != "network" and value < least:
+                raise ValueError(
+                    f"expected {field.name} of at least {least}, got {value}"
+                )
 
     @property
     def total_steps(self) -> int:

@@ -4,7 +4,7 @@ NeRD section 3.4. Statistics are float64 and exact (Chan, Golub and LeVeque, "Al
 for computing the sample variance", 1983), so that huge offsets cost no digits.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -59,10 +59,12 @@ class Normalize(Transform):
 
     Statistics are frozen buffers: they follow ``.to`` and ``state_dict``, are copied by
     ``deepcopy``, and never change while running. Keys that a tensordict lacks are left
-    alone. The inverse acts outside an env only, on the keys that are present.
+    alone. The inverse acts on ``in_keys_inv`` alone, none by default: a replay buffer
+    calls it on whatever is stored. `denormalize` is the inverse of one quantity.
 
     Args:
         stats: key -> `Stats`.
+        in_keys_inv: keys that ``inv`` takes back, outside an env.
 
     Examples:
         >>> x = torch.randn(100, 3).double() * 5.0 + 1000.0
@@ -72,10 +74,15 @@ class Normalize(Transform):
         True
     """
 
-    def __init__(self, stats: Mapping[NestedKey, Stats]) -> None:
+    def __init__(
+        self, stats: Mapping[NestedKey, Stats], in_keys_inv: Sequence[NestedKey] = ()
+    ) -> None:
         keys = list(stats)
         super().__init__(
-            in_keys=keys, out_keys=keys, in_keys_inv=keys, out_keys_inv=keys
+            in_keys=keys,
+            out_keys=keys,
+            in_keys_inv=list(in_keys_inv),
+            out_keys_inv=list(in_keys_inv),
         )
         self.names = {key: "_".join(("key", *_parts(key))) for key in keys}
         for key, name in self.names.items():
@@ -119,7 +126,7 @@ class Normalize(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is not None:
             return tensordict
-        for key in self.in_keys:
+        for key in self.in_keys_inv:
             x = tensordict.get(key, None)
             if x is not None:
                 tensordict.set(key, self.denormalize(key, x))

@@ -123,7 +123,9 @@ class StateDelta(Transform):
         return tensordict_reset.set(STATE_DELTA, zero)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.parent is None and STATE_DELTA in tensordict.keys():
+        keys = tensordict.keys(True)
+        is_known = NEXT_QPOS in keys and NEXT_QVEL in keys  # as in a buffer's extend
+        if self.parent is None and STATE_DELTA in keys and not is_known:
             missing = [key for key in (QPOS, QVEL) if key not in tensordict.keys()]
             if missing:
                 raise KeyError(
