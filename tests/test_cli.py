@@ -88,7 +88,7 @@ def test_an_unknown_scene_is_refused(command, capsys):
         ("data cartpole --trajectories -5", "trajectories of at least 1, got -5"),
         ("data cartpole --steps 0", "steps of at least 1, got 0"),
         ("train cartpole --steps -1", "steps of at least 0, got -1"),
-        ("train cartpole --rows -8", "rows of at least 0, got -8"),
+        ("train cartpole --rows -8", "rows of at least 1, got -8"),
         ("train cartpole --network huge", "unknown network 'huge'"),
         ("train cartpole --save-every 0", "save_every of at least 1"),
         ("train cartpole --threads -1", "threads"),

@@ -91,7 +91,12 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
     with torch.random.fork_rng(
         devices=[]
     ):  # its first weights are drawn, then replaced
-        model = NeRD(scene, _network_config(card, folder))
+        try:
+            model = NeRD(scene, _network_config(card, folder))
+        except ValueError as error:
+            raise ValueError(
+                f"the network in {folder} cannot be built: {error}"
+            ) from None
     tensors = _read_tensors(folder / WEIGHTS)
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in tensors.items()}
@@ -144,8 +149,6 @@ def _network_config(card: dict[str, Any], folder: Path) -> NetworkConfig:
     sizes = network.values()
     try:
         if not all(type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes):
-            raise TypeError
-        if network.get("width", 0) % network.get("heads", 1):
             raise TypeError
         return KINDS[str(kind)](**network)
     except (KeyError, TypeError):

@@ -18,7 +18,7 @@ from torchrl_nerd.scenes import SCENES, load_scene
 CHUNK, CHUNKS = 4, 5
 SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
 CONFIG = DataConfig(trajectories=CHUNK * CHUNKS - 1, steps=3, seed=5)
-MOMENTS = {"simulate": 2, "is_sound": 1, "write_json": 1}
+MOMENTS = {"simulate": 2, "is_sound": 1, "write_json": 2}
 """Functions of the module -> the call that belongs to the first chunk."""
 
 KILLED = """

@@ -18,9 +18,9 @@ ROWS = 60
 
 
 def random_tangents(model, rows, rng):
-    """Every joint moves between 1e-12 and 1, three parts of a turn stay under pi."""
-    size = 10.0 ** rng.uniform(-12, 0, size=(rows, model.nv))
-    return torch.from_numpy(rng.choice([-1, 1], size=size.shape) * size * pi / 2)
+    """Log-uniform from 1e-12 to pi / 2 in every direction: no turn reaches pi."""
+    size = 0.5 * pi * 10.0 ** rng.uniform(-12, 0, size=(rows, model.nv))
+    return torch.from_numpy(rng.choice([-1, 1], size=size.shape) * size)
 
 
 def mujoco_integrates(model, qpos, tangent):

@@ -67,7 +67,7 @@ def test_pendulum_keeps_elbow_and_tip():
     points, model = scene.contacts, scene.model
     places = world_points(model, np.zeros((1, 2)), points.bodies, points.positions)[0]
     order = np.argsort(places[:, 0])
-    np.testing.assert_allclose(places[order], [[1.5, 0, 2], [3.0, 0, 2]], atol=1e-12)
+    np.testing.assert_allclose(places[order], [[1.5, -1, 2], [3.0, -1, 2]], atol=1e-12)
     np.testing.assert_allclose(points.radii, 0.1)
     assert points.count_found == 4
 

@@ -38,7 +38,7 @@ FACTS = {
         "masses": {"link1": 25.6563, "link2": 25.6563},
         "centres": {"link1": (0.75, 0.0, 0.0), "link2": (0.75, 0.0, 0.0)},
         "inertias": dict.fromkeys(("link1", "link2"), (0.226187, 5.88105, 5.88105)),
-        "origins": {"link1": (0.0, 0.0, 2.0), "link2": (1.5, 0.0, 0.0)},
+        "origins": {"link1": (0.0, -1.0, 2.0), "link2": (1.5, 0.0, 0.0)},
         "limits": {"joint1": None, "joint2": None},
         "armature": 0.01,
         "gain": (1500.0, 1500.0),

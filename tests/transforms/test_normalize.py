@@ -145,3 +145,13 @@ def test_nested_keys_and_absent_ones(generator):
         out["next", "y"], (y - y.mean(0)) / y.std(0, correction=0)
     )
     assert "x" not in transform(as_rows(z=y.clone())).keys()
+
+
+def test_inv_acts_on_the_keys_it_was_told_and_no_others(generator):
+    x, y = samples(generator), samples(generator, offset=9.0)
+    stats = {"x": Stats.of(x), "y": Stats.of(y)}
+    normal = Normalize(stats)(as_rows(x=x.clone(), y=y.clone()))
+    assert (Normalize(stats).inv(normal.clone()) == normal).all()
+    back = Normalize(stats, in_keys_inv=["y"]).inv(normal.clone())
+    torch.testing.assert_close(back["y"], y)
+    assert torch.equal(back["x"], normal["x"])

@@ -6,6 +6,7 @@ ground varies, ``terrain``; under ``next`` the same state keys and ``joint_torqu
 JSON card beside it.
 """
 
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
@@ -149,11 +150,13 @@ def _open_card(scene: Scene, config: DataConfig, folder: Path) -> dict:
         "dropped": 0,
         "chunks_done": 0,
     }
+    fresh = json.loads(json.dumps(fresh))
     path = folder / CARD
     if not path.exists():
+        write_json(path, fresh)  # before any data: they never outlive their card
         return fresh
     card = read_json(path)
-    for key in ("scene_hash", "config"):
+    for key in ("scene_hash", "config", "ranges"):
         if card.get(key) != fresh[key]:
             raise ValueError(
                 f"{folder} already holds data with {key} {card.get(key)}, asked for "

@@ -4,6 +4,8 @@ import csv
 from importlib.util import find_spec
 from pathlib import Path
 
+from torchrl_nerd.files import write_atomically
+
 
 class TrainingLog:
     """Appends one row of figures per validation to ``log.csv``.
@@ -28,13 +30,16 @@ class TrainingLog:
         with open(self.path, newline="") as file:
             return list(csv.DictReader(file))
 
-    def write(self, figures: dict[str, float]) -> None:
-        """Add a row; the file is whole after every call."""
-        self.rows.append({key: repr(value) for key, value in figures.items()})
-        with open(self.path, "w", newline="") as file:
+    def _write_rows(self, path: Path) -> None:
+        with open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
             writer.writeheader()
             writer.writerows(self.rows)
+
+    def write(self, figures: dict[str, float]) -> None:
+        """Add a row; the file is whole after every call."""
+        self.rows.append({key: repr(value) for key, value in figures.items()})
+        write_atomically(self.path, self._write_rows)
         if self.board is not None:
             for key, value in figures.items():
                 self.board.add_scalar(key, value, int(figures["step"]))

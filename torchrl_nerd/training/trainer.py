@@ -272,10 +272,11 @@ class Trainer:
                 tensors |= {f"{name}.{index}.{k}": v for k, v in state.items()}
         tensors = {k: v.detach().cpu().clone() for k, v in tensors.items()}
         tensors["step"] = torch.tensor(self.step)
+        tensors["best"] = torch.tensor(self.best, dtype=torch.float64)
         path = self.folder / "state.safetensors"
         write_atomically(path, lambda aside: save_file(tensors, aside))
         card = {"config": asdict(self.config), "scene_hash": self.scene.hash}
-        card |= {"seconds": self.seconds, "best": min(self.best, 1e300)}
+        card |= {"seconds": self.seconds}
         write_json(self.folder / "state.json", card)
 
     def _save_model(
@@ -310,7 +311,7 @@ class Trainer:
                 )
         tensors = load_file(self.folder / "state.safetensors")
         self.step = int(tensors["step"])
-        self.seconds, self.best = card["seconds"], card["best"]
+        self.seconds, self.best = card["seconds"], float(tensors["best"])
         pick = _with_prefix(tensors, "model.")
         self.model.network.load_state_dict(pick)
         for name, value in _with_prefix(tensors, "average.").items():

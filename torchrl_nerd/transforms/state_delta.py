@@ -125,12 +125,14 @@ class StateDelta(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         keys = tensordict.keys(True)
         is_known = NEXT_QPOS in keys and NEXT_QVEL in keys  # as in a buffer's extend
-        if self.parent is None and STATE_DELTA in keys and not is_known:
+        if self.parent is None and STATE_DELTA in keys:
             missing = [key for key in (QPOS, QVEL) if key not in tensordict.keys()]
             if missing:
                 raise KeyError(
                     f"the inverse of StateDelta needs {missing}: a start state"
                 )
+            if is_known:
+                return tensordict
             state = (tensordict[QPOS], tensordict[QVEL], tensordict[STATE_DELTA])
             next_qpos, next_qvel = self.integrate(*state)
             tensordict.set(NEXT_QPOS, next_qpos)
