@@ -25,7 +25,7 @@ def random_points(model, base, rng):
     return rng.choice(carried, POINTS).tolist(), rng.normal(size=(POINTS, 3))
 
 
-def seen_by_the_base(model, base, data, body, point):
+def seen_by_the_base(model, base, mount, data, body, point):
     """Position and velocity of one point by MuJoCo, to a rider on the base, in B_t."""
     world = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point
     jacobian, velocity, turning = np.empty((3, model.nv)), np.zeros(3), np.zeros(3)
@@ -37,7 +37,7 @@ def seen_by_the_base(model, base, data, body, point):
         velocity = data.qvel[v : v + 3]
         turning = rotation @ data.qvel[v + 3 : v + 6]
     else:
-        position, rotation = mount_pose(model, base)
+        position, rotation = mount
     arm = world - position
     relative = jacobian @ data.qvel - velocity - np.cross(turning, arm)
     return rotation.T @ arm, rotation.T @ relative
@@ -45,6 +45,7 @@ def seen_by_the_base(model, base, data, body, point):
 
 def check_against_mujoco(model, rng):
     base, data = Base.from_model(model), mujoco.MjData(model)
+    mount = mount_pose(model, base)
     bodies, places = random_points(model, base, rng)
     qpos, qvel = random_states(model, ROWS, rng)
     positions, velocities = PointKinematics(model, base, bodies, places)(qpos, qvel)
@@ -54,7 +55,7 @@ def check_against_mujoco(model, rng):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         for point, (body, place) in enumerate(zip(bodies, places, strict=True)):
-            where, speed = seen_by_the_base(model, base, data, body, place)
+            where, speed = seen_by_the_base(model, base, mount, data, body, place)
             np.testing.assert_allclose(positions[row, point], where, 0, 1e-11)
             np.testing.assert_allclose(velocities[row, point], speed, 0, 1e-10)
 
