@@ -1,7 +1,9 @@
 """The ``nerd`` command: data, train, eval, transfer."""
 
+import io
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.settings import SettingError
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.recipes import RECIPES
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
@@ -212,18 +215,36 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"unknown command '{argv[0]}', expected {', '.join(COMMANDS)}")
     kind = COMMANDS[argv[0]]
     try:
-        command = tyro.cli(
-            kind,
-            args=argv[1:],
-            prog=f"nerd {argv[0]}",
-            default=_default(kind, argv[1:]),
-        )
+        command = _parse(kind, argv)
         figures = command.run()
         if command.json is not None:
             write_json(command.json, figures)
     except (ValueError, OSError, RuntimeError) as error:
         return _fail(str(error).splitlines()[0])
     return 0
+
+
+def _parse(kind: type, argv: list[str]) -> Any:
+    """The command with its settings; tyro's boxes point at what cannot be read.
+
+    Raises:
+        SettingError: a setting out of range, in its own words and without a box.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            default = _default(kind, argv[1:])
+            return tyro.cli(
+                kind, args=argv[1:], prog=f"nerd {argv[0]}", default=default
+            )
+    except SystemExit as stop:
+        cause = stop.__context__
+        while cause is not None:
+            if isinstance(cause, SettingError):
+                raise cause from None
+            cause = cause.__cause__ or cause.__context__
+        sys.stderr.write(said.getvalue())
+        raise
 
 
 def _default(kind: type, args: list[str]) -> Any:

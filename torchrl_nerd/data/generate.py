@@ -23,6 +23,7 @@ from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
+from torchrl_nerd.settings import expect_at_least
 
 CHUNK = 2048  # trajectories stepped together; also what a kill can lose
 LARGEST = 1e5  # reference code: a trajectory beyond this is broken
@@ -45,9 +46,7 @@ class DataConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value in (("trajectories", self.trajectories), ("steps", self.steps)):
-            if value < 1:
-                raise ValueError(f"expected {name} of at least 1, got {value}")
+        expect_at_least(1, trajectories=self.trajectories, steps=self.steps)
 
 
 def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> TensorDict:

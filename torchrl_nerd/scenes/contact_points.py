@@ -85,7 +85,7 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def _touches(model: mujoco.MjModel, geom: int) -> bool:
-    is_moving = model.body_dofnum[model.body_weldid[model.geom_bodyid[geom]]] > 0
+    is_moving = bool(model.body_dofnum[model.body_weldid[model.geom_bodyid[geom]]])
     return is_moving and any(
         model.geom_contype[geom] & model.geom_conaffinity[other]
         or model.geom_contype[other] & model.geom_conaffinity[geom]

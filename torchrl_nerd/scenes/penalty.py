@@ -13,7 +13,7 @@ Source: https://mujoco.readthedocs.io/en/stable/computation/#constraint-model
 import mujoco
 import numpy as np
 
-IMPEDANCE = 0.01
+IMPEDANCE = 0.001
 SOLIMP = np.array([IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0])
 
 

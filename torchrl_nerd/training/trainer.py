@@ -1,6 +1,5 @@
 """Training of a NeRD: sequences gathered on the device, resumable to the bit."""
 
-import dataclasses
 import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import SettingError, expect_at_least
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
@@ -46,7 +46,7 @@ class TrainConfig:
     | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
     | ``rollout_lr`` | share of the peak at which the rollout updates begin |
     | ``warmup`` | updates over which the step size rises from zero |
-    | ``softening`` | of the relative loss; see `losses.relative_weights` |
+    | ``softening`` | of the relative loss; see `losses.relative_error` |
     | ``clip`` | largest norm of the gradient |
     | ``ema`` | decay of the averaged weights, which are the ones saved |
     | ``save_every`` | updates between saves: what a kill can lose |
@@ -74,16 +74,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
-            raise ValueError(
+            raise SettingError(
                 f"unknown network '{self.network}', expected one of {', '.join(NETWORKS)}"
             )
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            least = 1 if field.name in COUNTS else 0
-            if field.name != "network" and value < least:
-                raise ValueError(
-                    f"expected {field.name} of at least {least}, got {value}"
-                )
+        for name, value in asdict(self).items():
+            if name != "network":
+                expect_at_least(1 if name in COUNTS else 0, **{name: value})
 
     @property
     def total_steps(self) -> int:
