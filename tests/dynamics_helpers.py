@@ -68,6 +68,13 @@ def random_model(scene: Scene, generator: Generator, network: str = "tiny") -> N
     return model
 
 
+def double_model(scene: Scene, generator: Generator, network: str = "tiny") -> NeRD:
+    """The same in float64: random weights blow up float32 rounding."""
+    model = random_model(scene, generator, network)
+    model.network.double()
+    return model
+
+
 def random_drive(
     scene: Scene, rows: int, steps: int, generator: Generator
 ) -> tuple[TensorDict, Tensor, Tensor | None]:
@@ -95,7 +102,7 @@ class DynamicsMaker:
 
     def __init__(self, scene: Scene, kind: str, generator: Generator) -> None:
         self.scene, self.kind = scene, kind
-        self.model = random_model(scene, generator) if kind in LEARNED else None
+        self.model = double_model(scene, generator) if kind in LEARNED else None
 
     def __call__(self) -> Dynamics:
         if self.model is not None:
@@ -122,7 +129,7 @@ class EnvMaker:
         if horizon is not None:
             self.task.horizon = horizon
         is_learned, scene = dynamics in LEARNED, self.task.scene
-        self.model = random_model(scene, generator) if is_learned else None
+        self.model = double_model(scene, generator) if is_learned else None
 
     def __call__(self, num_envs: int = 3, seed: int = 0) -> SceneEnv:
         if self.model is None:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from dynamics_helpers import (
     LEARNED,
+    double_model,
     random_drive,
     random_model,
     roll,
@@ -20,12 +21,6 @@ from torchrl_nerd.scenes import SCENES, load_scene
 ROWS, STEPS = 4, 14
 each_inference = pytest.mark.parametrize("inference", LEARNED)
 SCENE = load_scene(next(iter(SCENES)))
-
-
-def double_model(scene, generator, network="tiny") -> NeRD:
-    model = random_model(scene, generator, network)
-    model.network.double()
-    return model
 
 
 def tokens_of(model: NeRD, state, torques, terrain) -> Tensor:

@@ -73,7 +73,8 @@ def test_streaming_equals_the_full_sequence(config, dtype, tolerance, generator)
     with torch.no_grad():
         streamed = stream(network, tokens, resets)
         expected = episodes(network, tokens, resets)
-    torch.testing.assert_close(streamed, expected, atol=tolerance, rtol=tolerance)
+    scale = float(expected.abs().max())  # random weights: not of order one
+    torch.testing.assert_close(streamed, expected, atol=tolerance * scale, rtol=0.0)
 
 
 @each_config

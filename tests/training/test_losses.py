@@ -13,7 +13,7 @@ from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.training.losses import (
     one_step_loss,
-    relative_weights,
+    relative_error,
     rollout_loss,
 )
 from torchrl_nerd.training.sequences import data_stats, raw_tokens
@@ -69,24 +69,23 @@ def model_of(scene: Scene, data, config) -> NeRD:
     return model.train()
 
 
-def test_weights_are_one_over_the_mean_square(rng):
+def test_errors_are_relative_lengths(rng):
     targets = rng.normal(size=(4, 5, 3)) * 10.0 ** rng.uniform(-3, 3, size=(4, 5, 1))
     softening = rng.uniform(0.01, 1.0)
-    expected = 1.0 / ((targets**2).mean(-1, keepdims=True) + softening)
-    weights = relative_weights(torch.from_numpy(targets), softening)
-    np.testing.assert_allclose(weights.numpy(), expected, rtol=1e-12)
-    outputs = rng.normal(size=targets.shape)
-    loss = one_step_loss(
-        torch.from_numpy(outputs), torch.from_numpy(targets), softening
-    )
-    expected = np.mean(expected * (outputs - targets) ** 2)
-    np.testing.assert_allclose(float(loss), expected, rtol=1e-12)
+    outputs = targets + rng.normal(size=targets.shape)
+    size = (targets**2).mean(-1)
+    expected = np.sqrt(((outputs - targets) ** 2).mean(-1) / (size + softening))
+    pair = torch.from_numpy(outputs), torch.from_numpy(targets)
+    errors = relative_error(pair[0] - pair[1], torch.from_numpy(size), softening)
+    np.testing.assert_allclose(errors.numpy(), expected, rtol=1e-5, atol=1e-4)
+    loss = one_step_loss(*pair, softening)
+    np.testing.assert_allclose(float(loss), expected.mean(), rtol=1e-5, atol=1e-4)
 
 
 def test_predicting_no_change_costs_less_than_one(generator):
     targets = torch.randn(9, 7, 4, generator=generator).double()
     assert 0.9 < one_step_loss(0.0 * targets, targets, 1e-3) < 1.0
-    assert one_step_loss(targets, targets, 1e-3) == 0.0
+    assert one_step_loss(targets, targets, 1e-3) < 2e-4
 
 
 @every_scene
@@ -97,9 +96,9 @@ def test_the_truth_has_no_loss(scene, generator):
     _, target = raw_tokens(model.tokens, model.state_delta, data)
     outputs = model.normalize.normalize(TARGET, target)
     model.network = Recorded(outputs)
-    assert rollout_loss(model, *batch_of(data), 0.1) < 1e-12
+    assert rollout_loss(model, *batch_of(data), 0.1) < 2e-4
     model.network = Recorded(outputs + 0.1)
-    assert rollout_loss(model, *batch_of(data), 0.1) > 1e-4
+    assert rollout_loss(model, *batch_of(data), 0.1) > 1e-2
 
 
 def test_one_step_of_the_cartpole_by_hand(generator):
@@ -120,8 +119,9 @@ def test_one_step_of_the_cartpole_by_hand(generator):
     slip = (position - qpos[:, 1]) / (scale * step)
     change = (qvel[:, 1] - qvel[:, 0]) / scale
     softening = 0.07
-    size = (change**2).mean(-1, keepdims=True) + softening
-    expected = (np.concatenate((drift, slip), -1) ** 2 / size).mean()
+    size = (change**2).mean(-1) + softening
+    square = (np.concatenate((drift, slip), -1) ** 2).mean(-1) / size
+    expected = np.sqrt(square + 1e-8).mean()
     loss = rollout_loss(model, *batch_of(data), softening)
     np.testing.assert_allclose(float(loss.detach()), expected, rtol=1e-5)
 

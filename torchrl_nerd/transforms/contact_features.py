@@ -2,10 +2,11 @@
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
 zeroed beyond the margin xi. Over one plane, p1 follows from kinematics, n and d, so it is
-left out; where the plane is the same for all rows, n follows from gravity and is left
-out too. Added is what decides an impact: the point's velocity, and how deep it will be if
-it goes on: whether a point touches within the step is a threshold, which a network learns
-slowly from distance and speed. All of it fades to zero at the margin without a jump.
+left out; where all rows share a plane that is level, or that a fixed base cannot turn
+against, n follows from gravity and pose and is left out too. Added is what decides an
+impact: the point's velocity, and how deep it will be if it goes on: whether a point
+touches within the step is a threshold, which a network learns slowly from distance and
+speed. All of it fades to zero at the margin without a jump.
 """
 
 import numpy as np
@@ -42,7 +43,7 @@ class ContactFeatures(FeatureTransform):
     | ``contact_distance`` | min(d - xi, 0), m | P |
     | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
     | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed, m | K P |
-    | ``contact_normal`` | g * n; only where the ground varies from row to row | 3 P |
+    | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
     The K = min(substeps, 5) times are spread evenly from the step's start on: with few
     substeps they are just those at which the true solver looks for contact. A scene
@@ -76,6 +77,8 @@ class ContactFeatures(FeatureTransform):
             sizes[CONTACT_DEPTH] = glances * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
+            is_level = abs(float(terrain.default[2])) > 1.0 - 1e-12
+            if terrain.is_per_row or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
@@ -125,7 +128,7 @@ class ContactFeatures(FeatureTransform):
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
         depth = self._coming_depth(qpos, qvel, plane, distance, speed)
         features.append((gate * depth).flatten(-2))
-        if self.terrain.is_per_row:
+        if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features
 
