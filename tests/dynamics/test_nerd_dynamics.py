@@ -54,6 +54,7 @@ def test_history_matters_and_a_reset_empties_it(scene, inference, generator):
     dynamics = NeRDDynamics(random_model(scene, generator), inference)
     start, torques, terrain = random_drive(scene, ROWS, 2, generator)
     first = dynamics.step(start, torques[0], terrain)
+    dynamics.step(first, torques[1], terrain)
     second = dynamics.step(start, torques[0], terrain)
     assert (first["qvel"] != second["qvel"]).any(-1).all()
     dynamics.reset(start)
