@@ -53,9 +53,9 @@ class PPOConfig:
     total_frames: int = 3_000_000  # control steps to learn from
     num_envs: int = 1024  # rows stepped together
     horizon: int = 32  # steps of every row between two updates
-    epochs: int = 4  # passes over those steps
-    minibatch: int = 4096  # steps per gradient
-    lr: float = 4e-3  # Adam's step size at the start; falls linearly to zero
+    epochs: int = 5  # passes over those steps
+    minibatch: int = 2048  # steps per gradient
+    lr: float = 3e-3  # Adam's step size at the start; falls linearly to zero
     gamma: float = 0.99  # discount per step
     lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
     clip: float = 0.2  # how far an action's probability ratio counts

@@ -1,5 +1,7 @@
 """What can touch the ground, what is left out of it, and that nothing is lost."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,12 @@ from helpers import every_scene, make_scene, random_states, random_transitions
 from torchrl_nerd.keys import CONTACT_DISTANCE, CONTACT_NORMAL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.scenes.contact_points import MARGIN_PER_RADIUS, MIN_MARGIN
+from torchrl_nerd.scenes.double_pendulum import (
+    GROUNDS,
+    RADIUS,
+    ROOT,
+    evaluation_ground,
+)
 from torchrl_nerd.transforms import ContactFeatures
 
 PLANE = '<geom type="plane" size="0 0 1"/>'
@@ -115,9 +123,14 @@ def test_the_papers_contacts_follow_from_the_pendulums_features(generator):
 
 
 def test_a_ground_that_only_a_dropped_point_touches_does_nothing(rng):
-    """The pendulum's root: its links point away from a plane that it dips into."""
+    """The pendulum's root: its links point away from a plane that it dips into.
+
+    Without friction, which would brake its cap; no ground in use reaches it, see below.
+    """
     scene = load_scene("double_pendulum")
-    model, terrain = scene.model, scene.terrain
+    model, terrain = copy.copy(scene.model), scene.terrain
+    model.geom_friction[:] = 0.0
+    model.geom_condim[:] = 1
     for _ in range(20):
         angle, depth = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 0.05)
         normal = np.array([np.cos(angle), 0.0, np.sin(angle)])
@@ -132,6 +145,15 @@ def test_a_ground_that_only_a_dropped_point_touches_does_nothing(rng):
             after.append(data.qvel.copy())
             assert data.ncon == (distance < 0.1)
         np.testing.assert_allclose(after[0], after[1], rtol=0.0, atol=1e-9)
+
+
+def test_no_ground_in_use_reaches_the_dropped_root_of_the_pendulum(generator):
+    scene = load_scene("double_pendulum")
+    planes = [evaluation_ground(number)[None] for number in range(len(GROUNDS))]
+    planes.append(scene.sample_initial(500, generator)[0]["terrain"])
+    plane = torch.cat(planes)
+    distance = plane[:, :3] @ torch.tensor(ROOT).double() - plane[:, 3]
+    assert (distance > RADIUS - 1e-9).all()
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])

@@ -2,7 +2,8 @@
 
 As in the paper (section 3.2; facts of the reference code): a sphere's centre, a capsule's
 two cap centres, a box's eight corners. Points that always coincide are merged, points
-that no joint can move are dropped: the ground cannot do work on them.
+that no joint can move are dropped: the ground cannot do work on them, but for friction at
+the rim of a cap that turns on the spot.
 """
 
 from dataclasses import dataclass
