@@ -14,9 +14,8 @@ RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root sm
 def relative_error(errors: Tensor, size: Tensor, softening: float) -> Tensor:
     """Length of an error relative to what it is an error of, ``(*batch,)``.
 
-    Not its square: where one sample in ten is an impact whose error is a hundred times
-    that of free flight, squares leave free flight no say. Measured in docs/results.md: a
-    quarter of the rollout error.
+    Not its square: impacts are few and their errors large, and squares leave free flight
+    no say beside them. Measured in docs/results.md: a quarter of the error in free flight.
 
     Args:
         errors: ``(*batch, D)``, normalised.
