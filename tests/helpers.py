@@ -93,7 +93,7 @@ def random_transitions(scene: Scene, rows: int, generator: Generator) -> TensorD
         states = random_states(scene.model, rows, np.random.default_rng(seed))
         start = dict(zip((QPOS, QVEL), states, strict=True))
         scale = torch.ones(rows, 1, dtype=torch.float64)
-    torque = sample_torque(scene.sampling, scale, generator)
+    torque = sample_torque(scene.sampling, scale, 1, generator)[:, 0]
     return true_step(scene, TensorDict(start, batch_size=[rows]), torque)
 
 

@@ -28,10 +28,10 @@ def seconds_of_rollout(scene: Scene, seed: int, threads: int) -> float:
     state = np.concatenate(
         (np.zeros((ROWS, 1)), start["qpos"].numpy(), start["qvel"].numpy()), -1
     )
-    torque = [sample_torque(scene.sampling, scale, generator) for _ in range(STEPS)]
+    torque = sample_torque(scene.sampling, scale, STEPS, generator)
     size = mujoco.mj_stateSize(model, int(CONTROL))
     control = np.zeros((ROWS, STEPS, size))
-    control[:, :, scene.actuated] = np.stack([x.numpy() for x in torque], 1)
+    control[:, :, scene.actuated] = torque.numpy()
     if "terrain" in start:
         pose = scene.terrain.mocap_pose(start["terrain"]).numpy()
         control[:, :, model.nv :] = pose[:, None]

@@ -84,3 +84,25 @@ def test_the_scene_is_left_as_it_was(scene, generator):
     roll(MujocoDynamics(scene), *random_drive(scene, ROWS, 1, generator))
     assert int(scene.model.opt.disableflags) == flags
     np.testing.assert_array_equal(scene.model.qpos0, qpos0)
+
+
+def test_a_trajectory_in_one_call_is_its_steps(scene, generator):
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    path = roll(MujocoDynamics(scene), start, torques, terrain)
+    whole = MujocoDynamics(scene).rollout(start, torques.transpose(0, 1), terrain)
+    for key in ("qpos", "qvel"):
+        scale = float(path[key].abs().max())
+        torch.testing.assert_close(whole[key], path[key], rtol=0, atol=1e-12 * scale)
+
+
+def test_a_row_that_breaks_on_the_way_is_sound_until_then(scene, generator):
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    torques = torques.transpose(0, 1).clone()
+    clean = MujocoDynamics(scene).rollout(start, torques, terrain)
+    torques[3, 4] = torch.nan
+    broken = MujocoDynamics(scene).rollout(start, torques, terrain)
+    others = torch.arange(ROWS) != 3
+    for key in ("qpos", "qvel"):
+        assert torch.equal(broken[key][others], clean[key][others])
+        assert torch.equal(broken[key][3, :4], clean[key][3, :4])
+        assert broken[key][3, 4:].isnan().all()

@@ -26,6 +26,7 @@ from torchrl_nerd.scenes.sampling import sample_torque
 from torchrl_nerd.settings import expect_at_least
 
 CHUNK = 2048  # trajectories stepped together; also what a kill can lose
+SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
 LARGEST = 1e5  # reference code: a trajectory beyond this is broken
 CARD = "data.json"
 
@@ -56,14 +57,14 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     terrain = start.pop(TERRAIN, None)
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
-    transitions: list[TensorDictBase] = []
-    for _ in range(steps):
-        torque = sample_torque(scene.sampling, scale, generator)
-        next_state = dynamics.step(state, torque, terrain)
-        following = next_state.clone(False).set("joint_torque", torque)
-        transitions.append(state.clone(False).set("next", following))
-        state = next_state
-    data = cast(TensorDict, TensorDict.stack(transitions, 1))
+    torque = sample_torque(scene.sampling, scale, steps, generator)
+    parts = [state[:, None]]
+    for held in torque.split(SEGMENT, 1):
+        last = cast(TensorDictBase, parts[-1][:, -1])
+        parts.append(dynamics.rollout(last, held, terrain))
+    states = cast(TensorDict, torch.cat(parts, 1))
+    data, following = states[:, :-1], states[:, 1:]
+    data["next"] = following.set("joint_torque", torque)
     if terrain is not None:
         data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
     return data

@@ -2,7 +2,7 @@
 
 import copy
 import os
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import mujoco.rollout
@@ -79,50 +79,63 @@ class MujocoDynamics:
     ) -> TensorDictBase:
         """See `Dynamics.step`. Rows that MuJoCo gave up on come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
-        qpos, qvel = (np.asarray(state[key].double().cpu()) for key in (QPOS, QVEL))
-        trajectory = self._rollout(qpos, qvel, self._control(joint_torque, terrain))
-        nq, nv = self._model.nq, self._model.nv
-        last = trajectory[:, -1]
-        before = trajectory[:, -2, 1 + nq : 1 + nq + nv] if self._steps > 1 else qvel
-        next_qvel = last[:, 1 + nq : 1 + nq + nv]
-        self._warmstart = (next_qvel - before) / self._model.opt.timestep
-        next_state = torch.from_numpy(last[:, 1 : 1 + nq + nv].copy())
-        # a row that MuJoCo gave up on stopped before the end: its clock is behind
-        is_late = (
-            abs(last[:, 0] - self.scene.control_step) > 0.5 * self._model.opt.timestep
-        )
-        if is_late.any():
-            next_state[torch.from_numpy(is_late)] = torch.nan
-            self._warmstart[is_late] = 0.0
-        next_state = next_state.to(state[QPOS].device)
-        return TensorDict(
-            {QPOS: next_state[:, :nq], QVEL: next_state[:, nq:]},
-            batch_size=[len(qpos)],
-            device=state.device,
-        )
+        states = self.rollout(state, joint_torque[:, None], terrain)
+        return cast(TensorDictBase, states[:, 0])
 
-    @property
-    def _steps(self) -> int:
-        return self.scene.substeps
+    def rollout(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDict:
+        """Many control steps in one call: what `step` gives one after the other.
+
+        Args:
+            state: ``qpos (rows, nq)``, ``qvel (rows, nv)``.
+            joint_torque: ``(rows, T, num_actuated)``, each held over its control step.
+            terrain: ``(rows, terrain.size)`` where the ground varies.
+
+        Returns:
+            ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo
+            gave up on.
+        """
+        qpos, qvel = (np.asarray(state[key].double().cpu()) for key in (QPOS, QVEL))
+        fine = self._substeps(qpos, qvel, self._control(joint_torque, terrain))
+        timestep = self._model.opt.timestep
+        velocity = slice(1 + qpos.shape[1], 1 + qpos.shape[1] + qvel.shape[1])
+        before = fine[:, -2, velocity] if fine.shape[1] > 1 else qvel
+        self._warmstart = (fine[:, -1, velocity] - before) / timestep
+        states = fine[:, self.scene.substeps - 1 :: self.scene.substeps]
+        # a row that MuJoCo gave up on stopped before the end: its clock is behind
+        clock = self.scene.control_step * np.arange(1, states.shape[1] + 1)
+        is_late = abs(states[:, :, 0] - clock) > 0.5 * timestep
+        position = np.ascontiguousarray(states[:, :, 1 : velocity.start])
+        speed = np.ascontiguousarray(states[:, :, velocity])
+        if is_late.any():
+            position[is_late], speed[is_late] = np.nan, np.nan
+            self._warmstart[is_late[:, -1]] = 0.0
+        device = state[QPOS].device
+        values = {QPOS: torch.from_numpy(position), QVEL: torch.from_numpy(speed)}
+        return TensorDict(values, [*states.shape[:2]]).to(device)
 
     def _control(self, joint_torque: Tensor, terrain: Tensor | None) -> np.ndarray:
-        """MuJoCo's control vector: applied force, then the ground's pose."""
-        rows = len(joint_torque)
-        force = torch.zeros(rows, self._model.nv, dtype=torch.float64)
-        force[:, self.scene.actuated] = joint_torque.double().cpu()
+        """MuJoCo's control vector, ``(rows, T, size)``: applied force, ground's pose."""
+        shape = joint_torque.shape[:-1]
+        force = torch.zeros(*shape, self._model.nv, dtype=torch.float64)
+        force[..., self.scene.actuated] = joint_torque.double().cpu()
         ground = self.scene.terrain
         if terrain is None or ground is None or not ground.is_per_row:
-            pos = torch.from_numpy(self._data[0].mocap_pos.reshape(1, -1))
-            quat = torch.from_numpy(self._data[0].mocap_quat.reshape(1, -1))
-            pose = torch.cat((pos, quat), -1).expand(rows, -1)
+            pos = torch.from_numpy(self._data[0].mocap_pos.reshape(-1))
+            quat = torch.from_numpy(self._data[0].mocap_quat.reshape(-1))
+            pose = torch.cat((pos, quat)).expand(shape[0], -1)
         else:
             pose = ground.mocap_pose(terrain.double().cpu())
-        return torch.cat((force, pose), -1).numpy()
+        return torch.cat((force, pose[:, None].expand(*shape, -1)), -1).numpy()
 
-    def _rollout(
+    def _substeps(
         self, qpos: np.ndarray, qvel: np.ndarray, control: np.ndarray
     ) -> np.ndarray:
-        """All substeps of all rows, ``(rows, substeps, state)``."""
+        """The state after every substep, ``(rows, T * substeps, state)``."""
         rows = len(qpos)
         size = mujoco.mj_stateSize(self._model, STATE.mjSTATE_FULLPHYSICS)
         start = np.zeros((rows, size))
@@ -134,7 +147,7 @@ class MujocoDynamics:
             self._model,
             self._data,
             start,
-            np.repeat(control[:, None], self._steps, 1),
+            np.repeat(control, self.scene.substeps, 1),
             control_spec=CONTROL,
             initial_warmstart=self._warmstart,
         )

@@ -43,10 +43,14 @@ def uniform(
     return a + (b - a) * u
 
 
-def sample_torque(sampling: Sampling, scale: Tensor, generator: Generator) -> Tensor:
-    """Uniform torques ``(rows, num_actuated)`` times each row's scale ``(rows, 1)``."""
-    high = sampling.torque
-    return scale * uniform(tuple(-t for t in high), high, len(scale), generator)
+def sample_torque(
+    sampling: Sampling, scale: Tensor, steps: int, generator: Generator
+) -> Tensor:
+    """Uniform torques ``(rows, steps, num_actuated)`` times each row's scale."""
+    rows, high = len(scale), sampling.torque
+    low = tuple(-t for t in high)
+    torque = uniform(low, high, steps * rows, generator)
+    return scale[:, None] * torque.unflatten(0, (steps, rows)).transpose(0, 1)
 
 
 def sample_scale(
