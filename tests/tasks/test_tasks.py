@@ -37,7 +37,7 @@ def numbers(state: TensorDict) -> list[np.ndarray]:
 def test_every_task_keeps_its_promises(task_id, generator):
     task = make_task(task_id)
     state, after = (random_state(task, generator) for _ in range(2))
-    width = task.scene.controller.num_actions
+    width = task.controller.num_actions
     action = 2.0 * torch.rand(ROWS, width, generator=generator) - 1.0
     before = state.clone(), after.clone()
     observation, reward = task.observation(state), task.reward(state, action, after)
@@ -55,7 +55,7 @@ def test_every_task_keeps_its_promises(task_id, generator):
 def test_leading_dimensions_are_free(task_id, generator):
     task = make_task(task_id)
     state = random_state(task, generator, 12)
-    action = torch.zeros(12, task.scene.controller.num_actions)
+    action = torch.zeros(12, task.controller.num_actions)
     shaped, split = state.reshape(3, 4), action.reshape(3, 4, -1)
     for flat, deep in (
         (task.observation(state), task.observation(shaped)),

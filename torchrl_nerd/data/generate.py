@@ -57,14 +57,20 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     terrain = start.pop(TERRAIN, None)
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
-    torque = sample_torque(scene.sampling, scale, steps, generator)
-    parts = [state[:, None]]
-    for held in torque.split(SEGMENT, 1):
-        last = cast(TensorDictBase, parts[-1][:, -1])
-        parts.append(dynamics.rollout(last, held, terrain))
-    states = cast(TensorDict, torch.cat(parts, 1))
-    data, following = states[:, :-1], states[:, 1:]
-    data["next"] = following.set("joint_torque", torque)
+    states, torques = [state[:, None]], []
+    for done in range(0, steps, 1 if scene.sampling.drive else SEGMENT):
+        last = states[-1][:, -1]
+        if scene.sampling.drive is None:
+            count = min(SEGMENT, steps - done)
+            held = sample_torque(scene.sampling, scale, count, generator)
+        else:
+            torque = scene.sampling.drive(last[QPOS], last[QVEL], scale, generator)
+            held = torque[:, None]
+        torques.append(held)
+        states.append(dynamics.rollout(last, held, terrain))
+    path = cast(TensorDict, TensorDict.cat(states, 1))
+    data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))
+    data["next"] = after.set("joint_torque", torch.cat(torques, 1))
     if terrain is not None:
         data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
     return data
@@ -143,7 +149,7 @@ def _open_card(scene: Scene, config: DataConfig, folder: Path) -> dict:
         "scene": scene.name,
         "scene_hash": scene.hash,
         "config": asdict(config),
-        "ranges": {k: v for k, v in asdict(scene.sampling).items() if k != "ground"},
+        "ranges": {k: v for k, v in asdict(scene.sampling).items() if not callable(v)},
         "mujoco": mujoco.__version__,
         "torchrl_nerd": __version__,
         "trajectories": 0,

@@ -21,10 +21,10 @@ class SceneEnv(EnvBase):
 
     Per row: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
-    the step that led here (zero after a reset). A row whose action, state or next state
-    is not finite keeps its last state and ends as ``terminated``; no other row notices.
-    Random numbers are each row's own, so a row's episodes do not depend on how many rows
-    there are. ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel`` and
+    the control step that led here (zero after a reset). A row whose action, state or next
+    state is not finite keeps its last state and ends as ``terminated``; no other row
+    notices. Random numbers are each row's own, so a row's episodes do not depend on how
+    many rows there are. ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel`` and
     parameters in ``td``.
 
     Args:
@@ -87,7 +87,7 @@ class SceneEnv(EnvBase):
             torch.Size((*rows, width)), dtype=torch.float32, device=device
         )
         self.observation_spec = Composite(state, shape=rows, device=device)
-        num_actions = self.scene.controller.num_actions
+        num_actions = self.task.controller.num_actions
         self.action_spec = Bounded(
             -1.0,
             1.0,
@@ -186,8 +186,11 @@ class SceneEnv(EnvBase):
         state = self._state()
         is_fine = torch.all(action.isfinite(), -1, keepdim=True)
         action = torch.where(is_fine, action, 0.0)
-        torque = self.scene.controller(action, state[QPOS], state[QVEL])
-        moved = self.dynamics.step(state, torque, state.get(TERRAIN, None))
+        controller, moved = self.task.controller, state
+        torque = state[QVEL][..., self.scene.actuated]
+        for _ in range(self.task.steps_per_action):
+            torque = controller(action, moved[QPOS], moved[QVEL])
+            moved = self.dynamics.step(moved, torque, state.get(TERRAIN, None))
         for key in (QPOS, QVEL):
             is_fine = is_fine & torch.all(moved[key].isfinite(), -1, keepdim=True)
         next_values = {

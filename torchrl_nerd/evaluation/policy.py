@@ -128,7 +128,7 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
     if len(sizes) < 2 or not all(type(size) is int and size > 0 for size in sizes):
         raise ValueError(f"expected the layer sizes in {folder / CARD}, got {found!r}")
     if task is not None:
-        expected = (task.observation_size, task.scene.controller.num_actions)
+        expected = (task.observation_size, task.controller.num_actions)
         if (sizes[0], sizes[-1]) != expected:
             raise ValueError(
                 f"the policy in {folder} has {sizes[0]} observations and {sizes[-1]} "

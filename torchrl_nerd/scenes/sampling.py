@@ -6,8 +6,53 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
+from torchrl_nerd.geometry.frames import quat_exp, quat_multiply, rotate
+
 GroundSampler = Callable[[Tensor, Generator], Tensor]
 """``(qpos (n, nq), generator) -> terrain (n, terrain.size)``."""
+
+Drive = Callable[[Tensor, Tensor, Tensor, Generator], Tensor]
+"""``(qpos, qvel, scale (n, 1), generator) -> joint_torque (n, num_actuated)``."""
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class BaseSampling:
+    """Where a floating base starts.
+
+    | field | meaning |
+    |---|---|
+    | ``low``, ``high`` | position of the base, m, world |
+    | ``tilt`` | turned by U(-1, 1) times this angle (rad) about a random axis |
+    | ``linear_low``, ``linear_high`` | velocity of its origin, m/s, base frame |
+    | ``angular_low``, ``angular_high`` | angular velocity, rad/s, base frame |
+    | ``quat`` | the orientation that is turned, wxyz |
+
+    The axis is a normalised U(-1, 1)^3, as in the reference code.
+    """
+
+    low: Triple
+    high: Triple
+    tilt: float
+    linear_low: Triple
+    linear_high: Triple
+    angular_low: Triple
+    angular_high: Triple
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    def draw(self, rows: int, generator: Generator) -> tuple[Tensor, Tensor]:
+        """``qpos (rows, 7)`` and ``qvel (rows, 6)`` of the free joint, float64."""
+        position = uniform(self.low, self.high, rows, generator)
+        axis = uniform((-1.0,) * 3, (1.0,) * 3, rows, generator)
+        axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True)
+        angle = uniform((-self.tilt,), (self.tilt,), rows, generator)
+        upright = torch.tensor(self.quat, dtype=torch.float64).expand(rows, 4)
+        quat = quat_multiply(upright, quat_exp(axis * angle))
+        linear = uniform(self.linear_low, self.linear_high, rows, generator)
+        angular = uniform(self.angular_low, self.angular_high, rows, generator)
+        qvel = torch.cat((rotate(quat, linear), angular), -1)
+        return torch.cat((position, quat), -1), qvel
 
 
 @dataclass(frozen=True)
@@ -16,10 +61,13 @@ class Sampling:
 
     | field | meaning |
     |---|---|
-    | ``qpos_low``, ``qpos_high`` | initial positions, m and rad |
-    | ``qvel_low``, ``qvel_high`` | initial velocities, m/s and rad/s |
+    | ``qpos_low``, ``qpos_high`` | initial positions of the joints, m and rad |
+    | ``qvel_low``, ``qvel_high`` | initial velocities of the joints, m/s and rad/s |
     | ``torque`` | largest torque of each actuated dof, N and N m |
+    | ``base`` | start of a floating base, whose joint comes before the others |
     | ``ground`` | draws each row's ground, where it varies |
+    | ``drive`` | torques that depend on the state, in place of uniform ones |
+    | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
     | ``passive_share`` | share of trajectories with no torque at all |
     | ``quiet_share`` | share whose torque and velocity are scaled down by U(0, 1) |
     """
@@ -29,7 +77,10 @@ class Sampling:
     qvel_low: tuple[float, ...]
     qvel_high: tuple[float, ...]
     torque: tuple[float, ...]
+    base: BaseSampling | None = None
     ground: GroundSampler | None = None
+    drive: Drive | None = None
+    clearance: float | None = None
     passive_share: float = 0.25
     quiet_share: float = 0.25
 

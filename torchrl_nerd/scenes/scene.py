@@ -9,14 +9,19 @@ import numpy as np
 import torch
 from torch import Generator
 
-from torchrl_nerd.geometry.kinematics import Base, mount_pose
+from torchrl_nerd.geometry.kinematics import (
+    Base,
+    PointKinematics,
+    matrix_from_quat,
+    mount_pose,
+)
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.scenes.contact_points import (
     ContactPoints,
     contact_points,
     ground_geoms,
 )
-from torchrl_nerd.scenes.controllers import TorqueController
+from torchrl_nerd.scenes.controllers import Controller
 from torchrl_nerd.scenes.explain import Symmetries, find_symmetries
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
 from torchrl_nerd.scenes.terrain import Terrain
@@ -51,7 +56,7 @@ class Scene:
     name: str
     model: mujoco.MjModel
     substeps: int
-    controller: TorqueController
+    controller: Controller
     sampling: Sampling
 
     def __post_init__(self) -> None:
@@ -131,10 +136,62 @@ class Scene:
             ``terrain (rows, terrain.size)``, all float64.
         """
         ranges = self.sampling
-        qpos = uniform(ranges.qpos_low, ranges.qpos_high, rows, generator)
-        qvel = uniform(ranges.qvel_low, ranges.qvel_high, rows, generator)
+        qpos, qvel = self._draw(rows, generator)
         torque_scale, speed_scale = sample_scale(ranges, rows, generator)
         state = {"qpos": qpos, "qvel": speed_scale * qvel}
         if ranges.ground is not None:
             state["terrain"] = ranges.ground(qpos, generator)
         return state, torque_scale
+
+    def _draw(
+        self, rows: int, generator: Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions and velocities within the ranges, clear of the ground."""
+        ranges = self.sampling
+        qpos = uniform(ranges.qpos_low, ranges.qpos_high, rows, generator)
+        qvel = uniform(ranges.qvel_low, ranges.qvel_high, rows, generator)
+        if ranges.base is not None:
+            base_pos, base_vel = ranges.base.draw(rows, generator)
+            qpos = torch.cat((base_pos, qpos), -1)
+            qvel = torch.cat((base_vel, qvel), -1)
+        if ranges.clearance is not None:
+            is_low = self.clearances(qpos).amin(-1) < ranges.clearance
+            if is_low.any():
+                again = self._draw(int(is_low.sum()), generator)
+                qpos[is_low], qvel[is_low] = again
+        return qpos, qvel
+
+    def clearances(
+        self, qpos: torch.Tensor, terrain: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Gap between every contact point's shape and the ground, m, ``(*batch, P)``.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+        """
+        if self.terrain is None:
+            return qpos.new_zeros(*qpos.shape[:-1], 0)
+        at_rest = torch.zeros_like(qpos[..., :1]).expand(
+            *qpos.shape[:-1], self.layout.nv
+        )
+        points, _ = self.point_kinematics.to(qpos.device)(qpos, at_rest)
+        ground = torch.as_tensor(self.terrain.default).to(qpos)
+        ground = ground.expand(*qpos.shape[:-1], -1) if terrain is None else terrain
+        distance, _ = self.terrain.distance(points, ground, *self.base_pose(qpos))
+        return distance - torch.as_tensor(self.contacts.radii).to(qpos)
+
+    def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
+        if not self.base.is_floating:
+            batch = qpos.shape[:-1]
+            position, rotation = (torch.as_tensor(x).to(qpos) for x in self.mount)
+            return position.expand(*batch, 3), rotation.expand(*batch, 3, 3)
+        q = self.base.qpos_address
+        return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
+
+    @cached_property
+    def point_kinematics(self) -> PointKinematics:
+        """Kinematics of the contact points."""
+        points = self.contacts
+        return PointKinematics(self.model, self.base, points.bodies, points.positions)

@@ -7,6 +7,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes.controllers import Controller
 
 State = Mapping[str, Tensor]
 """``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's row parameters; a
@@ -22,6 +23,7 @@ class Task(ABC):
     | ``horizon`` | control steps after which an episode is truncated |
     | ``num_uniforms`` | random numbers that one reset takes |
     | ``observation_size`` | width of the observation |
+    | ``steps_per_action`` | control steps over which an action is held |
     | ``parameters`` | row parameters drawn at a reset and kept, key -> width |
     """
 
@@ -29,12 +31,18 @@ class Task(ABC):
     horizon: ClassVar[int]
     num_uniforms: ClassVar[int]
     observation_size: ClassVar[int]
+    steps_per_action: ClassVar[int] = 1
     parameters: ClassVar[dict[str, int]] = {}
 
     @property
     def scene(self) -> Scene:
         """The robot and its ground."""
         return load_scene(self.scene_name)
+
+    @property
+    def controller(self) -> Controller:
+        """What turns the action into torque; the scene's own unless a task has one."""
+        return self.scene.controller
 
     @abstractmethod
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
