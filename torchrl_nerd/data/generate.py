@@ -59,7 +59,7 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     dynamics.reset(state)
     states, torques = [state[:, None]], []
     for done in range(0, steps, 1 if scene.sampling.drive else SEGMENT):
-        last = states[-1][:, -1]
+        last = cast(TensorDict, states[-1][:, -1])
         if scene.sampling.drive is None:
             count = min(SEGMENT, steps - done)
             held = sample_torque(scene.sampling, scale, count, generator)

@@ -24,8 +24,8 @@ class SceneEnv(EnvBase):
     the control step that led here (zero after a reset). A row whose action, state or next
     state is not finite keeps its last state and ends as ``terminated``; no other row
     notices. Random numbers are each row's own, so a row's episodes do not depend on how
-    many rows there are. ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel`` and
-    parameters in ``td``.
+    many rows there are. ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel``
+    and parameters in ``td``.
 
     Args:
         task: reset distribution, observation, reward, end.
