@@ -1,5 +1,6 @@
 """Robots of others: their actuators, grounds and steps are what their own model has."""
 
+import copy
 from dataclasses import replace
 from math import pi
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.cli import main
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
@@ -104,6 +106,12 @@ def write(folder, world, rest=""):
     return path
 
 
+def servo_scene(folder, integrator="Euler", control_step=0.004) -> Scene:
+    path = folder / "servos.xml"
+    path.write_text(SERVOS.format(integrator=integrator))
+    return Scene.from_mjcf(path, control_step)
+
+
 @pytest.fixture(params=STEPS)
 def robot(request) -> Scene:
     """Each imported robot."""
@@ -113,9 +121,7 @@ def robot(request) -> Scene:
 @pytest.fixture(params=["Euler", "RK4", "implicitfast"])
 def servos(request, tmp_path) -> Scene:
     """A robot with all kinds of servos."""
-    path = tmp_path / "servos.xml"
-    path.write_text(SERVOS.format(integrator=request.param))
-    return Scene.from_mjcf(path, control_step=0.004)
+    return servo_scene(tmp_path, request.param)
 
 
 def states_and_actions(scene, generator, clearance=None):
@@ -163,9 +169,7 @@ def check_steps(scene, generator, hold):
             mujoco.mj_forward(scene.model, data)
             data.qfrc_applied = data.qfrc_actuator
             data.qacc_warmstart = 0.0
-            for name in ("gainprm", "biasprm"):
-                assert getattr(scene.model, f"actuator_{name}").any()
-        model = scene.model.__copy__()
+        model = copy.copy(scene.model)
         if hold:
             model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
         mujoco.mj_step(model, data, scene.substeps)
@@ -194,9 +198,7 @@ def test_true_steps_of_servos_are_the_originals_with_the_force_held(servos, gene
 
 
 def test_servos_stepped_at_every_timestep_need_no_holding(tmp_path, generator):
-    path = tmp_path / "servos.xml"
-    path.write_text(SERVOS.format(integrator="Euler"))
-    check_steps(Scene.from_mjcf(path, control_step=0.002), generator, hold=False)
+    check_steps(servo_scene(tmp_path, control_step=0.002), generator, hold=False)
 
 
 def test_a_dm_control_episode_is_dm_controls_own(generator):
@@ -357,6 +359,35 @@ def test_data_can_be_drawn_from_a_name(tmp_path):
     sizes = ("--trajectories", "4", "--steps", "3")
     assert main(["data", name, "--out", str(out), *sizes, "--quiet"]) == 0
     assert main(["data", name, "--out", str(out), *sizes, "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("is_file", [True, False])
+def test_a_checkpoint_finds_its_robot_again(is_file, tmp_path):
+    scene = servo_scene(tmp_path) if is_file else load_scene("gymnasium/Ant-v5")
+    model = NeRD(scene, NETWORKS["tiny"])
+    save_checkpoint(model, tmp_path / "checkpoint", make_card(model))
+    again = load_checkpoint(tmp_path / "checkpoint", scene if is_file else None)
+    assert again.scene.hash == scene.hash
+    with pytest.raises(ValueError, match="unknown scene 'unicycle'"):
+        card = make_card(model) | {"scene": "unicycle"}
+        load_checkpoint(save_checkpoint(model, tmp_path / "other", card))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m.body_gravcomp.__iadd__(0.5),
+        lambda m: m.qpos_spring.__iadd__(0.5),
+        lambda m: m.dof_solref.__imul__(2.0),
+        lambda m: m.dof_dampingpoly[-1].__iadd__(0.1),
+        lambda m: setattr(m.opt, "noslip_iterations", 3),
+    ],
+)
+def test_rare_physics_changes_the_hash(change, robot):
+    again = replace(robot, model=copy.copy(robot.model))
+    assert again.hash == robot.hash
+    change(again.model)
+    assert replace(again).hash != robot.hash
 
 
 @pytest.mark.parametrize("named", REFUSED)

@@ -1,6 +1,5 @@
 """A scene: one robot, its ground, its controller, and how finely the truth is stepped."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +26,7 @@ from torchrl_nerd.scenes.contact_points import (
 )
 from torchrl_nerd.scenes.controllers import Controller
 from torchrl_nerd.scenes.explain import Symmetries, find_symmetries
+from torchrl_nerd.scenes.fingerprint import fingerprint
 from torchrl_nerd.scenes.importer import (
     Imported,
     import_dm_control,
@@ -37,15 +37,6 @@ from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
 from torchrl_nerd.scenes.support import check_supported
 from torchrl_nerd.scenes.terrain import Terrain
 
-_HASHED_FIELDS = (
-    *("body_parentid", "body_pos", "body_quat", "body_mass", "body_inertia"),
-    *("body_ipos", "body_iquat", "jnt_type", "jnt_pos", "jnt_axis", "jnt_range"),
-    *("jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp", "dof_armature"),
-    *("dof_damping", "dof_frictionloss", "geom_type", "geom_size", "geom_pos"),
-    *("geom_quat", "geom_friction", "geom_solref", "geom_solimp", "geom_contype"),
-    *("geom_conaffinity", "geom_condim", "geom_margin", "geom_gap", "geom_solmix"),
-    *("geom_priority", "jnt_margin", "actuator_trnid", "actuator_gear", "qpos0"),
-)
 LARGEST_REDRAWS = 300  # of starts that are not clear of the ground
 
 
@@ -180,15 +171,7 @@ class Scene:
     @cached_property
     def hash(self) -> str:
         """Fingerprint of the physics: equal for equal robots, steps and grounds."""
-        digest = hashlib.sha256()
-        for field in _HASHED_FIELDS:
-            digest.update(np.ascontiguousarray(getattr(self.model, field)).tobytes())
-        option = self.model.opt
-        numbers = [option.timestep, self.substeps, *option.gravity, option.impratio]
-        numbers += [option.density, option.viscosity, *option.wind]
-        numbers += [int(option.integrator), int(option.disableflags), int(option.cone)]
-        digest.update(np.array(numbers, float).tobytes())
-        return digest.hexdigest()[:16]
+        return fingerprint(self.model, self.substeps)
 
     def sample_initial(
         self, rows: int, generator: Generator

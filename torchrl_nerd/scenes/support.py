@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.kinematics import BALL, FREE, Base
+from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, Base
 
 JOINT, IN_PARENT, TENDON = (
     int(mujoco.mjtTrn.mjTRN_JOINT),
@@ -23,6 +23,9 @@ JOINT, IN_PARENT, TENDON = (
 )
 GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
 BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+AFFINE = np.array([[GAINS[1]], [BIASES[1]]], int)
+NO_ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION
+NOTHING = -1  # where another has the type of a joint
 
 Refusal = tuple[str, Any, Callable[[int], Any] | None]
 """What, a flag of the model or one per object, and how to get an object by its index."""
@@ -83,7 +86,7 @@ def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
 
 def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
     """What an `ActuatorController` does not do."""
-    get, kind = model.actuator, model.actuator_trntype
+    get = model.actuator
     has_state = model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE
     yield "an actuator with a state of its own", has_state, get
     yield "a delayed actuator", model.actuator_delay, get
@@ -95,27 +98,34 @@ def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
     own = model.actuator_damping + model.actuator_armature
     own = own + abs(model.actuator_dampingpoly).sum(-1)
     yield "an actuator with damping or armature of its own", own, get
-    targets = model.actuator_trnid[:, 0]
-    joint = np.where(np.isin(kind, (JOINT, IN_PARENT)), targets, -1)
-    wrap = model.tendon_adr[targets * (kind == TENDON)] if model.ntendon else kind
-    is_fixed = kind == TENDON
-    if model.ntendon:
-        is_fixed &= model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT
-    yield "an actuator on no joint or fixed tendon", (joint < 0) & ~is_fixed, get
-    joint_kind = np.where(joint >= 0, model.jnt_type[joint], -1)
+    joint_kind = np.array([_kind_of_joint(model, i) for i in range(model.nu)], int)
+    yield "an actuator on no joint or fixed tendon", joint_kind == NOTHING, get
     yield "an actuator on its free joint", joint_kind == FREE, get
-    reads_angle = (model.actuator_gainprm[:, 1] != 0) & (
-        model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
+    is_affine = np.stack((model.actuator_gaintype, model.actuator_biastype)) == AFFINE
+    slopes = np.stack((model.actuator_gainprm[:, 1], model.actuator_biasprm[:, 1]))
+    reads_angle = (is_affine & (slopes != 0.0)).any(0)
+    reads_angle |= model.actuator_trntype == IN_PARENT
+    yield (
+        "an actuator that reads the angle of a ball joint",
+        reads_angle & (joint_kind == BALL),
+        get,
     )
-    reads_angle |= (model.actuator_biasprm[:, 1] != 0) & (
-        model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-    )
-    turns = (joint_kind == BALL) & (reads_angle | (kind == IN_PARENT))
-    yield "an actuator that reads the angle of a ball joint", turns, get
     is_off = [bool(model.opt.disableactuator & 1 << g) for g in model.actuator_group]
-    is_off = is_off or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION
     yield "a disabled actuator", is_off, get
+    all_off = model.nu and model.opt.disableflags & NO_ACTUATION
+    yield "actuators that are disabled", all_off, None
     yield "gravity compensation by actuators", model.jnt_actgravcomp, model.joint
+
+
+def _kind_of_joint(model: mujoco.MjModel, actuator: int) -> int:
+    """Joint type that an actuator drives; a hinge stands for those of a fixed tendon."""
+    kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
+    if kind in (JOINT, IN_PARENT):
+        return int(model.jnt_type[target])
+    if kind != TENDON:
+        return NOTHING
+    wrap = model.wrap_type[model.tendon_adr[target]]
+    return HINGE if wrap == mujoco.mjtWrap.mjWRAP_JOINT else NOTHING
 
 
 def _moves_alike_everywhere(model: mujoco.MjModel, base: Base) -> bool:

@@ -96,8 +96,6 @@ class _JointFeatures:
         model, ignored = scene.model, scene.symmetries
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
-        if scene.sampling.base is not None:  # whose speeds are not among these
-            speed = torch.cat((torch.zeros(6), speed))
         for joint in range(model.njnt):
             kind, is_limited = (
                 int(model.jnt_type[joint]),
