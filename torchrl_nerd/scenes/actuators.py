@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
 
 Row = tuple[float, ...]
+UNLIMITED = 1e300  # N or N m: finite, so that the card of a data set can hold it
 AFFINE_GAIN, AFFINE_BIAS = mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtBias.mjBIAS_AFFINE
 
 
@@ -66,9 +67,11 @@ class ActuatorController:
         gain[model.actuator_gaintype != AFFINE_GAIN, 1:] = 0.0
         bias = np.where((model.actuator_biastype == AFFINE_BIAS)[:, None], bias, 0.0)
         ctrl = _ranges(model.actuator_ctrllimited, model.actuator_ctrlrange, 1.0)
-        force = _ranges(model.actuator_forcelimited, model.actuator_forcerange, np.inf)
+        force = _ranges(
+            model.actuator_forcelimited, model.actuator_forcerange, UNLIMITED
+        )
         is_limited = model.jnt_actfrclimited[joints] * is_scalar
-        torque = _ranges(is_limited, model.jnt_actfrcrange[joints], np.inf)
+        torque = _ranges(is_limited, model.jnt_actfrcrange[joints], UNLIMITED)
         return cls(
             tuple(dofs),
             tuple(int(q) for q in model.jnt_qposadr[joints]),
