@@ -100,13 +100,15 @@ class PaperInput(nn.Module):
     ) -> dict[str, Tensor]:
         """Every piece ``(*batch, width)`` in the dtype of the state."""
         base, batch = self.scene.base, qpos.shape[:-1]
-        position, rotation = self.scene.base_pose(qpos)
-        turn, offset = self.frame(qpos)
         found = {JOINT_POSITION: qpos[..., self.joint_qpos]}
         found[JOINT_VELOCITY] = qvel[..., self.joint_dofs]
         torque = qpos.new_zeros(*batch, len(self.joint_dofs))
         torque[..., self.driven] = joint_torque
         found[TORQUES] = torque
+        if GRAVITY_B not in self.sizes:
+            return found
+        position, rotation = self.scene.base_pose(qpos)
+        turn, offset = self.frame(qpos)
         found[GRAVITY_B] = self.down * (rotation @ turn)[..., 2, :]
         if base.is_floating:
             v = base.dof_address

@@ -148,7 +148,9 @@ def quat_from_matrix(matrix: Tensor) -> Tensor:
     rows = (*rows, *(b, d, 1 - x + y - z, f), *(c, e, f, 1 - x - y + z))
     outer = torch.stack(rows, -1).unflatten(-1, (4, 4))
     best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    column = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
+    column = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[
+        ..., 0, :
+    ]
     return column / torch.linalg.vector_norm(column, dim=-1, keepdim=True)
 
 
@@ -163,9 +165,7 @@ def _is_ground_constant(scene: Scene) -> bool:
     return not scene.base.is_floating and not is_per_row
 
 
-def _seen(
-    scene: Scene, part: dict[str, Tensor], qpos: Tensor
-) -> tuple[Tensor, Tensor]:
+def _seen(scene: Scene, part: dict[str, Tensor], qpos: Tensor) -> tuple[Tensor, Tensor]:
     """Distance ``(rows, P)`` and normal ``(rows, P, 3)`` of the kept points."""
     distance = part[DISTANCE] + torch.as_tensor(scene.contacts.margins)
     if NORMAL in part:
