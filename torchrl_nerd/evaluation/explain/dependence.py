@@ -29,7 +29,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import StateDelta
 
 MATTERS = 1e-6  # relative change of a step; rounding leaves about 1e-12
-NEAREST = 24  # states, those deepest in the ground, at which robot or ground are moved
+NEAREST = 12  # states, those deepest in the ground, at which robot or ground are moved
 SHIFT, TURN = 0.02, 0.2  # m and rad: by how much, one standard deviation
 PAST = 0.05  # rad or m: how far past its limit a joint is put, at most
 LIMIT = int(mujoco.mjtDisableBit.mjDSBL_LIMIT)

@@ -36,19 +36,19 @@ VELOCITY, DEPTH = "contact velocity", "contact depth"
 
 WHY = {
     LINEAR: "floating base: what drag and friction act on",
-    ANGULAR: "floating base: turns its axes, drives gyroscopic torques",
-    GRAVITY: "floating base: all of its orientation that matters",
-    ANGLE: "hinge without limits: sine and cosine, an angle without a jump",
+    ANGULAR: "floating base: turns its axes",
+    GRAVITY: "floating base: how it is tilted",
+    ANGLE: "hinge without limits: sine, cosine",
     POSITION: "slide, or hinge with limits",
     BALL: "ball joint: two columns of its rotation matrix",
     SPEED: "the other half of the state",
-    GAPS: "limited joint: zero until the limit can be reached within the step",
+    GAPS: "limited joint; zero far from its limits",
     GATED: "ignored by the free dynamics, but damped at a limit",
     TORQUE: "actuated joint",
     DISTANCE: "point the ground can reach; zero beyond the margin",
-    NORMAL: "ground varies, or is tilted under a floating base",
-    VELOCITY: "speed along and across the ground's normal, which decides an impact",
-    DEPTH: "penetration within the coming step: a threshold that is slow to learn",
+    NORMAL: "ground varies, or tilts under a floating base",
+    VELOCITY: "along and across the normal: decides an impact",
+    DEPTH: "penetration in the coming step, a threshold",
 }
 
 # Kinds in the order in which they are asked what they add: helpers come last.
@@ -142,7 +142,7 @@ def _gradients(scene: Scene, tokens: SceneTokens, states: TensorDict) -> Tensor:
         return tokens(qpos, states[QVEL] + speed, torque + push, terrain).sum(0)
 
     # each row of the sum depends on its own row of the change only
-    zero = states[QVEL].new_zeros(*states.batch_size, sum(sizes))
+    zero = states[QVEL].new_zeros(len(states), sum(sizes))
     found = jacobian(summed, zero, vectorize=True)
     assert isinstance(found, Tensor)
     return found.transpose(0, 1)

@@ -19,7 +19,11 @@ from torchrl_nerd.evaluation.explain.paper_input import (
 )
 from torchrl_nerd.evaluation.explain.rebuild import Piece, rebuild_errors
 from torchrl_nerd.evaluation.explain.states import draw_states
-from torchrl_nerd.evaluation.explain.timing import StepTime, time_inputs
+from torchrl_nerd.evaluation.explain.timing import (
+    StepTime,
+    check_network,
+    time_inputs,
+)
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.explain import SolverReport
 from torchrl_nerd.settings import expect_at_least
@@ -106,6 +110,8 @@ def explain(
         (7, [])
     """
     expect_at_least(16, rows=rows)
+    if network is not None:
+        check_network(network)
     generator = Generator().manual_seed(seed)
     states = draw_states(scene, rows, generator)
     kinds = feature_kinds(scene, states[:RANKED])
@@ -143,13 +149,14 @@ def _dropped(
             )
             why = "the true step does not depend on it"
             if is_base:
-                why += "; contact distance and normal tell of the ground"
-            proof = f"moved, the step changes by {effect.change:.0e}"
+                why += "; the ground is seen by contact"
+            proof = f"moved: step changes by {effect.change:.0e}"
             found.append(Dropped(what, 0 if is_base else 1, why, proof))
 
     def rebuilt(name: str, width: int, why: str) -> None:
         if name in paper and width:
-            proof = f"rebuilt within {paper[name].error:.0e}"
+            error = paper[name].error
+            proof = f"rebuilt within {error:.0e}" if error else "rebuilt exactly"
             found.append(Dropped(name, width, why, proof))
 
     is_floating = scene.base.is_floating
@@ -167,8 +174,8 @@ def _dropped(
         found.append(Dropped("merged points", merged, why, proof))
     if still:
         proof = f"{solver.points_still} of {solver.points_found} points"
-        why = "no joint moves them: the ground does no work on them, but for friction"
-        found.append(Dropped("still points", still, f"{why} at a turning rim", proof))
+        why = "no joint moves them: only friction at a turning rim is lost"
+        found.append(Dropped("still points", still, why, proof))
     if paper.get(DISTANCES):
         why = "follow from kinematics, normal and distance"
         rebuilt(CLOSEST, 3 * kept, why)

@@ -53,7 +53,7 @@ def _rebuilt(report: SceneReport) -> list[str]:
     )
     if any(piece.lost for piece in report.pieces):
         lines.append(
-            "lost: ignored coordinates, and what points that no joint moves see"
+            "lost: coordinates that the step ignores; what points see that no joint moves"
         )
     return lines
 

@@ -39,6 +39,13 @@ class StepTime:
     ratio: float
 
 
+def check_network(name: str) -> None:
+    """Raise ValueError for a network that is not one of `NETWORKS`."""
+    if name not in NETWORKS:
+        expected = ", ".join(NETWORKS)
+        raise ValueError(f"unknown network '{name}', expected one of {expected}")
+
+
 @torch.no_grad()
 def time_inputs(scene: Scene, states: TensorDict, network: str) -> StepTime:
     """Both inputs through one kind of network, turn by turn so that load hits both.
@@ -51,9 +58,7 @@ def time_inputs(scene: Scene, states: TensorDict, network: str) -> StepTime:
     Raises:
         ValueError: no such network.
     """
-    if network not in NETWORKS:
-        expected = ", ".join(NETWORKS)
-        raise ValueError(f"unknown network '{network}', expected one of {expected}")
+    check_network(network)
     ground = states.get(TERRAIN, None)
     inputs = states[QPOS], states[QVEL], states[JOINT_TORQUE], ground
     runs = []
@@ -69,7 +74,8 @@ def time_inputs(scene: Scene, states: TensorDict, network: str) -> StepTime:
             times[2 * i + 1].append(seconds)
     kept = [t[WARM_UP:] for t in times]
     ratio = median((a + b) / (c + d) for a, b, c, d in zip(*kept, strict=True))
-    return StepTime(len(states), network, *(1e3 * median(t) for t in kept), ratio)
+    compact, step, paper, paper_step = (1e3 * median(t) for t in kept)
+    return StepTime(len(states), network, compact, step, paper, paper_step, ratio)
 
 
 def _timed(call: Callable[[], Tensor]) -> tuple[Tensor, float]:
