@@ -67,7 +67,8 @@ class Kind:
     |---|---|
     | ``name`` | such as ``contact distance`` |
     | ``width`` | numbers in the token |
-    | ``adds`` | directions of state, torque and ground seen by no kind before it |
+    | ``adds`` | directions of state, torque and ground seen by no kind before it, |
+    | | at the state where they are most |
     | ``why`` | in short |
     """
 
@@ -142,7 +143,7 @@ def _gradients(scene: Scene, tokens: SceneTokens, states: TensorDict) -> Tensor:
         return tokens(qpos, states[QVEL] + speed, torque + push, terrain).sum(0)
 
     # each row of the sum depends on its own row of the change only
-    zero = states[QVEL].new_zeros(len(states), sum(sizes))
+    zero = torch.zeros(len(states), sum(sizes), dtype=torch.float64)
     found = jacobian(summed, zero, vectorize=True)
     assert isinstance(found, Tensor)
     return found.transpose(0, 1)

@@ -1,8 +1,11 @@
 """The scene compiler's report: what a network sees of a robot, and why that is enough."""
 
 from dataclasses import dataclass
+from typing import cast
 
 import mujoco
+import torch
+from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.evaluation.explain.dependence import Dependence, dependences
@@ -24,6 +27,7 @@ from torchrl_nerd.evaluation.explain.timing import (
     check_network,
     time_inputs,
 )
+from torchrl_nerd.keys import QPOS, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.explain import SolverReport
 from torchrl_nerd.settings import expect_at_least
@@ -114,7 +118,7 @@ def explain(
         check_network(network)
     generator = Generator().manual_seed(seed)
     states = draw_states(scene, rows, generator)
-    kinds = feature_kinds(scene, states[:RANKED])
+    kinds = feature_kinds(scene, _telling(scene, states))
     pieces, solver = rebuild_errors(scene, states), scene.explain()
     return SceneReport(
         scene=scene.name,
@@ -130,6 +134,15 @@ def explain(
         solver=solver,
         timing=None if network is None else time_inputs(scene, states, network),
     )
+
+
+def _telling(scene: Scene, states: TensorDict) -> TensorDict:
+    """A few of the states, half of them with all points as near the ground as can be."""
+    if scene.terrain is None:
+        return states[:RANKED]
+    gap = scene.clearances(states[QPOS], states.get(TERRAIN, None)).amax(-1)
+    nearest = gap.argsort()[: RANKED // 2]
+    return cast(TensorDict, torch.cat((states[nearest], states[: RANKED // 2])))
 
 
 def _dropped(
