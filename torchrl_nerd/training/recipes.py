@@ -32,4 +32,15 @@ RECIPES: dict[str, Recipe] = {
         ),
         "double_pendulum/passive",
     ),
+    "ant": Recipe(
+        DataConfig(trajectories=20_000, steps=100),
+        TrainConfig(
+            network="mlp-large",
+            steps=26_000,
+            rollout_steps=1_500,
+            single_share=1.0,
+            softening=0.02,
+        ),
+        "ant/run",
+    ),
 }
