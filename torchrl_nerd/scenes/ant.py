@@ -47,10 +47,10 @@ def ant() -> Scene:
         low=(-10.0, -10.0, 1.0),
         high=(10.0, 10.0, 1.3),
         tilt=pi / 2,
-        linear_low=(-1.0,) * 3,
-        linear_high=(1.0,) * 3,
-        angular_low=(-pi,) * 3,
-        angular_high=(pi,) * 3,
+        linear_low=(-1.0, -1.0, -1.0),
+        linear_high=(1.0, 1.0, 1.0),
+        angular_low=(-pi, -pi, -pi),
+        angular_high=(pi, pi, pi),
     )
     return Scene(
         name="ant",

@@ -56,10 +56,10 @@ def anymal() -> Scene:
         low=(-0.2, -0.2, 0.65),
         high=(0.2, 0.2, 1.0),
         tilt=pi / 6,
-        linear_low=(-0.1,) * 3,
-        linear_high=(0.1,) * 3,
-        angular_low=(-0.25,) * 3,
-        angular_high=(0.25,) * 3,
+        linear_low=(-0.1, -0.1, -0.1),
+        linear_high=(0.1, 0.1, 0.1),
+        angular_low=(-0.25, -0.25, -0.25),
+        angular_high=(0.25, 0.25, 0.25),
     )
     return Scene(
         name="anymal",

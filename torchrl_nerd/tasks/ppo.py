@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class PPOSettings:
+class PPOConfig:
     """Proximal policy optimisation: Schulman et al., https://arxiv.org/abs/1707.06347."""
 
     total_frames: int = 3_000_000  # actions to learn from
@@ -24,21 +24,21 @@ class PPOSettings:
     widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic
 
 
-_ANT = PPOSettings(
+_ANT = PPOConfig(
     total_frames=32_800_000,
     num_envs=2048,
     minibatch=16_384,
     lr=3e-4,
     widths=(128, 64, 32),
 )
-_ANYMAL = PPOSettings(
+_ANYMAL = PPOConfig(
     total_frames=65_500_000,
     num_envs=2048,
     minibatch=16_384,
     lr=3e-4,
     widths=(128, 64, 32),
 )
-_FRANKA = PPOSettings(
+_FRANKA = PPOConfig(
     total_frames=26_200_000,
     num_envs=1024,
     horizon=128,
@@ -47,8 +47,8 @@ _FRANKA = PPOSettings(
     lr=3e-4,
 )
 
-PPO_SETTINGS: dict[str, PPOSettings] = {
-    "cartpole/swingup": PPOSettings(),
+PPO_CONFIGS: dict[str, PPOConfig] = {
+    "cartpole/swingup": PPOConfig(),
     "ant/run": _ANT,
     "ant/spin": _ANT,
     "ant/spin_track": _ANT,
