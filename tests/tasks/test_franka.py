@@ -47,7 +47,8 @@ def test_reach_rewards_observations_and_no_end(task_id, generator):
     np.testing.assert_allclose(
         task.reward(before, torch.zeros(64, 7), state), want, rtol=1e-9
     )
-    angle = np.arctan2(np.sin(state["qpos"]), np.cos(state["qpos"]))
+    qpos = state["qpos"].numpy()
+    angle = np.arctan2(np.sin(qpos), np.cos(qpos))
     seen = np.concatenate((angle, place, state["goal"]), -1)
     np.testing.assert_allclose(task.observation(state), seen, atol=1e-9)
     assert not task.terminated(state).any() and task.horizon == 128

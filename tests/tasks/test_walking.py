@@ -7,8 +7,8 @@ from helpers import random_quats, yaw_quat
 from tensordict import TensorDict
 
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
-from torchrl_nerd.scenes.anymal import STANDING_POSE as ANYMAL_POSE
 from torchrl_nerd.scenes.ant import STANDING_POSE as ANT_POSE
+from torchrl_nerd.scenes.anymal import STANDING_POSE as ANYMAL_POSE
 from torchrl_nerd.tasks import make_task
 
 ROWS = 64
