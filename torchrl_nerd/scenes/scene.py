@@ -22,7 +22,12 @@ from torchrl_nerd.scenes.contact_points import (
     ground_geoms,
 )
 from torchrl_nerd.scenes.controllers import Controller
-from torchrl_nerd.scenes.explain import Symmetries, find_symmetries
+from torchrl_nerd.scenes.explain import (
+    SolverReport,
+    Symmetries,
+    base_effects,
+    find_symmetries,
+)
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
 from torchrl_nerd.scenes.terrain import Terrain
 
@@ -112,6 +117,22 @@ class Scene:
     def symmetries(self) -> Symmetries:
         """Coordinates that the dynamics do not depend on."""
         return find_symmetries(self.model, self.substeps)
+
+    def explain(self) -> SolverReport:
+        """Which coordinates and contact points are kept, asked of the true solver.
+
+        `torchrl_nerd.evaluation.explain.explain` adds features, proofs and timing.
+        """
+        base = base_effects(self.model, self.base, self.substeps)
+        stands_for = self.contacts.stands_for
+        still = stands_for.count(-1)
+        return SolverReport(
+            scene=self.name,
+            effects=base + self.symmetries.effects,
+            points_found=len(stands_for),
+            points_merged=len(stands_for) - still - len(self.contacts),
+            points_still=still,
+        )
 
     @cached_property
     def hash(self) -> str:
