@@ -163,6 +163,7 @@ class Eval:
                 self.rows,
                 self.seed,
                 self.device,
+                protocol.random_actions,
             )
             for horizon, by_name in errors.items():
                 for name, error in by_name.items():

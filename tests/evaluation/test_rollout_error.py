@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.rollout_error import (
+    action_drive,
     initial_states,
     open_loop,
     passive_errors,
@@ -204,3 +205,33 @@ def test_open_loop_is_step_after_step(name, rng):
     passive = open_loop(MujocoDynamics(scene), start, STEPS)
     idle = open_loop(MujocoDynamics(scene), start, STEPS, torch.zeros_like(torque))
     assert torch.equal(passive, idle) and not torch.equal(passive, path)
+
+
+@pytest.mark.parametrize("random_actions", [False, True])
+@pytest.mark.parametrize("name", ["cartpole/swingup", "anymal/forward"])
+def test_actions_become_torque_through_the_tasks_controller(name, random_actions, seed):
+    task, steps = make_task(name), 4
+    start = initial_states(task, 3, seed)
+    drive = action_drive(task, 3, steps, seed, random_actions)
+    truth = MujocoDynamics(task.scene, num_threads=1)
+    path = open_loop(truth, start, steps, drive)
+    again = action_drive(task, 3, steps, seed, random_actions)
+    state = start
+    truth.reset(state)
+    for step in range(steps):
+        torque = again(step, state)
+        idle = task.controller(
+            torch.zeros(3, 12)[:, : torque.shape[1]], **state_of(state)
+        )
+        assert torch.equal(torque, idle) != random_actions
+        low, high = (
+            task.controller(sign * torch.ones_like(idle), **state_of(state))
+            for sign in (-1.0, 1.0)
+        )
+        assert ((torque >= low) & (torque <= high)).all()
+        state = truth.step(state.select("qpos", "qvel"), torque)
+        torch.testing.assert_close(path[:, step], state["qpos"], rtol=0, atol=1e-12)
+
+
+def state_of(state):
+    return {key: state[key] for key in ("qpos", "qvel")}
