@@ -60,7 +60,8 @@ def test_the_truth_against_itself_has_no_error(task_id, seed):
     for by_name in summaries.values():
         assert by_name
         for error in by_name.values():
-            assert error.mean == error.interval == error.final == error.p95 == 0.0
+            figures = (error.mean, error.interval, error.final, error.p95)
+            assert max(figures) < 1e-15  # a quaternion against itself: not quite zero
 
 
 def test_fixed_base_by_hand(rng):
@@ -160,12 +161,15 @@ def test_horizons_are_prefixes_of_one_rollout(task_id, seed):
     task = make_task(task_id)
     truth, other = MujocoDynamics(task.scene), MujocoDynamics(heavier(task.scene))
     together = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed)
+    is_moving = task.scene.name != "franka"  # at rest, without gravity
     for horizon, by_name in together.items():
         alone = passive_errors(task, other, truth, [horizon], ROWS, seed)
         assert alone == {horizon: by_name}
-        assert any(error.mean > 0.0 for error in by_name.values())
+        assert any(error.mean > 0.0 for error in by_name.values()) == is_moving
     again = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed)
     assert again == together
+    if not is_moving:
+        return
     unlike = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed + 1)
     assert unlike != together
 
@@ -182,7 +186,7 @@ def test_starts_are_the_tasks_and_of_their_seed(name, seed):
     assert first.batch_size == (50,)
     for key in first.keys():
         assert torch.equal(first[key], second[key])
-    assert not (first["qpos"] == third["qpos"]).any()
+    assert (first["qpos"] != third["qpos"]).any(-1).all()
     generator = torch.Generator().manual_seed(seed)
     u = torch.rand(50, task.num_uniforms, dtype=torch.float64, generator=generator)
     assert torch.equal(first["qpos"], task.initial_state(u)["qpos"])
