@@ -40,7 +40,8 @@ class Data:
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum."""
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
     out: Path | None = None
     """Folder of the data set; datasets/SCENE by default."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
@@ -52,7 +53,7 @@ class Data:
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
         scene = load_scene(self.scene)
-        out = self.out or Path("datasets") / self.scene
+        out = self.out or Path("datasets") / Path(self.scene).stem
         generate(scene, self.config, out, self.quiet)
         card = read_json(out / CARD)
         print(
@@ -89,7 +90,13 @@ class Train:
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the best checkpoint."""
-        scene, recipe = load_scene(self.scene), RECIPES[self.scene]
+        scene = load_scene(self.scene)
+        if self.scene not in RECIPES:
+            raise ValueError(
+                f"expected a scene with a recipe ({', '.join(RECIPES)}), got "
+                f"'{self.scene}': train it with torchrl_nerd.training.trainer.Trainer"
+            )
+        recipe = RECIPES[self.scene]
         out = writable_folder(self.out or Path("runs") / self.scene)
         folder = self.data or Path("datasets") / self.scene
         if not (folder / CARD).exists():

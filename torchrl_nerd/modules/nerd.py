@@ -24,7 +24,7 @@ NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
     "mlp": MLPConfig(),
     "mlp-wide": MLPConfig(depth=4, width=120),
-    "mlp-large": MLPConfig(depth=4, width=256),
+    "mlp-large": MLPConfig(depth=4, width=128),
     "gru": GRUConfig(),
 }
 """Networks by name, for the command line."""

@@ -27,14 +27,29 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 @cache
 def load_scene(name: str) -> Scene:
-    """The registered scene of that name; the same object at every call.
+    """The scene of that name; the same object at every call.
+
+    Args:
+        name: a registered one, ``dm_control/DOMAIN-TASK``, ``gymnasium/ID`` or the path
+            of an MJCF file.
 
     Raises:
-        ValueError: no such scene.
+        ValueError: no such scene, or a robot with something not supported (named).
     """
-    if name not in SCENES:
-        raise ValueError(f"unknown scene '{name}', expected one of {', '.join(SCENES)}")
-    return SCENES[name]()
+    if name in SCENES:
+        return SCENES[name]()
+    origin, _, rest = name.partition("/")
+    domain, _, task = rest.partition("-")
+    if origin == "dm_control" and task:
+        return Scene.from_dm_control(domain, task)
+    if origin == "gymnasium" and rest:
+        return Scene.from_gymnasium(rest)
+    if name.endswith(".xml"):
+        return Scene.from_mjcf(name)
+    raise ValueError(
+        f"unknown scene '{name}', expected one of {', '.join(SCENES)}, "
+        "dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
+    )
 
 
 __all__ = ["SCENES", "Scene", "load_scene"]

@@ -24,6 +24,11 @@ SPHERE, CAPSULE, BOX = (
 )
 
 
+NO_CONTACT = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+)
+
+
 @dataclass(frozen=True)
 class ContactPoints:
     """Contact points after merging.
@@ -83,7 +88,7 @@ def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarr
     bodies: list[int] = []
     positions: list[np.ndarray] = []
     radii: list[float] = []
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+    if not model.opt.disableflags & NO_CONTACT:
         for geom in range(model.ngeom):
             if model.body_weldid[model.geom_bodyid[geom]] and _touches(model, geom):
                 points, radius = _points_of(model, geom)
