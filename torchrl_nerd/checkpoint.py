@@ -42,7 +42,8 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
     """
     scene, config = model.scene, model.config
     kind = next(name for name, cls in KINDS.items() if type(config) is cls)
-    ranges = {k: v for k, v in asdict(scene.sampling).items() if k != "ground"}
+    ranges = asdict(scene.sampling)
+    ranges = {k: v for k, v in ranges.items() if k not in ("ground", "drive")}
     return {
         "format": 1,
         "scene": scene.name,

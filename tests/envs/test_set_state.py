@@ -26,6 +26,8 @@ ROWS, STEPS = 4, 3
 def random_state(env, generator) -> TensorDict:
     """A state of the scene's training ranges, far from the task's resets."""
     state, _, terrain = random_drive(env.scene, ROWS, 1, generator)
+    for key, width in env.task.parameters.items():
+        state[key] = torch.rand(ROWS, width, generator=generator).double()
     if terrain is not None:
         state["terrain"] = terrain
     return state
