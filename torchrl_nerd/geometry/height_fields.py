@@ -44,8 +44,12 @@ def height_field_distance(
     at_row = first_row[..., None] + torch.arange(high + 1, device=points.device)
     near = heights[at_row[..., :, None], at_column[..., None, :]]
     # vertices of the window as seen from the point, each (*batch, P, high + 1, wide + 1)
-    x = (dx * at_column - half_x - points[..., :1])[..., None, :].expand_as(near)
-    y = (dy * at_row - half_y - points[..., 1:2])[..., :, None].expand_as(near)
+    x = (dx * at_column.to(points) - half_x - points[..., :1])[..., None, :].expand_as(
+        near
+    )
+    y = (dy * at_row.to(points) - half_y - points[..., 1:2])[..., :, None].expand_as(
+        near
+    )
     z = near - points[..., 2, None, None]
     closest = _closest((x, y, z), dx, dy)
     rise, upward = _straight_down(points, heights, column, row, half_x, half_y)
@@ -61,11 +65,12 @@ def _window(
 
     The window holds every cell within ``reach``; near the border it is moved inwards.
     """
-    cell = ((along.detach() + half) / step).floor().nan_to_num(0.0)
-    cell = cell.clamp(0, count - 2).long()
-    margin = int(reach / step) + 1
-    width = min(2 * margin + 1, count - 1)
-    return cell, (cell - margin).clamp(0, count - 1 - width), width
+    place = ((along.detach() + half) / step).nan_to_num(0.0)
+    cell = place.floor().clamp(0, count - 2)
+    width = min(int(2.0 * reach / step) + 2, count - 1)
+    first = torch.minimum((place - reach / step).floor(), cell)
+    first = first.clamp(0, count - 1 - width)
+    return cell.long(), first.long(), width
 
 
 def _closest(vertices: Vector, dx: float, dy: float) -> Tensor:
@@ -73,27 +78,33 @@ def _closest(vertices: Vector, dx: float, dy: float) -> Tensor:
 
     ``vertices``: x, y, z ``(*batch, P, R, C)``, m, relative to the point.
     """
-    origin, right, up, across = (
-        tuple(part[..., rows, columns] for part in vertices)
-        for rows in (slice(None, -1), slice(1, None))
-        for columns in (slice(None, -1), slice(1, None))
-    )
-    along_x = tuple(part[..., :-1] for part in vertices)
-    along_y = tuple(part[..., :-1, :] for part in vertices)
-    end_x = tuple(part[..., 1:] for part in vertices)
-    end_y = tuple(part[..., 1:, :] for part in vertices)
+    first, last, whole = slice(None, -1), slice(1, None), slice(None)
+    origin, z = _cut(vertices, first, first), vertices[2]
+    right, up, across = z[..., :-1, 1:], z[..., 1:, :-1], z[..., 1:, 1:]
     candidates = [
-        _on_segment(along_x, end_x[2] - along_x[2], dx, 0.0),
-        _on_segment(along_y, end_y[2] - along_y[2], 0.0, dy),
-        _on_segment(origin, across[2] - origin[2], dx, dy),
-        # z(u, v) = z0 + slope_x u + slope_y v over either triangle
-        _on_face(origin, right[2] - origin[2], across[2] - right[2], dx, dy, below=True),
-        _on_face(origin, across[2] - up[2], up[2] - origin[2], dx, dy, below=False),
+        _on_segment(_cut(vertices, whole, first), z.diff(dim=-1), dx, 0.0),
+        _on_segment(_cut(vertices, first, whole), z.diff(dim=-2), 0.0, dy),
+        _on_segment(origin, across - origin[2], dx, dy),
+        # z(u, v) = z0 + rise_x u + rise_y v over either triangle
+        _on_face(origin, right - origin[2], across - right, dx, dy, below=True),
+        _on_face(origin, across - up, up - origin[2], dx, dy, below=False),
     ]
-    offset = torch.cat([torch.stack(c, -1).flatten(-3, -2) for c in candidates], -2)
+    offset = torch.stack([_shortest(candidate) for candidate in candidates], -2)
     best = (offset.detach() ** 2).sum(-1).argmin(-1)
     index = best[..., None, None].expand(*best.shape, 1, 3)
     return offset.gather(-2, index)[..., 0, :]
+
+
+def _cut(vertices: Vector, rows: slice, columns: slice) -> Vector:
+    x, y, z = (part[..., rows, columns] for part in vertices)
+    return x, y, z
+
+
+def _shortest(vectors: Vector) -> Tensor:
+    """The shortest of each point's vectors, ``(*batch, P, R, C) -> (*batch, P, 3)``."""
+    x, y, z = (part.flatten(-2) for part in vectors)
+    best = (x * x + y * y + z * z).detach().argmin(-1, keepdim=True)
+    return torch.cat([part.gather(-1, best) for part in (x, y, z)], -1)
 
 
 def _on_segment(start: Vector, rise: Tensor, dx: float, dy: float) -> Vector:
@@ -121,7 +132,8 @@ def _on_face(
     low, high = (v, u) if below else (u, v)
     is_on = (low >= 0.0) & (low <= high) & (high <= 1.0)
     far = torch.full_like(z, torch.inf)
-    return tuple(torch.where(is_on, part, far) for part in (foot_x, foot_y, -share))
+    x, y, z = (torch.where(is_on, part, far) for part in (foot_x, foot_y, -share))
+    return x, y, z
 
 
 def _straight_down(

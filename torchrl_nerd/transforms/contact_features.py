@@ -4,10 +4,11 @@ NeRD section 3.2 feeds closest point p1, normal n and distance d of every contac
 zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out; where
 all there is is one plane that all rows share and that is level, or that a fixed base
 cannot turn against, n follows from gravity and pose and is left out too. Of several
-surfaces each point sees the nearest, so that a model fits any number of them. Added is what decides an
-impact: the point's velocity, and how deep it will be if it goes on: whether a point
-touches within the step is a threshold, which a network learns slowly from distance and
-speed. All of it fades to zero at the margin without a jump.
+surfaces each point sees the nearest, so that a model fits any number of them.
+
+Added is what decides an impact: the point's velocity, and how deep it will be if it goes
+on: whether a point touches within the step is a threshold, which a network learns slowly
+from distance and speed. All of it fades to zero at the margin without a jump.
 """
 
 import numpy as np
