@@ -78,7 +78,7 @@ def _closest(vertices: Vector, dx: float, dy: float) -> Tensor:
 
     ``vertices``: x, y, z ``(*batch, P, R, C)``, m, relative to the point.
     """
-    first, last, whole = slice(None, -1), slice(1, None), slice(None)
+    first, whole = slice(None, -1), slice(None)
     origin, z = _cut(vertices, first, first), vertices[2]
     right, up, across = z[..., :-1, 1:], z[..., 1:, :-1], z[..., 1:, 1:]
     candidates = [

@@ -24,7 +24,7 @@ from torchrl_nerd.scenes.contact_points import (
 from torchrl_nerd.scenes.controllers import Controller
 from torchrl_nerd.scenes.explain import Symmetries, find_symmetries
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
-from torchrl_nerd.scenes.terrain import Terrain
+from torchrl_nerd.scenes.terrain import PLANE, Terrain
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
 _HASHED_FIELDS = (
@@ -36,6 +36,11 @@ _HASHED_FIELDS = (
     *("geom_conaffinity", "geom_condim", "geom_margin", "geom_gap", "geom_solmix"),
     *("geom_priority", "jnt_margin", "actuator_trnid", "actuator_gear", "qpos0"),
 )
+_HASHED_GROUND = (
+    *("geom_bodyid", "body_mocapid", "geom_dataid", "hfield_size", "hfield_nrow"),
+    *("hfield_ncol", "hfield_adr", "hfield_data"),
+)
+"""Of a ground that is more than one plane; those keep the hashes they always had."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,15 +129,38 @@ class Scene:
     @cached_property
     def hash(self) -> str:
         """Fingerprint of the physics: equal for equal robots, steps and grounds."""
-        digest = hashlib.sha256()
+        fields = _HASHED_FIELDS
+        grounds = ground_geoms(self.model)
+        if any(self.model.geom_type[grounds] != PLANE) or len(grounds) > 1:
+            fields += _HASHED_GROUND
+        return _fingerprint(
+            *(getattr(self.model, field) for field in fields), self._stepping
+        )
+
+    @cached_property
+    def robot_hash(self) -> str:
+        """Fingerprint of the robot and its steps alone: equal over any ground."""
+        model = self.model
+        moves = model.body_dofnum[model.body_weldid] > 0
+        chosen = {"body": moves, "geom": moves[model.geom_bodyid]}
+        parts = []
         for field in _HASHED_FIELDS:
-            digest.update(np.ascontiguousarray(getattr(self.model, field)).tobytes())
+            value = np.asarray(getattr(model, field))
+            value = value[chosen.get(field.split("_")[0], ...)]
+            if field == "body_parentid":  # counted within the robot, from 1
+                value = np.cumsum(moves)[value] * moves[value]
+            parts.append(value)
+        mount = () if self.base.is_floating else self.mount
+        return _fingerprint(*parts, self._stepping, *mount)
+
+    @property
+    def _stepping(self) -> np.ndarray:
+        """Numbers of the whole world that change a step."""
         option = self.model.opt
         numbers = [option.timestep, self.substeps, *option.gravity, option.impratio]
         numbers += [option.density, option.viscosity, *option.wind]
         numbers += [int(option.integrator), int(option.disableflags), int(option.cone)]
-        digest.update(np.array(numbers, float).tobytes())
-        return digest.hexdigest()[:16]
+        return np.array(numbers, float)
 
     def sample_initial(
         self, rows: int, generator: Generator
@@ -202,3 +230,10 @@ class Scene:
         """Kinematics of the contact points."""
         points = self.contacts
         return PointKinematics(self.model, self.base, points.bodies, points.positions)
+
+
+def _fingerprint(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
