@@ -146,7 +146,8 @@ class Terrain:
             given = terrain[..., part]
             poses[mocap] = given if plane is None else _plane_pose(given, plane)
         positions = [pose[..., :3] for pose in poses]
-        return torch.cat((*positions, *(pose[..., 3:] for pose in poses)), -1)
+        quats = [pose[..., 3:] for pose in poses]
+        return torch.cat((terrain[..., :0], *positions, *quats), -1)
 
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
         """Raise ValueError where a row's parameters are of another shape or not finite.
