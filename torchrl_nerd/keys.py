@@ -15,8 +15,9 @@ QVEL = "qvel"
 
 TERRAIN = "terrain"
 """Ground parameters of each row ``(*batch, scene.terrain.size)``, world frame, float64.
-A plane is (unit normal, offset) with ``normal . x = offset``. Only where the ground
-varies from row to row."""
+A plane is (unit normal, offset) with ``normal . x = offset``; other movable ground is its
+body's position (m) and quaternion, see `Terrain`. Only where the ground varies from row
+to row."""
 
 ACTION = "action"
 """What the policy chose ``(*batch, num_actions)``, float32, in [-1, 1]."""
