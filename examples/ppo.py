@@ -1,7 +1,8 @@
-"""Swing up a cart-pole in learned dynamics, then measure the policy in true physics.
+"""Learn a task in learned dynamics, then measure the policy in true physics.
 
-    python examples/ppo.py                       # learn in NeRD
+    python examples/ppo.py                       # swing up a cart-pole in NeRD
     python examples/ppo.py --dynamics mujoco     # the same in MuJoCo: nothing else changes
+    python examples/ppo.py --task ant/run        # any task; its settings: tasks/ppo.py
 
 True physics is measured, never learned from. Policy and figures are written to `--out`.
 """
@@ -39,35 +40,32 @@ from torchrl_nerd.evaluation.policy_transfer import (
 )
 from torchrl_nerd.files import write_json
 from torchrl_nerd.tasks import make_task
+from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 
 
 @dataclass(frozen=True)
-class PPOConfig:
-    """Proximal policy optimisation: Schulman et al., https://arxiv.org/abs/1707.06347."""
+class Run(PPOConfig):
+    """What to learn, where, and with which settings."""
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # where: nerd, mujoco, dm_control, a checkpoint folder
     seed: int = 0  # of weights, exploration and starts
-    total_frames: int = 3_000_000  # control steps to learn from
-    num_envs: int = 1024  # rows stepped together
-    horizon: int = 32  # steps of every row between two updates
-    epochs: int = 5  # passes over those steps
-    minibatch: int = 2048  # steps per gradient
-    lr: float = 3e-3  # Adam's step size at the start; falls linearly to zero
-    gamma: float = 0.99  # discount per step
-    lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
-    clip: float = 0.2  # how far an action's probability ratio counts
-    widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic
     evaluate_every: int = 20  # updates between two points of the learning curve
     episodes: int = 2048  # of the final evaluation
     out: Path = Path("runs/ppo")  # folder for policy, numbers and figures
 
 
-def make_policy_and_critic(
-    env: EnvBase, cfg: PPOConfig
-) -> tuple[Policy, ValueOperator]:
+def parse() -> Run:
+    """Settings from the command line; the task chooses the defaults of all others."""
+    task = tyro.cli(Run).task
+    return tyro.cli(
+        Run, default=Run(**vars(PPO_CONFIGS.get(task, PPOConfig())), task=task)
+    )
+
+
+def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperator]:
     """Both see observations standardised by what random actions meet."""
     seen = env.rollout(cfg.horizon, break_when_any_done=False)["observation"]
     size, num_actions = seen.shape[-1], env.action_spec.shape[-1]
@@ -82,7 +80,7 @@ def update(
     advantage: GAE,
     loss: ClipPPOLoss,
     optimizer: Adam,
-    cfg: PPOConfig,
+    cfg: Run,
 ) -> None:
     """Several passes over a batch ``[num_envs, horizon]``."""
     batch["next", "reward"] *= 1 - cfg.gamma  # values become means of rewards, not sums
@@ -97,7 +95,7 @@ def update(
             optimizer.step()
 
 
-def train(cfg: PPOConfig) -> tuple[Policy, list[dict[str, float]]]:
+def train(cfg: Run) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
     env = make_env(
         cfg.task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed
@@ -133,7 +131,7 @@ def train(cfg: PPOConfig) -> tuple[Policy, list[dict[str, float]]]:
     return policy, curve
 
 
-def main(cfg: PPOConfig) -> None:
+def main(cfg: Run) -> None:
     """Learn in one dynamics, measure in all of them, write down what came out."""
     torch.manual_seed(cfg.seed)
     policy, curve = train(cfg)
@@ -146,8 +144,8 @@ def main(cfg: PPOConfig) -> None:
     print(transfer_table(returns))
     write_json(cfg.out / "returns.json", {k: asdict(v) for k, v in returns.items()})
     episodes = hardest_episode(cfg.task, actor, everywhere[:3], seed)
-    plot_states(episodes, make_task(cfg.task).scene, cfg.out / "swing_up.png")
+    plot_states(episodes, make_task(cfg.task).scene, cfg.out / "episode.png")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(PPOConfig))
+    main(parse())

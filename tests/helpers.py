@@ -130,6 +130,11 @@ def moved_scene(scene: Scene, yaw: float, shift: Tensor) -> Scene:
         if model.body_parentid[body] == 0 and model.body_mocapid[body] < 0
     ]
     model.geom_sameframe[model.geom_bodyid == 0] = 0  # or MuJoCo skips the new pose
+    if scene.base.is_floating:  # its place at rest, or it would lie deep in the ground
+        q = scene.base.qpos_address
+        fixed.append(
+            (model.qpos0[None, q : q + 3], model.qpos0[None, q + 3 : q + 7], 0)
+        )
     for positions, quats, index in fixed:
         position = torch.from_numpy(positions[index].copy())
         positions[index] = (rotate(turn, position) + shift).numpy()

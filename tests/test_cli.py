@@ -51,7 +51,7 @@ def test_help_names_every_command(argv, capsys):
     assert all(f"  {name}" in text for name in COMMANDS)
 
 
-@pytest.mark.parametrize("command", ["data", "train", "eval"])
+@pytest.mark.parametrize("command", ["data", "train", "eval", "explain"])
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
@@ -76,7 +76,7 @@ def test_an_unknown_command_is_refused(capsys):
     assert "'fly'" in text and "data, train, eval" in text
 
 
-@pytest.mark.parametrize("command", ["data", "train", "eval"])
+@pytest.mark.parametrize("command", ["data", "train", "eval", "explain"])
 def test_an_unknown_scene_is_refused(command, capsys):
     text = refusal(capsys, command, "unicorn")
     assert "'unicorn'" in text and all(name in text for name in SCENES)
@@ -93,6 +93,8 @@ def test_an_unknown_scene_is_refused(command, capsys):
         ("train cartpole --save-every 0", "save_every of at least 1"),
         ("train cartpole --threads -1", "threads"),
         ("train cartpole --device nowhere", "nowhere"),
+        ("explain cartpole --rows 3", "rows of at least 16, got 3"),
+        ("explain cartpole --rows 32 --network huge", "unknown network 'huge'"),
         ("eval cartpole --rows 1", "at least 2 rows, got 1"),
         ("eval cartpole --rows -3", "at least 2 rows, got -3"),
         ("eval cartpole --device nowhere", "nowhere"),
@@ -175,6 +177,16 @@ def test_from_data_to_figures(scene, tmp_path, seed, capsys):
         key = (row["case"], row["steps"], row["quantity"])
         assert row["paper"] == protocol.published.get(key)
         assert row["case"] in line and row["quantity"] in line
+
+
+def test_a_scene_is_explained(scene, tmp_path, seed, capsys):
+    path = tmp_path / "figures.json"
+    argv = ["explain", scene.name, "--rows", "300", "--seed", str(seed), "--no-timing"]
+    assert main([*argv, "--json", str(path)]) == 0
+    text, content = capsys.readouterr().out, read(path)
+    assert text.startswith(f"{scene.name}: {content['size']} numbers a step")
+    assert content["unused"] == [] and content["timing"] is None
+    assert all(kind["name"] in text for kind in content["kinds"])
 
 
 def test_the_shipped_cartpole_is_as_good_as_the_paper(tmp_path):

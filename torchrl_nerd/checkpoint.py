@@ -20,7 +20,7 @@ from torchrl_nerd.files import read_json, writable_folder, write_atomically, wri
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.scenes import Scene, load_scene
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -137,9 +137,12 @@ def shipped_models() -> list[str]:
 
 def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
     name = card.get("scene")
-    if not isinstance(name, str) or name not in SCENES:
+    if not isinstance(name, str):
         raise ValueError(f"the card in {folder} names an unknown scene: {name!r}")
-    return load_scene(str(name))
+    try:
+        return load_scene(name)
+    except ValueError as error:
+        raise ValueError(f"the scene of the card in {folder}: {error}") from None
 
 
 def _network_config(card: dict[str, Any], folder: Path) -> NetworkConfig:

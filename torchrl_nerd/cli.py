@@ -1,4 +1,4 @@
-"""The ``nerd`` command: data, train, eval, transfer."""
+"""The ``nerd`` command: data, train, eval, transfer, explain."""
 
 import io
 import sys
@@ -15,6 +15,8 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.explain.report import explain
+from torchrl_nerd.evaluation.explain.table import report_table
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
@@ -39,7 +41,8 @@ class Data:
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum."""
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
     out: Path | None = None
     """Folder of the data set; datasets/SCENE by default."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
@@ -51,7 +54,7 @@ class Data:
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
         scene = load_scene(self.scene)
-        out = self.out or Path("datasets") / self.scene
+        out = self.out or Path("datasets") / Path(self.scene).stem
         generate(scene, self.config, out, self.quiet)
         card = read_json(out / CARD)
         print(
@@ -88,7 +91,13 @@ class Train:
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the best checkpoint."""
-        scene, recipe = load_scene(self.scene), RECIPES[self.scene]
+        scene = load_scene(self.scene)
+        if self.scene not in RECIPES:
+            raise ValueError(
+                f"expected a scene with a recipe ({', '.join(RECIPES)}), got "
+                f"'{self.scene}': train it with torchrl_nerd.training.trainer.Trainer"
+            )
+        recipe = RECIPES[self.scene]
         out = writable_folder(self.out or Path("runs") / self.scene)
         folder = self.data or Path("datasets") / self.scene
         if not (folder / CARD).exists():
@@ -160,6 +169,7 @@ class Eval:
                 self.rows,
                 self.seed,
                 self.device,
+                protocol.random_actions,
             )
             for horizon, by_name in errors.items():
                 for name, error in by_name.items():
@@ -206,7 +216,42 @@ class Transfer:
         return {"task": self.task, "seed": self.seed, "returns": figures}
 
 
-COMMANDS = {"data": Data, "train": Train, "eval": Eval, "transfer": Transfer}
+@dataclass(frozen=True)
+class Explain:
+    """What a network sees of a scene, what is left out, and proofs that it may be.
+
+    Example: nerd explain double_pendulum --json results/explain.json
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum."""
+    rows: int = 1024
+    """Random states to ask the true solver about, and rows of the timing."""
+    seed: int = 0
+    """Of these states."""
+    network: str = "tiny"
+    """What to time the compact input and the paper's with."""
+    timing: bool = True
+    """Time them."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print the report and return its figures."""
+        scene = load_scene(self.scene)
+        network = self.network if self.timing else None
+        report = explain(scene, self.rows, self.seed, network)
+        print(report_table(report))
+        return asdict(report) | {"unused": report.unused, "derived": report.derived}
+
+
+COMMANDS = {
+    "data": Data,
+    "train": Train,
+    "eval": Eval,
+    "transfer": Transfer,
+    "explain": Explain,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -19,6 +19,10 @@ A plane is (unit normal, offset) with ``normal . x = offset``; other movable gro
 body's position (m) and quaternion, see `Terrain`. Only where the ground varies from row
 to row."""
 
+GOAL = "goal"
+"""Where the hand should go ``(*batch, 3)``, m, world frame, float64; a task's row
+parameter, drawn at each reset."""
+
 ACTION = "action"
 """What the policy chose ``(*batch, num_actions)``, float32, in [-1, 1]."""
 

@@ -96,6 +96,8 @@ def test_a_trajectory_in_one_call_is_its_steps(scene, generator):
 
 
 def test_a_row_that_breaks_on_the_way_is_sound_until_then(scene, generator):
+    if not scene.actuated:
+        return  # no torque to break it with
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
     torques = torques.transpose(0, 1).clone()
     clean = MujocoDynamics(scene).rollout(start, torques, terrain)

@@ -45,8 +45,12 @@ def test_a_path_is_encode_network_decode(scene, inference, network, generator):
             parts = [tokens[:, max(0, t - window + 1) : t + 1] for t in range(STEPS)]
             outputs = torch.stack([model.network(part)[:, -1] for part in parts], 1)
         qpos, qvel = model.decode(before["qpos"], before["qvel"], outputs)
-    torch.testing.assert_close(after["qpos"], qpos, atol=1e-10, rtol=1e-10)
-    torch.testing.assert_close(after["qvel"], qvel, atol=1e-10, rtol=1e-10)
+    # what has learned nothing may fly off, where rounding turns it by whole turns
+    is_calm = torch.cat((before["qvel"], qvel), -1).abs().amax(-1) < 1e3
+    assert is_calm.any()
+    close = {"atol": 1e-10, "rtol": 1e-10}
+    torch.testing.assert_close(after["qpos"][is_calm], qpos[is_calm], **close)
+    torch.testing.assert_close(after["qvel"][is_calm], qvel[is_calm], **close)
 
 
 @each_inference
@@ -64,6 +68,9 @@ def test_history_matters_and_a_reset_empties_it(scene, inference, generator):
 @each_inference
 def test_gradients_are_those_of_finite_differences(scene, inference, generator):
     model = double_model(scene, generator)
+    with torch.no_grad():  # small steps, or rotations by many turns blow rounding up
+        for weight in model.network.head.parameters():
+            weight *= 0.1
     start, torques, terrain = random_drive(scene, ROWS, 4, generator)
     torques = 0.1 * torques
     weight = torch.randn(ROWS, scene.model.nv, generator=generator).double()
@@ -81,7 +88,7 @@ def test_gradients_are_those_of_finite_differences(scene, inference, generator):
             (objective(k * h) - objective(-k * h)) / (2.0 * k * h) for k in (1, 2)
         ]
     slope = (4.0 * slopes[0] - slopes[1]) / 3.0
-    assert gradient != 0.0
+    assert bool(gradient != 0.0) == bool(scene.actuated)
     torch.testing.assert_close(gradient, slope, atol=1e-6, rtol=1e-5)
 
 

@@ -1,10 +1,11 @@
-"""Torques follow actions: proportional, clipped, one per actuated dof."""
+"""Torques follow actions: proportional, clipped, one per actuated dof; or springs."""
 
+import pytest
 import torch
 from helpers import random_transitions
 
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes.controllers import TorqueController
+from torchrl_nerd.scenes.controllers import PDController, TorqueController
 
 
 def random_actions(scene, rows, generator, low=-1.0, high=1.0):
@@ -23,7 +24,7 @@ def test_a_scenes_torques_fit_its_actuators(scene, generator):
     assert torque.shape == (50, len(scene.actuated)) and torque.dtype == torch.float64
     largest = torch.tensor(scene.sampling.torque, dtype=torch.float64)
     assert (torque.abs() <= largest).all()
-    if not isinstance(scene.controller, TorqueController):
+    if not isinstance(scene.controller, TorqueController) or not torque.shape[1]:
         return
     unit = torch.eye(scene.controller.num_actions)
     pushed = torques(scene, unit, generator) - torques(scene, 0.0 * unit, generator)
@@ -49,3 +50,37 @@ def test_leading_dimensions_are_kept(scene, generator):
     flat = scene.controller(action, state[QPOS], state[QVEL])
     batch = (x.reshape(3, 4, -1) for x in (action, state[QPOS], state[QVEL]))
     assert torch.equal(scene.controller(*batch).reshape(flat.shape), flat)
+
+
+def springs(rng, **changes):
+    """Springs on three of nine coordinates, and their numbers."""
+    joints = tuple(rng.permutation(9)[:3].tolist())
+    kp, kd, scale = (tuple(rng.uniform(0.5, 2.0, 3)) for _ in range(3))
+    numbers = {"kp": kp, "kd": kd, "scale": scale, **changes}
+    return PDController(joints, tuple(j - 1 for j in joints), **numbers), numbers
+
+
+@pytest.mark.parametrize("relative_to", ["absolute", "default", "current"])
+def test_springs_pull_to_the_target_and_no_harder_than_their_limit(relative_to, rng):
+    default, limit = tuple(rng.normal(size=3)), tuple(rng.uniform(0.5, 1.5, 3))
+    choice = {"relative_to": relative_to, "default": default}
+    controller, n = springs(rng, **choice)
+    action, qpos, qvel = 2.0 * rng.normal(size=(50, 3)), *rng.normal(size=(2, 50, 10))
+    q = qpos[:, controller.qpos_addresses]
+    origin = {"absolute": 0.0, "default": default, "current": q}[relative_to]
+    target = origin + n["scale"] * action.clip(-1.0, 1.0)
+    want = n["kp"] * (target - q) - n["kd"] * qvel[:, controller.dof_addresses]
+    given = tuple(map(torch.from_numpy, (action, qpos, qvel)))
+    torch.testing.assert_close(controller(*given), torch.from_numpy(want))
+    limited, _ = springs(rng, **choice, limit=limit)
+    torque = limited(*given).abs()
+    largest = torch.tensor(limit, dtype=torch.float64)
+    assert (torque <= largest).all() and (torque == largest).any()
+
+
+def test_springs_of_unequal_lengths_or_without_a_pose_are_refused(rng):
+    for name in ("kp", "kd", "scale", "limit", "default"):
+        with pytest.raises(ValueError, match=f"3 numbers as {name}, got 2"):
+            springs(rng, **{name: (1.0, 2.0)})
+    with pytest.raises(ValueError, match="expected a default pose"):
+        springs(rng, relative_to="default")

@@ -1,9 +1,12 @@
 """Dropped coordinates do not matter to MuJoCo, and kept ones do."""
 
+import copy
+
 import mujoco
 import pytest
 import torch
 from helpers import (
+    HANDMADE,
     every_scene,
     make_scene,
     random_states,
@@ -15,6 +18,7 @@ from tensordict import TensorDict
 from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes.explain import base_effects
 from torchrl_nerd.transforms import StateDelta
 
 ROWS = 100
@@ -107,6 +111,35 @@ def test_symmetries_follow_from_the_physics(
         velocity,
     )
     assert 1 not in symmetries.velocities
+
+
+@every_scene
+def test_the_report_names_what_is_ignored(scene):
+    report = scene.explain()
+    scalar = [e for e in report.effects if not e.name.startswith("base ")]
+    assert len(scalar) == 2 * len(scalar_joints(scene))
+    for key, found in (
+        (QPOS, scene.symmetries.positions),
+        (QVEL, scene.symmetries.velocities),
+    ):
+        assert {e.address for e in scalar if e.key == key and e.is_ignored} == found
+    assert all(effect.name in str(report) for effect in report.effects)
+    assert report.points_kept == len(scene.contacts)
+
+
+@every_scene
+def test_where_a_floating_base_stands_and_faces_is_ignored(scene):
+    base = [e for e in scene.explain().effects if e.name.startswith("base ")]
+    assert len(base) == 4 * scene.base.is_floating
+    assert all(effect.is_ignored for effect in base)
+
+
+def test_heading_matters_where_gravity_leans(rng):
+    floater = HANDMADE["floater"]
+    model = copy.copy(floater.model)
+    model.opt.gravity[:2] = rng.uniform(1.0, 2.0, 2)
+    ignored = {e.name for e in base_effects(model, floater.base, 2) if e.is_ignored}
+    assert ignored == {"base x", "base y", "base z"}
 
 
 def test_looking_for_symmetries_leaves_the_model_alone(scene, rng):

@@ -182,14 +182,17 @@ def test_an_unknown_scene_is_named_with_those_that_exist():
 @pytest.mark.parametrize(
     ("extra", "named"),
     [
-        ('<tendon><fixed><joint joint="a" coef="1"/></fixed></tendon>', "tendon"),
-        ('<equality><joint joint1="a"/></equality>', "equality constraint"),
+        (
+            '<tendon><fixed stiffness="1"><joint joint="a" coef="1"/></fixed></tendon>',
+            "a tendon with a limit, spring",
+        ),
+        ('<equality><joint joint1="a"/></equality>', "an equality constraint"),
     ],
 )
 def test_what_no_feature_describes_is_refused_by_name(extra, named):
     body = '<body><joint name="a"/><geom size="1"/></body>'
     xml = f"<mujoco><worldbody>{body}</worldbody>{extra}</mujoco>"
-    with pytest.raises(ValueError, match=f"'handmade' has a {named}"):
+    with pytest.raises(ValueError, match=f"'handmade' has {named}"):
         make_scene(xml)
     with pytest.raises(ValueError, match="at least 1 substep, got 0"):
         replace(load_scene("cartpole"), substeps=0)

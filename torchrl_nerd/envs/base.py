@@ -21,7 +21,8 @@ class SceneEnv(EnvBase):
 
     Per row: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
-    the control step that led here (zero after a reset). A row whose action, state or next
+    the control step that led here (zero after a reset); where a task holds an action over
+    several control steps, over the last of them. A row whose action, state or next
     state is not finite keeps its last state and ends as ``terminated``; no other row
     notices. Random numbers are each row's own, so a row's episodes do not depend on how
     many rows there are. ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel``

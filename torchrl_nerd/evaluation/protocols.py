@@ -3,24 +3,33 @@
 from dataclasses import dataclass
 
 from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks.ant import AntRun
+from torchrl_nerd.tasks.anymal import AnymalForward
 from torchrl_nerd.tasks.cartpole import CartpoleSwingup
+from torchrl_nerd.tasks.cube import CubeToss, RealCubeToss
 from torchrl_nerd.tasks.double_pendulum import GROUNDS, DoublePendulumPassive
+from torchrl_nerd.tasks.franka import FrankaGravityReachTorque, FrankaReachTorque
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Passive open-loop rollouts of one scene.
+    """Open-loop rollouts of one scene.
+
+    The action is zero, and the task's controller makes torque of it: none where it is a
+    torque (passive motion), springs to the standing pose for ANYmal.
 
     | field | meaning |
     |---|---|
     | ``cases`` | name -> task whose reset distribution gives the starts |
     | ``horizons`` | control steps over which errors are averaged |
     | ``published`` | (case, horizon, quantity) -> the paper's mean error, m or rad |
+    | ``random_actions`` | uniform in [-1, 1] at every step in place of zero |
     """
 
     cases: dict[str, Task]
     horizons: tuple[int, ...]
     published: dict[tuple[str, int, str], float]
+    random_actions: bool = False
 
 
 def cartpole() -> Protocol:
@@ -51,4 +60,52 @@ def double_pendulum() -> Protocol:
     return Protocol(cases, (100,), published)
 
 
-PROTOCOLS = {"cartpole": cartpole, "double_pendulum": double_pendulum}
+def ant() -> Protocol:
+    """Paper, Fig. 3."""
+    published = {
+        ("passive", 500, "base_position"): 0.057,
+        ("passive", 500, "base_orientation"): 0.095,
+        ("passive", 500, "joints"): 0.077,
+    }
+    return Protocol({"passive": AntRun()}, (100, 500), published)
+
+
+def franka() -> Protocol:
+    """An episode of random torques within the effort limits; no published figures.
+
+    Passive, the arm would stay where it is: it starts at rest and knows no gravity.
+    """
+    return Protocol({"random": FrankaReachTorque()}, (128,), {}, random_actions=True)
+
+
+def franka_gravity() -> Protocol:
+    """As `franka`."""
+    task = FrankaGravityReachTorque()
+    return Protocol({"random": task}, (128,), {}, random_actions=True)
+
+
+def anymal() -> Protocol:
+    """Springs to the standing pose for an episode; no published figures."""
+    return Protocol({"standing": AnymalForward()}, (100, 1000), {})
+
+
+def cube() -> Protocol:
+    """Tosses of 80 steps as in the paper's appendix C.4, whose figures are of real ones."""
+    return Protocol({"toss": CubeToss()}, (80,), {})
+
+
+def cube_real() -> Protocol:
+    """As `cube`."""
+    return Protocol({"toss": RealCubeToss()}, (80,), {})
+
+
+PROTOCOLS = {
+    "cartpole": cartpole,
+    "double_pendulum": double_pendulum,
+    "ant": ant,
+    "franka": franka,
+    "franka_gravity": franka_gravity,
+    "anymal": anymal,
+    "cube": cube,
+    "cube_real": cube_real,
+}

@@ -1,22 +1,26 @@
 """Open-loop error: learned against true dynamics from the same start, never corrected.
 
 Protocol of the paper's Fig. 3 and appendix C.2: starts from the task's reset
-distribution, the same torques in both (none: passive), errors of every step averaged over
+distribution, the same actions in both (none: passive), errors of every step averaged over
 time and trajectories.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.geometry.frames import orientation_error, wrap_angle
-from torchrl_nerd.keys import QPOS, TERRAIN
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
+
+Drive = Callable[[int, TensorDictBase], Tensor]
+"""``(step, state [rows]) -> joint torque (rows, num_actuated)``."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +50,31 @@ def initial_states(task: Task, rows: int, seed: int) -> TensorDict:
     return TensorDict(task.initial_state(u), batch_size=[rows])
 
 
+def action_drive(
+    task: Task, rows: int, steps: int, seed: int, random_actions: bool = False
+) -> Drive:
+    """The task's controller on actions that do not look at the state.
+
+    Actions are zero, or uniform in [-1, 1] at every step. The controller sees the state
+    that the dynamics it drives has led to.
+    """
+    generator = Generator().manual_seed(seed)
+    shape = (steps, rows, task.controller.num_actions)
+    draw = torch.rand(shape, dtype=torch.float64, generator=generator)
+    actions = 2.0 * draw - 1.0 if random_actions else torch.zeros_like(draw)
+
+    def drive(step: int, state: TensorDictBase) -> Tensor:
+        qpos, qvel = state[QPOS], state[QVEL]
+        return task.controller(actions[step].to(qpos.device), qpos, qvel)
+
+    return drive
+
+
 def open_loop(
     dynamics: Dynamics,
     start: TensorDict,
     steps: int,
-    joint_torque: Tensor | None = None,
+    joint_torque: Tensor | Drive | None = None,
 ) -> Tensor:
     """Positions after each step, ``(rows, steps, nq)``.
 
@@ -58,15 +82,19 @@ def open_loop(
         dynamics: learned or true.
         start: ``qpos``, ``qvel`` and, where the ground varies, ``terrain``.
         steps: how many.
-        joint_torque: ``(rows, steps, num_actuated)``; None for none (passive motion).
+        joint_torque: ``(rows, steps, num_actuated)``, or a function of step and state;
+            None for none (passive motion).
     """
     rows, terrain = start.batch_size[0], start.get(TERRAIN, None)
-    state = start.select(QPOS, "qvel")
+    state: TensorDictBase = start.select(QPOS, QVEL)
     idle = state.get(QPOS).new_zeros(rows, len(dynamics.scene.actuated))
     dynamics.reset(state)
     positions = []
     for step in range(steps):
-        torque = idle if joint_torque is None else joint_torque[:, step]
+        if callable(joint_torque):
+            torque = joint_torque(step, state)
+        else:
+            torque = idle if joint_torque is None else joint_torque[:, step]
         state = dynamics.step(state, torque, terrain)
         positions.append(state[QPOS])
     return torch.stack(positions, 1)
@@ -138,12 +166,18 @@ def passive_errors(
     rows: int,
     seed: int,
     device: torch.device | str = "cpu",
+    random_actions: bool = False,
 ) -> dict[int, dict[str, ErrorSummary]]:
-    """Passive open-loop errors at every horizon, from one rollout of the longest."""
+    """Open-loop errors at every horizon, from one rollout of the longest.
+
+    Passive where the task's controller makes no torque of a zero action; see
+    `action_drive`.
+    """
     start = initial_states(task, rows, seed).to(device)
     steps = max(horizons)
-    true_path = open_loop(truth, start, steps)
-    learned_path = open_loop(learned, start, steps)
+    drive = action_drive(task, rows, steps, seed, random_actions)
+    true_path = open_loop(truth, start, steps, drive)
+    learned_path = open_loop(learned, start, steps, drive)
     errors = position_errors(task.scene, true_path, learned_path)
     return {
         horizon: summarize(task.scene, {k: e[:, :horizon] for k, e in errors.items()})

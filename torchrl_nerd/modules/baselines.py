@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.modules.transformer import FeedForward, initialize, make_head
+
 
 @dataclass(frozen=True)
 class MLPConfig:
-    """Size of an MLP: ``depth`` hidden layers of ``width``, SiLU between them."""
+    """Size of an MLP: ``depth`` residual blocks of ``width``."""
 
-    depth: int = 2
+    depth: int = 4
     width: int = 64
 
     def build(self, num_inputs: int, num_outputs: int) -> "MLP":
@@ -38,20 +40,24 @@ class NoMemory:
 
 
 class MLP(nn.Module):
-    """Each token by itself: a history of one (the Markov model)."""
+    """The transformer without its attention: a history of one (the Markov model)."""
 
     def __init__(self, config: MLPConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
         self.config = config
-        sizes = [num_inputs, *[config.width] * config.depth]
-        layers: list[nn.Module] = []
-        for a, b in zip(sizes[:-1], sizes[1:], strict=True):
-            layers += [nn.Linear(a, b), nn.SiLU()]
-        self.layers = nn.Sequential(*layers, nn.Linear(sizes[-1], num_outputs))
+        self.embed = nn.Linear(num_inputs, config.width)
+        self.blocks = nn.ModuleList(
+            FeedForward(config.width) for _ in range(config.depth)
+        )
+        self.head = make_head(config.width, num_outputs)
+        initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """``(*batch, F) -> (*batch, D)``."""
-        return self.layers(tokens)
+        x = self.embed(tokens)
+        for block in self.blocks:
+            x = block(x)
+        return self.head(x)
 
     def empty_memory(self, rows: int) -> NoMemory:
         """Nothing."""
@@ -59,7 +65,7 @@ class MLP(nn.Module):
 
     def step(self, token: Tensor, memory: NoMemory) -> Tensor:
         """``(rows, F) -> (rows, D)``."""
-        return self.layers(token)
+        return self(token)
 
 
 @dataclass

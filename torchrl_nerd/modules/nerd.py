@@ -23,6 +23,8 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
     "mlp": MLPConfig(),
+    "mlp-wide": MLPConfig(depth=4, width=120),
+    "mlp-large": MLPConfig(depth=4, width=128),
     "gru": GRUConfig(),
 }
 """Networks by name, for the command line."""

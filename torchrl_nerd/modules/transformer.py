@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MASKED = float("-inf")
-HEAD_WIDTH = 64  # paper, appendix A; SiLU for its ReLU: half the rollout error, docs
+HEAD_WIDTH = 64  # paper, appendix A
 
 
 @dataclass(frozen=True)
@@ -122,30 +122,53 @@ class Attention(nn.Module):
         return self.output(mixed.flatten(1))
 
 
-class Block(nn.Module):
-    """Attention, then a GELU MLP of four times the width, each added to its input.
+class FeedForward(nn.Module):
+    """GELU MLP of four times the width, added to its input.
 
-    Without layer norms: the state is a magnitude, and dividing by a token's own size
+    Without a layer norm: the state is a magnitude, and dividing by a token's own size
     takes it away. Measured in docs/results.md: a third to a half of the rollout error.
     """
 
-    def __init__(self, config: TransformerConfig) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        width = config.width
-        self.attention = Attention(config)
         self.expand = nn.Linear(width, 4 * width, bias=False)
         self.contract = nn.Linear(4 * width, width, bias=False)
 
-    def _mlp(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:
+        """``(*batch, width)``."""
         return x + self.contract(F.gelu(self.expand(x)))
+
+
+class Block(FeedForward):
+    """Attention, added to its input, before the MLP."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__(config.width)
+        self.attention = Attention(config)
 
     def forward(self, x: Tensor) -> Tensor:
         """``(rows, T, width)``."""
-        return self._mlp(x + self.attention(x))
+        return super().forward(x + self.attention(x))
 
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
         """``(rows, width)``."""
-        return self._mlp(x + self.attention.step(x, cache, layer))
+        return super().forward(x + self.attention.step(x, cache, layer))
+
+
+def make_head(width: int, num_outputs: int) -> nn.Sequential:
+    """From a block's width to predictions; SiLU for the paper's ReLU: half the error."""
+    return nn.Sequential(
+        nn.Linear(width, HEAD_WIDTH), nn.SiLU(), nn.Linear(HEAD_WIDTH, num_outputs)
+    )
+
+
+def initialize(blocks: nn.ModuleList) -> None:
+    """Keep sizes through every layer; residual branches share the variance."""
+    for name, weight in blocks.named_parameters():
+        if weight.ndim == 2 and "offset_bias" not in name:
+            is_residual = name.endswith(("output.weight", "contract.weight"))
+            depth = (2 * len(blocks)) ** -0.5 if is_residual else 1.0
+            nn.init.normal_(weight, std=depth * weight.shape[1] ** -0.5)
 
 
 class CausalTransformer(nn.Module):
@@ -171,16 +194,8 @@ class CausalTransformer(nn.Module):
         self.config = config
         self.embed = nn.Linear(num_inputs, config.width)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
-        self.head = nn.Sequential(
-            nn.Linear(config.width, HEAD_WIDTH),
-            nn.SiLU(),
-            nn.Linear(HEAD_WIDTH, num_outputs),
-        )
-        for name, weight in self.blocks.named_parameters():
-            if weight.ndim == 2 and "offset_bias" not in name:
-                is_residual = name.endswith(("output.weight", "contract.weight"))
-                depth = (2 * config.layers) ** -0.5 if is_residual else 1.0
-                nn.init.normal_(weight, std=depth * weight.shape[1] ** -0.5)
+        self.head = make_head(config.width, num_outputs)
+        initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""

@@ -24,6 +24,11 @@ SPHERE, CAPSULE, BOX = (
 )
 
 
+NO_CONTACT = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+)
+
+
 @dataclass(frozen=True)
 class ContactPoints:
     """Contact points after merging.
@@ -34,17 +39,22 @@ class ContactPoints:
     | ``positions`` | ``(P, 3)``, m, body frame |
     | ``radii`` | ``(P,)``, m: a point at this distance from the ground touches it |
     | ``margins`` | ``(P,)``, m: xi, the distance beyond which a point has no features |
-    | ``count_found`` | how many the shapes have before merging and dropping |
+    | ``stands_for`` | of every point that the shapes have: which one here, -1 for none |
     """
 
     bodies: list[int]
     positions: np.ndarray
     radii: np.ndarray
     margins: np.ndarray
-    count_found: int
+    stands_for: list[int]
 
     def __len__(self) -> int:
         return len(self.bodies)
+
+    @property
+    def count_found(self) -> int:
+        """How many the shapes have before merging and dropping."""
+        return len(self.stands_for)
 
 
 def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
@@ -53,25 +63,40 @@ def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
     Raises:
         ValueError: a shape that can touch the ground is none of sphere, capsule, box.
     """
+    bodies, positions, radii = shape_points(model)
+    leaders = _leaders(model, base, bodies, positions, radii)
+    kept = sorted(set(leaders) - {-1})
+    radius = radii[kept]
+    return ContactPoints(
+        bodies=[bodies[i] for i in kept],
+        positions=positions[kept],
+        radii=radius,
+        margins=np.maximum(MARGIN_PER_RADIUS * radius, MIN_MARGIN),
+        stands_for=[kept.index(i) if i >= 0 else -1 for i in leaders],
+    )
+
+
+def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Every point of every shape that can touch the ground, none merged.
+
+    Returns:
+        body ids, positions ``(N, 3)`` (m, body frame) and radii ``(N,)`` (m).
+
+    Raises:
+        ValueError: a shape is none of sphere, capsule, box.
+    """
     bodies: list[int] = []
     positions: list[np.ndarray] = []
     radii: list[float] = []
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+    if not model.opt.disableflags & NO_CONTACT:
+        grounds = ground_geoms(model)
         for geom in _moving_geoms(model):
-            if any(_collide(model, geom, ground) for ground in ground_geoms(model)):
+            if any(_collide(model, geom, ground) for ground in grounds):
                 points, radius = _points_of(model, geom)
                 bodies += [int(model.geom_bodyid[geom])] * len(points)
                 positions += list(points)
                 radii += [radius] * len(points)
-    kept = _distinct(model, base, bodies, positions, radii)
-    radius = np.array([radii[i] for i in kept])
-    return ContactPoints(
-        bodies=[bodies[i] for i in kept],
-        positions=np.array([positions[i] for i in kept]).reshape(-1, 3),
-        radii=radius,
-        margins=np.maximum(MARGIN_PER_RADIUS * radius, MIN_MARGIN),
-        count_found=len(bodies),
-    )
+    return bodies, np.array(positions).reshape(-1, 3), np.array(radii)
 
 
 def ground_geoms(model: mujoco.MjModel) -> list[int]:
@@ -114,14 +139,14 @@ def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     return local @ matrix.reshape(3, 3).T + model.geom_pos[geom], float(radius)
 
 
-def _distinct(
+def _leaders(
     model: mujoco.MjModel,
     base: Base,
     bodies: list[int],
-    positions: list[np.ndarray],
-    radii: list[float],
+    positions: np.ndarray,
+    radii: np.ndarray,
 ) -> list[int]:
-    """Indices of points that move and that do not follow another one everywhere."""
+    """Of each point, the first one that it follows everywhere; -1 where none moves it."""
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
     tracks = []
     for _ in range(4):
@@ -133,13 +158,16 @@ def _distinct(
         ]
         tracks.append(np.array(world).reshape(-1, 3))
     track = np.stack(tracks, 1)  # (P, poses, 3)
-    kept: list[int] = []
+    leaders: list[int] = []
     for i in range(len(bodies)):
         if not base.is_floating and np.ptp(track[i], 0).max() < 1e-9:
+            leaders.append(-1)
             continue
         twins = (
-            abs(track[i] - track[k]).max() < 1e-9 and radii[i] == radii[k] for k in kept
+            k
+            for k in range(i)
+            if leaders[k] == k and radii[i] == radii[k]
+            if abs(track[i] - track[k]).max() < 1e-9
         )
-        if not any(twins):
-            kept.append(i)
-    return kept
+        leaders.append(next(twins, i))
+    return leaders

@@ -3,19 +3,47 @@
 The same random states are stepped as they are and with one coordinate moved. Where the
 change of state comes out the same, the coordinate is a symmetry of the robot: it need not
 be a feature. Joint limits are lifted for this test, since their effect is carried by
-features of their own (the gaps to the limits).
+features of their own (the gaps to the limits); so is contact, for a floating base, where
+distances and normals carry it.
 """
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.geometry.kinematics import HINGE, SLIDE, Base, quat_matrix
+from torchrl_nerd.keys import QPOS, QVEL
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
+
+Move = Callable[[mujoco.MjData, np.random.Generator], None]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """How much one coordinate matters to the true solver.
+
+    | field | meaning |
+    |---|---|
+    | ``name`` | of the joint, or which coordinate of a floating base |
+    | ``key`` | ``qpos`` or ``qvel`` |
+    | ``address`` | in it |
+    | ``change`` | largest relative change of one control step when it alone is moved |
+    """
+
+    name: str
+    key: str
+    address: int
+    change: float
+
+    @property
+    def is_ignored(self) -> bool:
+        """True where the step does not depend on the coordinate."""
+        return self.change <= TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -26,10 +54,50 @@ class Symmetries:
     |---|---|
     | ``positions`` | qpos addresses |
     | ``velocities`` | dof addresses |
+    | ``effects`` | what was measured of every hinge and slide |
     """
 
     positions: frozenset[int]
     velocities: frozenset[int]
+    effects: tuple[Effect, ...] = ()
+
+
+@dataclass(frozen=True)
+class SolverReport:
+    """What the true solver says about a scene; its text by ``print``.
+
+    | field | meaning |
+    |---|---|
+    | ``scene`` | its name |
+    | ``effects`` | of every hinge and slide, and of a floating base's pose |
+    | ``points_found`` | contact points of the robot's shapes |
+    | ``points_merged`` | of these, how many always coincide with another one |
+    | ``points_still`` | of these, how many no joint can move |
+    """
+
+    scene: str
+    effects: tuple[Effect, ...]
+    points_found: int
+    points_merged: int
+    points_still: int
+
+    @property
+    def points_kept(self) -> int:
+        """Contact points that have features."""
+        return self.points_found - self.points_merged - self.points_still
+
+    def __str__(self) -> str:
+        title = "moved in the true solver"
+        lines = [f"{title:<30}{'change of step':>16}  verdict"]
+        for effect in self.effects:
+            verdict = "dropped" if effect.is_ignored else "kept"
+            what = f"{effect.name} {effect.key}[{effect.address}]"
+            lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
+        lines.append(
+            f"contact points: {self.points_found} found, {self.points_merged} merged, "
+            f"{self.points_still} that no joint moves dropped, {self.points_kept} kept"
+        )
+        return "\n".join(lines)
 
 
 def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
@@ -38,45 +106,120 @@ def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
     One coordinate is moved and nothing else, so that only true invariances pass; the
     ground stays where it is.
     """
-    free = copy.copy(model)
-    free.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    free = _without(model, mujoco.mjtDisableBit.mjDSBL_LIMIT)
     rng = np.random.default_rng(0)
-    positions: set[int] = set()
-    velocities: set[int] = set()
+    effects: list[Effect] = []
     for joint in range(model.njnt):
         if int(model.jnt_type[joint]) not in (SLIDE, HINGE):
             continue
+        name = model.joint(joint).name or f"joint {joint}"
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        if _is_ignored(free, substeps, rng, qpos=q):
-            positions.add(q)
-        if _is_ignored(free, substeps, rng, qvel=v):
-            velocities.add(v)
-    return Symmetries(frozenset(positions), frozenset(velocities))
+        for key, address in ((QPOS, q), (QVEL, v)):
+            change = _largest_change(free, substeps, rng, _shift(key, address))
+            effects.append(Effect(name, key, address, change))
+    return Symmetries(
+        frozenset(e.address for e in effects if e.key == QPOS and e.is_ignored),
+        frozenset(e.address for e in effects if e.key == QVEL and e.is_ignored),
+        tuple(effects),
+    )
 
 
-def _is_ignored(
+def base_effects(
+    model: mujoco.MjModel, base: Base, substeps: int
+) -> tuple[Effect, ...]:
+    """Effect of where a floating base stands and faces, by its own axes' step.
+
+    Without contact: distances and normals, features of their own, carry the ground.
+    Empty for a fixed base.
+    """
+    if not base.is_floating:
+        return ()
+    flags = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    free, rng, q = _without(model, flags), np.random.default_rng(0), base.qpos_address
+    moves = {
+        f"base {axis}": (q + i, _shift(QPOS, q + i)) for i, axis in enumerate("xyz")
+    }
+    moves["base heading"] = (q + 3, _heading(base))
+    return tuple(
+        Effect(name, QPOS, at, _largest_change(free, substeps, rng, move, base))
+        for name, (at, move) in moves.items()
+    )
+
+
+def _without(model: mujoco.MjModel, flags: int) -> mujoco.MjModel:
+    """The model without some forces and without actuators: a torque is a torque."""
+    free = copy.copy(model)
+    free.opt.disableflags |= flags | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    return free
+
+
+def _shift(key: str, address: int) -> Move:
+    def move(data: mujoco.MjData, rng: np.random.Generator) -> None:
+        getattr(data, key)[address] += rng.normal()
+
+    return move
+
+
+def _heading(base: Base) -> Move:
+    """Turn the robot about the vertical, and its velocity with it."""
+    q, v = base.qpos_address + 3, base.dof_address
+
+    def move(data: mujoco.MjData, rng: np.random.Generator) -> None:
+        half = 0.5 * rng.normal()
+        turn, turned = np.array([np.cos(half), 0, 0, np.sin(half)]), np.empty(4)
+        mujoco.mju_mulQuat(turned, turn, data.qpos[q : q + 4])
+        data.qpos[q : q + 4] = turned
+        data.qvel[v : v + 3] = quat_matrix(turn) @ data.qvel[v : v + 3]
+
+    return move
+
+
+def _largest_change(
     model: mujoco.MjModel,
     substeps: int,
     rng: np.random.Generator,
-    qpos: int | None = None,
-    qvel: int | None = None,
-) -> bool:
-    """True where moving one coordinate leaves the step's change of velocity alone."""
+    move: Move,
+    base: Base | None = None,
+) -> float:
+    """How much a move alters the step's change of velocity, relative, at worst.
+
+    With a floating ``base``, its linear velocity is seen from the base and no force
+    drives it; without one, every dof is driven.
+    """
+    largest, sound = 0.0, 0
     for _ in range(TRIALS):
         data = mujoco.MjData(model)
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
         data.qvel = rng.normal(size=model.nv)
-        data.qfrc_applied = rng.normal(size=model.nv) * data.qvel
+        data.qfrc_applied = rng.normal(size=model.nv) * model.dof_M0  # any robot's size
+        if base is not None:  # a force in world axes would not turn with the robot
+            data.qfrc_applied[base.dof_address : base.dof_address + 3] = 0.0
         moved = copy.copy(data)
-        if qpos is not None:
-            moved.qpos[qpos] += rng.normal()
-        if qvel is not None:
-            moved.qvel[qvel] += rng.normal()
-        before, after = data.qvel.copy(), moved.qvel.copy()
-        mujoco.mj_step(model, data, substeps)
-        mujoco.mj_step(model, moved, substeps)
-        change, moved_change = data.qvel - before, moved.qvel - after
-        size = abs(change).max() + abs(before).max()
-        if abs(change - moved_change).max() > TOLERANCE * size:
-            return False
-    return True
+        move(moved, rng)
+        size = abs(data.qvel).max()
+        change, moved_change = (
+            _change(model, d, substeps, base) for d in (data, moved)
+        )
+        if data.warning.number.any() or moved.warning.number.any():
+            continue  # states that MuJoCo gave up on say nothing
+        sound += 1
+        size += abs(change).max()
+        largest = max(largest, float(abs(change - moved_change).max() / size))
+    return largest if sound else 1.0
+
+
+def _change(
+    model: mujoco.MjModel, data: mujoco.MjData, substeps: int, base: Base | None
+) -> np.ndarray:
+    """Change of velocity ``(nv,)`` over one control step, in the base's axes at first."""
+    before = data.qvel.copy()
+    turn = np.eye(3)
+    if base is not None:
+        q = base.qpos_address + 3
+        turn = quat_matrix(data.qpos[q : q + 4])
+    mujoco.mj_step(model, data, substeps)
+    change = data.qvel - before
+    if base is not None:
+        v = base.dof_address
+        change[v : v + 3] = turn.T @ change[v : v + 3]
+    return change

@@ -1,14 +1,16 @@
 """A scene: one robot, its ground, its controller, and how finely the truth is stepped."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 from torch import Generator
 
+from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.geometry.kinematics import (
     Base,
     PointKinematics,
@@ -16,31 +18,32 @@ from torchrl_nerd.geometry.kinematics import (
     mount_pose,
 )
 from torchrl_nerd.geometry.manifold import JointLayout
+from torchrl_nerd.scenes.actuators import driven_dofs
 from torchrl_nerd.scenes.contact_points import (
     ContactPoints,
     contact_points,
     ground_geoms,
 )
 from torchrl_nerd.scenes.controllers import Controller
-from torchrl_nerd.scenes.explain import Symmetries, find_symmetries
+from torchrl_nerd.scenes.explain import (
+    SolverReport,
+    Symmetries,
+    base_effects,
+    find_symmetries,
+)
+from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
+from torchrl_nerd.scenes.importer import (
+    Imported,
+    import_dm_control,
+    import_gymnasium,
+    import_mjcf,
+)
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
-from torchrl_nerd.scenes.terrain import PLANE, Terrain
+from torchrl_nerd.scenes.support import check_supported
+from torchrl_nerd.scenes.terrain import Terrain
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
-_HASHED_FIELDS = (
-    *("body_parentid", "body_pos", "body_quat", "body_mass", "body_inertia"),
-    *("body_ipos", "body_iquat", "jnt_type", "jnt_pos", "jnt_axis", "jnt_range"),
-    *("jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp", "dof_armature"),
-    *("dof_damping", "dof_frictionloss", "geom_type", "geom_size", "geom_pos"),
-    *("geom_quat", "geom_friction", "geom_solref", "geom_solimp", "geom_contype"),
-    *("geom_conaffinity", "geom_condim", "geom_margin", "geom_gap", "geom_solmix"),
-    *("geom_priority", "jnt_margin", "actuator_trnid", "actuator_gear", "qpos0"),
-)
-_HASHED_GROUND = (
-    *("geom_bodyid", "body_mocapid", "geom_dataid", "hfield_size", "hfield_nrow"),
-    *("hfield_ncol", "hfield_adr", "hfield_data"),
-)
-"""Of a ground that is more than one plane; those keep the hashes they always had."""
+LARGEST_REDRAWS = 300  # of starts that are not clear of the ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +71,63 @@ class Scene:
     def __post_init__(self) -> None:
         if self.substeps < 1:
             raise ValueError(f"expected at least 1 substep, got {self.substeps}")
-        counts = {"tendon": self.model.ntendon, "equality constraint": self.model.neq}
-        for what, count in counts.items():
-            if count:
-                raise ValueError(f"scene '{self.name}' has a {what}: not supported")
+        check_supported(self.name, self.model)
+
+    @classmethod
+    def from_mjcf(
+        cls, path: str | Path, control_step: float | None = None, **ranges: Any
+    ) -> "Scene":
+        """The robot in an MJCF file, driven by its own actuators.
+
+        Args:
+            path: the file; also the scene's name.
+            control_step: s; by default the whole number of timesteps nearest to 0.02 s.
+            ranges: fields of `Sampling` to use in place of those that follow from the
+                joints' limits and the actuators' strengths.
+
+        Raises:
+            ValueError: in one sentence, a file that is not there or does not compile, no
+                joint, or something that is not supported (named).
+        """
+        return cls._from(import_mjcf(path, control_step, **ranges))
+
+    @classmethod
+    def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":
+        """The robot of a dm_control suite task, at the task's control step.
+
+        Args:
+            domain: such as ``"cheetah"``.
+            task: such as ``"run"``.
+            ranges: as for `from_mjcf`.
+
+        Raises:
+            ValueError: no such task, or a robot with something not supported (named).
+        """
+        return cls._from(import_dm_control(domain, task, **ranges))
+
+    @classmethod
+    def from_gymnasium(cls, env_id: str, **ranges: Any) -> "Scene":
+        """The robot of a Gymnasium MuJoCo environment, at the environment's step.
+
+        Args:
+            env_id: such as ``"Ant-v5"``; version 5, which names its file.
+            ranges: as for `from_mjcf`.
+
+        Raises:
+            ValueError: no such environment, or a robot with something not supported.
+        """
+        return cls._from(import_gymnasium(env_id, **ranges))
+
+    @classmethod
+    def _from(cls, parts: Imported) -> "Scene":
+        scene = cls(*parts)
+        terrain = scene.terrain  # refuses a ground without features right away
+        if terrain is not None and terrain.is_per_row and not scene.sampling.ground:
+            raise ValueError(
+                f"scene '{scene.name}' has a ground that moves with each row: expected "
+                "ground=, a function that draws it"
+            )
+        return scene
 
     @property
     def control_step(self) -> float:
@@ -95,9 +151,8 @@ class Scene:
 
     @cached_property
     def actuated(self) -> list[int]:
-        """Dof address of each actuated joint, in the order of the actuators."""
-        joints = self.model.actuator_trnid[:, 0]
-        return [int(self.model.jnt_dofadr[j]) for j in joints]
+        """Distinct dofs that actuators act on, in the order of the actuators."""
+        return driven_dofs(self.model)
 
     @cached_property
     def contacts(self) -> ContactPoints:
@@ -126,41 +181,31 @@ class Scene:
         """Coordinates that the dynamics do not depend on."""
         return find_symmetries(self.model, self.substeps)
 
+    def explain(self) -> SolverReport:
+        """Which coordinates and contact points are kept, asked of the true solver.
+
+        `torchrl_nerd.evaluation.explain.explain` adds features, proofs and timing.
+        """
+        base = base_effects(self.model, self.base, self.substeps)
+        stands_for = self.contacts.stands_for
+        still = stands_for.count(-1)
+        return SolverReport(
+            scene=self.name,
+            effects=base + self.symmetries.effects,
+            points_found=len(stands_for),
+            points_merged=len(stands_for) - still - len(self.contacts),
+            points_still=still,
+        )
+
     @cached_property
     def hash(self) -> str:
         """Fingerprint of the physics: equal for equal robots, steps and grounds."""
-        fields = _HASHED_FIELDS
-        grounds = ground_geoms(self.model)
-        if any(self.model.geom_type[grounds] != PLANE) or len(grounds) > 1:
-            fields += _HASHED_GROUND
-        return _fingerprint(
-            *(getattr(self.model, field) for field in fields), self._stepping
-        )
+        return fingerprint(self.model, self.substeps)
 
     @cached_property
     def robot_hash(self) -> str:
         """Fingerprint of the robot and its steps alone: equal over any ground."""
-        model = self.model
-        moves = model.body_dofnum[model.body_weldid] > 0
-        chosen = {"body": moves, "geom": moves[model.geom_bodyid]}
-        parts = []
-        for field in _HASHED_FIELDS:
-            value = np.asarray(getattr(model, field))
-            value = value[chosen.get(field.split("_")[0], ...)]
-            if field == "body_parentid":  # counted within the robot, from 1
-                value = np.cumsum(moves)[value] * moves[value]
-            parts.append(value)
-        mount = () if self.base.is_floating else self.mount
-        return _fingerprint(*parts, self._stepping, *mount)
-
-    @property
-    def _stepping(self) -> np.ndarray:
-        """Numbers of the whole world that change a step."""
-        option = self.model.opt
-        numbers = [option.timestep, self.substeps, *option.gravity, option.impratio]
-        numbers += [option.density, option.viscosity, *option.wind]
-        numbers += [int(option.integrator), int(option.disableflags), int(option.cone)]
-        return np.array(numbers, float)
+        return robot_fingerprint(self.model, self.substeps)
 
     def sample_initial(
         self, rows: int, generator: Generator
@@ -183,6 +228,25 @@ class Scene:
         self, rows: int, generator: Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions and velocities within the ranges, clear of the ground."""
+        qpos, qvel = self._draw_anywhere(rows, generator)
+        clearance = self.sampling.clearance
+        if clearance is None:
+            return qpos, qvel
+        for _ in range(LARGEST_REDRAWS):
+            is_low = self.clearances(qpos).amin(-1) < clearance
+            if not is_low.any():
+                return qpos, qvel
+            again = self._draw_anywhere(int(is_low.sum()), generator)
+            qpos[is_low], qvel[is_low] = again
+        raise ValueError(
+            f"expected ranges of '{self.name}' with starts clear of the ground, found "
+            f"none in {LARGEST_REDRAWS} draws: give others, or clearance=None"
+        )
+
+    def _draw_anywhere(
+        self, rows: int, generator: Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions and velocities within the ranges."""
         ranges = self.sampling
         qpos = uniform(ranges.qpos_low, ranges.qpos_high, rows, generator)
         qvel = uniform(ranges.qvel_low, ranges.qvel_high, rows, generator)
@@ -190,11 +254,8 @@ class Scene:
             base_pos, base_vel = ranges.base.draw(rows, generator)
             qpos = torch.cat((base_pos, qpos), -1)
             qvel = torch.cat((base_vel, qvel), -1)
-        if ranges.clearance is not None:
-            is_low = self.clearances(qpos).amin(-1) < ranges.clearance
-            if is_low.any():
-                again = self._draw(int(is_low.sum()), generator)
-                qpos[is_low], qvel[is_low] = again
+        for q, _ in self.layout.rotations:
+            qpos[:, q : q + 4] = quat_normalize(qpos[:, q : q + 4])
         return qpos, qvel
 
     def clearances(
@@ -230,10 +291,3 @@ class Scene:
         """Kinematics of the contact points."""
         points = self.contacts
         return PointKinematics(self.model, self.base, points.bodies, points.positions)
-
-
-def _fingerprint(*arrays: np.ndarray) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]

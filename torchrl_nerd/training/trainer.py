@@ -38,10 +38,11 @@ class TrainConfig:
 
     | field | meaning |
     |---|---|
-    | ``network`` | name in `NETWORKS`: tiny, wide, small, paper, paper-large, mlp, gru |
+    | ``network`` | name in `NETWORKS` |
     | ``steps`` | updates on one-step targets |
     | ``rollout_steps`` | further updates on the model's own rollouts |
     | ``rows``, ``length`` | sequences per update and tokens of each |
+    | ``single_share`` | share of updates on as many single states instead |
     | ``rollout_rows``, ``rollout_length`` | the same for rollouts |
     | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
     | ``rollout_lr`` | share of the peak at which the rollout updates begin |
@@ -59,6 +60,7 @@ class TrainConfig:
     rollout_steps: int = 2_000
     rows: int = 64
     length: int = 16
+    single_share: float = 0.75
     rollout_rows: int = 128
     rollout_length: int = 8
     lr: float = 0.01
@@ -187,9 +189,7 @@ class Trainer:
         self.model.train()
         with torch.enable_grad(), self._autocast():
             if self.step < config.steps:
-                tokens, targets = self.sequences.one_step(
-                    config.rows, config.length, generator
-                )
+                tokens, targets = self._batch(generator)
                 outputs = self.model.network(tokens).float()
                 loss = one_step_loss(outputs, targets, config.softening)
             else:
@@ -208,6 +208,18 @@ class Trainer:
             for name, weight in self.model.network.named_parameters():
                 self.average[name].lerp_(weight, 1.0 - decay)
         return loss.detach()
+
+    def _batch(self, generator: Generator) -> tuple[Tensor, Tensor]:
+        """Sequences, or as many states from all over the data.
+
+        The steps of a sequence resemble each other: single states, each with an empty
+        history, make a batch of the same size tell more.
+        """
+        config = self.config
+        rows, length = config.rows, config.length
+        if torch.rand((), generator=generator) < config.single_share:
+            rows, length = rows * length, 1
+        return self.sequences.one_step(rows, length, generator)
 
     def _rate(self) -> float:
         """Share of the peak step size: up, then down to zero, in each of two phases."""

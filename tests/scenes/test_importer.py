@@ -1,0 +1,445 @@
+"""Robots of others: their actuators, grounds and steps are what their own model has."""
+
+import copy
+from dataclasses import replace
+from math import pi
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
+from torchrl_nerd.cli import main
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.nerd import NETWORKS, NeRD, SceneTokens
+from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes.actuators import ActuatorController
+from torchrl_nerd.scenes.contact_points import ground_geoms
+from torchrl_nerd.transforms import StateDelta
+
+ROWS = 20
+STEPS = {  # control step (s), substeps: of the tasks and environments
+    "dm_control/acrobot-swingup": (0.01, 1),
+    "dm_control/cartpole-swingup": (0.01, 1),
+    "dm_control/cheetah-run": (0.01, 1),
+    "dm_control/hopper-hop": (0.02, 4),
+    "dm_control/humanoid-run": (0.025, 5),
+    "dm_control/point_mass-easy": (0.02, 1),
+    "dm_control/reacher-easy": (0.02, 1),
+    "dm_control/walker-walk": (0.025, 10),
+    "gymnasium/Ant-v5": (0.05, 5),
+    "gymnasium/HalfCheetah-v5": (0.05, 5),
+    "gymnasium/Hopper-v5": (0.008, 4),
+    "gymnasium/Humanoid-v5": (0.015, 5),
+    "gymnasium/InvertedDoublePendulum-v5": (0.05, 5),
+    "gymnasium/Swimmer-v5": (0.04, 4),
+    "gymnasium/Walker2d-v5": (0.008, 4),
+}
+PLANAR = [f"dm_control/{x}" for x in ("cheetah-run", "hopper-hop", "walker-walk")]
+PLANAR += [f"gymnasium/{x}-v5" for x in ("HalfCheetah", "Hopper", "Walker2d")]
+
+SERVOS = """
+<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody>
+  <geom name="floor" type="plane" size="0 0 1"/>
+  <body pos="0 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="3"/>
+    <body pos="0.3 0 0"><joint name="a" axis="0 1 0" range="-60 60"
+        limited="true" actuatorfrcrange="-6 5"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" mass="0.5"/>
+      <body pos="0.2 0 0"><joint name="b" axis="0 1 0.2" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" mass="0.4"/>
+      </body></body>
+    <body pos="-0.3 0 0"><joint name="c" type="slide" axis="1 0 0"/>
+      <geom type="sphere" size="0.05" mass="0.5"/>
+      <body pos="-0.1 0 0"><joint name="d" type="ball"/>
+        <geom type="capsule" fromto="0 0 0 -0.2 0 0" size="0.03" mass="0.4"/>
+      </body></body>
+  </body></worldbody>
+  <tendon><fixed name="t"><joint joint="b" coef="0.7"/><joint joint="c" coef="-2"/>
+  </fixed></tendon>
+  <actuator>
+    <position joint="a" kp="20" kv="1" gear="1.5" ctrlrange="-0.5 1"/>
+    <motor joint="a" gear="3" ctrlrange="-1 0.5"/>
+    <velocity joint="b" kv="2" forcerange="-1 0.5"/>
+    <general tendon="t" gear="2" gainprm="5" biastype="affine" biasprm="0.3 -4 -0.2"/>
+    <damper joint="c" kv="3" ctrlrange="0 1"/>
+    <motor joint="d" gear="1 2 -0.5"/><motor joint="d" gear="0 1 0"/>
+  </actuator></mujoco>"""
+"""Every actuator there is law for: several on a joint, on a tendon, on a ball, limited."""
+
+BODY = '<body><joint name="a"/><geom size="0.1"/></body>'
+MOTOR = '<actuator><motor name="m" joint="a" {}/></actuator>'
+REFUSED = {
+    "an actuator with a state": (BODY, '<actuator><general name="m" joint="a" '
+        'dyntype="filter" dynprm="0.1"/></actuator>'),
+    "an actuator that is no": (BODY, '<actuator><general name="m" joint="a" '
+        'gaintype="user"/></actuator>'),
+    "an actuator on no joint": (BODY.replace("</body>", '<site name="s"/></body>'),
+        '<actuator><motor name="m" site="s"/></actuator>'),
+    "an actuator on its free": ('<body><freejoint name="a"/><geom size="1"/></body>',
+        MOTOR.format("")),
+    "an actuator that reads": ('<body><joint name="a" type="ball"/><geom size="1"/>'
+        "</body>", '<actuator><position name="m" joint="a"/></actuator>'),
+    "a delayed actuator": (BODY, MOTOR.format('delay="0.01" nsample="2"')),
+    "a tendon with": (BODY, '<tendon><fixed name="m" range="0 1"><joint joint="a" '
+        'coef="1"/></fixed></tendon>'),
+    "an equality": (BODY, '<equality><joint name="m" joint1="a"/></equality>'),
+    "a contact pair": ('<geom name="f" type="plane" size="1 1 1"/>'
+        + BODY.replace("<geom", '<geom name="g"'),
+        '<contact><pair name="m" geom1="f" geom2="g"/></contact>'),
+    "a floating base whose": ('<body><freejoint/><geom size="1"/></body>',
+        '<option gravity="1 0 -9"/>'),
+    "is a ellipsoid": ('<geom type="plane" size="1 1 1"/><body><joint/>'
+        '<geom name="m" type="ellipsoid" size="1 2 1"/></body>', ""),
+    "2 moving trees": (BODY + BODY.replace('"a"', '"b"'), ""),
+    "no joint": ('<body><geom size="1"/></body>', ""),
+}  # fmt: skip
+
+
+def write(folder, world, rest=""):
+    path = folder / "robot.xml"
+    path.write_text(f"<mujoco><worldbody>{world}</worldbody>{rest}</mujoco>")
+    return path
+
+
+def servo_scene(folder, integrator="Euler", control_step=0.004) -> Scene:
+    path = folder / "servos.xml"
+    path.write_text(SERVOS.format(integrator=integrator))
+    return Scene.from_mjcf(path, control_step)
+
+
+@pytest.fixture(params=STEPS)
+def robot(request) -> Scene:
+    """Each imported robot."""
+    return load_scene(request.param)
+
+
+@pytest.fixture(params=["Euler", "RK4", "implicitfast"])
+def servos(request, tmp_path) -> Scene:
+    """A robot with all kinds of servos."""
+    return servo_scene(tmp_path, request.param)
+
+
+def states_and_actions(scene, generator, clearance=None):
+    """Random states, some of them in the ground, and random actions, ``[ROWS]``."""
+    anywhere = replace(scene, sampling=replace(scene.sampling, clearance=clearance))
+    state, _ = anywhere.sample_initial(ROWS, generator)
+    u = torch.rand(ROWS, scene.controller.num_actions, generator=generator).double()
+    return TensorDict(state, batch_size=[ROWS]), 2.4 * u - 1.2
+
+
+def set_up(scene, state, action, row, model=None):
+    """MuJoCo's data of one row, with the controls that its action stands for."""
+    model = scene.model if model is None else model
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = state[QPOS][row], state[QVEL][row]
+    limits = model.actuator_ctrlrange.copy()
+    limits[model.actuator_ctrllimited == 0] = (-1.0, 1.0)
+    share = 0.5 * (action[row].clamp(-1.0, 1.0).numpy() + 1.0)
+    data.ctrl = limits[:, 0] + share * (limits[:, 1] - limits[:, 0])
+    return data
+
+
+def check_torques(scene, generator):
+    state, action = states_and_actions(scene, generator)
+    torque = scene.controller(action, state[QPOS], state[QVEL])
+    assert len(set(scene.actuated)) == len(scene.actuated) == torque.shape[-1]
+    for row in range(ROWS):
+        data = set_up(scene, state, action, row)
+        mujoco.mj_forward(scene.model, data)
+        force = np.zeros(scene.model.nv)
+        force[scene.actuated] = torque[row]
+        size = 1.0 + abs(force).max()
+        np.testing.assert_allclose(force, data.qfrc_actuator, 0.0, 1e-12 * size)
+
+
+def check_steps(scene, generator, hold):
+    """One control step against the original model, its actuators on or held."""
+    state, action = states_and_actions(scene, generator)
+    dynamics = MujocoDynamics(scene, num_threads=1)
+    torque = scene.controller(action, state[QPOS], state[QVEL])
+    after = dynamics.step(state, torque)
+    for row in range(ROWS):
+        data = set_up(scene, state, action, row)
+        if hold:
+            mujoco.mj_forward(scene.model, data)
+            data.qfrc_applied = data.qfrc_actuator
+            data.qacc_warmstart = 0.0
+        model = copy.copy(scene.model)
+        if hold:
+            model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
+        mujoco.mj_step(model, data, scene.substeps)
+        for key, want in ((QPOS, data.qpos), (QVEL, data.qvel)):
+            size = 1.0 + abs(want).max()
+            np.testing.assert_allclose(after[key][row], want, 0.0, 1e-10 * size)
+
+
+def test_torques_are_the_actuators(robot, generator):
+    check_torques(robot, generator)
+    assert robot.controller.num_actions == robot.model.nu
+
+
+def test_servo_torques_are_the_actuators(servos, generator):
+    check_torques(servos, generator)
+    assert not servos.controller.is_motor and len(servos.actuated) == 6
+
+
+def test_true_steps_are_the_original_models(robot, generator):
+    assert robot.controller.is_motor
+    check_steps(robot, generator, hold=False)
+
+
+def test_true_steps_of_servos_are_the_originals_with_the_force_held(servos, generator):
+    check_steps(servos, generator, hold=True)
+
+
+def test_servos_stepped_at_every_timestep_need_no_holding(tmp_path, generator):
+    check_steps(servo_scene(tmp_path, control_step=0.002), generator, hold=False)
+
+
+def test_a_dm_control_episode_is_dm_controls_own(generator):
+    from dm_control import suite
+
+    scene, env = load_scene("dm_control/walker-walk"), suite.load("walker", "walk")
+    state, action = states_and_actions(scene, generator, clearance=0.1)
+    torque = scene.controller(action, state[QPOS], state[QVEL])
+    after = MujocoDynamics(scene, num_threads=1).step(state, torque)
+    for row in range(ROWS):
+        env.reset()
+        with env.physics.reset_context():
+            env.physics.data.qpos[:] = state[QPOS][row]
+            env.physics.data.qvel[:] = state[QVEL][row]
+        env.step(action[row].clamp(-1.0, 1.0).numpy())
+        for key in (QPOS, QVEL):
+            want = getattr(env.physics.data, key)
+            np.testing.assert_allclose(after[key][row], want, 0.0, 1e-6)
+
+
+def test_control_steps_are_the_tasks(robot):
+    control_step, substeps = STEPS[robot.name]
+    assert abs(robot.control_step - control_step) < 1e-12
+    assert robot.substeps == substeps
+
+
+def test_a_network_can_step_it(robot, generator):
+    state, action = states_and_actions(robot, generator, robot.sampling.clearance)
+    torque = robot.controller(action, state[QPOS], state[QVEL])
+    dynamics = NeRDDynamics(NeRD(robot, NETWORKS["tiny"]))
+    assert dynamics.model.tokens.size == SceneTokens(robot).size
+    tokens = dynamics.model.tokens(state[QPOS], state[QVEL], torque, None)
+    assert tokens.shape == (ROWS, dynamics.model.tokens.size)
+    for after in (
+        dynamics.step(state, torque),
+        MujocoDynamics(robot, num_threads=1).step(state, torque),
+    ):
+        assert all(after[key].shape == state[key].shape for key in (QPOS, QVEL))
+        assert all(after[key].isfinite().all() for key in (QPOS, QVEL))
+        change = StateDelta(robot)
+        start = state[QPOS], state[QVEL]
+        delta = change.delta(*start, after[QPOS], after[QVEL])
+        again = change.delta(*start, *change.integrate(*start, delta))
+        torch.testing.assert_close(again, delta, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [*PLANAR, "gymnasium/Swimmer-v5"])
+def test_a_planar_robot_does_not_see_where_it_is(name, generator):
+    scene = load_scene(name)
+    model = scene.model
+    assert not scene.base.is_floating
+    root = next(
+        j
+        for j in range(model.njnt)
+        if model.jnt_type[j] == SLIDE and abs(model.jnt_axis[j][0]) == 1.0
+    )
+    address = int(model.jnt_qposadr[root])
+    assert address in scene.symmetries.positions
+    state, action = states_and_actions(scene, generator)
+    torque = scene.controller(action, state[QPOS], state[QVEL])
+    tokens, elsewhere = SceneTokens(scene), state[QPOS].clone()
+    elsewhere[:, address] += 1e4
+    here = tokens(state[QPOS], state[QVEL], torque, None)
+    there = tokens(elsewhere, state[QVEL], torque, None)
+    torch.testing.assert_close(here, there, rtol=0.0, atol=1e-8)
+
+
+def test_the_nearest_point_gives_the_robots_clearance(robot, generator):
+    points, model = robot.contacts, robot.model
+    if robot.terrain is None:
+        assert len(points) == 0
+        return
+    state, _ = states_and_actions(robot, generator)
+    gaps, data = robot.clearances(state[QPOS]), mujoco.MjData(model)
+    (ground,) = ground_geoms(model)
+    bodies = set(points.bodies)
+    geoms = [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom_bodyid[geom] in bodies
+        and model.geom_contype[geom] | model.geom_conaffinity[geom]
+    ]
+    for row in range(ROWS):
+        data.qpos = state[QPOS][row]
+        mujoco.mj_kinematics(model, data)
+        want = min(
+            mujoco.mj_geomDistance(model, data, ground, geom, 1e3, None)
+            for geom in geoms
+        )
+        assert abs(float(gaps[row].min()) - want) < 1e-9
+
+
+def test_starts_are_within_the_limits_and_clear_of_the_ground(robot, generator):
+    state, _ = states_and_actions(robot, generator, robot.sampling.clearance)
+    model, qpos = robot.model, state[QPOS]
+    for joint in range(model.njnt):
+        q, kind = model.jnt_qposadr[joint], model.jnt_type[joint]
+        if kind not in (HINGE, SLIDE):
+            continue
+        low, high = model.jnt_range[joint]
+        if not model.jnt_limited[joint]:
+            width = pi if kind == HINGE else 1.0
+            low, high = model.qpos0[q] - width, model.qpos0[q] + width
+        assert (qpos[:, q] >= low).all() and (qpos[:, q] <= high).all()
+    if robot.terrain is not None:
+        assert robot.clearances(qpos).amin() >= 0.0
+
+
+@pytest.mark.parametrize("name", ["dm_control/hopper-hop", "gymnasium/Ant-v5"])
+def test_random_trajectories_stay_sound(name, generator):
+    scene = load_scene(name)
+    data = simulate(scene, 8, 10, generator)
+    assert is_sound(data).all()
+    largest = torch.tensor(scene.sampling.torque, dtype=torch.float64)
+    assert (data["next", "joint_torque"].abs() <= largest).all()
+
+
+def test_servos_are_driven_by_random_actions(servos, generator):
+    scale = torch.rand(2000, 1, generator=generator).double()
+    anywhere = replace(servos, sampling=replace(servos.sampling, clearance=None))
+    state, _ = anywhere.sample_initial(2000, generator)
+    norms = torch.linalg.vector_norm(state[QPOS][:, -4:], dim=-1)
+    assert (norms - 1.0).abs().max() < 1e-12
+    qvel = torch.zeros_like(state[QVEL])
+    drive = servos.sampling.drive
+    torque = drive(state[QPOS], qvel, scale, generator)
+    largest = torch.tensor(servos.sampling.torque, dtype=torch.float64)
+    assert (torque.abs() <= 1.1 * scale * largest).all()
+    assert (torque.abs().amax(0) > 0.3 * largest).all()
+    idle = drive(state[QPOS], qvel, 0.0 * scale, generator)
+    assert not idle.any() and is_sound(simulate(servos, 4, 5, generator)).all()
+
+
+def test_ranges_can_be_given():
+    scene = Scene.from_gymnasium("Ant-v5", qvel_high=(2.0,) * 8, clearance=0.3)
+    assert scene.sampling.qvel_high == (2.0,) * 8 and scene.sampling.clearance == 0.3
+    assert scene.sampling.qpos_low == load_scene("gymnasium/Ant-v5").sampling.qpos_low
+    state, _ = scene.sample_initial(50, torch.Generator().manual_seed(0))
+    assert scene.clearances(state[QPOS]).min() >= 0.3
+    buried = Scene.from_gymnasium("Hopper-v5", clearance=1e3)
+    with pytest.raises(ValueError, match="starts clear of the ground"):
+        buried.sample_initial(1, torch.Generator().manual_seed(0))
+
+
+def test_names_stand_for_imports(tmp_path):
+    assert load_scene("gymnasium/Ant-v5") is load_scene("gymnasium/Ant-v5")
+    assert Scene.from_gymnasium("Ant-v5").hash == load_scene("gymnasium/Ant-v5").hash
+    scene = load_scene("dm_control/cheetah-run")
+    assert Scene.from_dm_control("cheetah", "run").hash == scene.hash
+    path = write(tmp_path, BODY, MOTOR.format(""))
+    scene = load_scene(str(path))
+    assert scene.name == str(path) and isinstance(scene.controller, ActuatorController)
+    assert scene.substeps == 10 and scene.actuated == [0]
+
+
+def test_data_can_be_drawn_from_a_name(tmp_path):
+    out, name = tmp_path / "data", "gymnasium/InvertedPendulum-v5"
+    sizes = ("--trajectories", "4", "--steps", "3")
+    assert main(["data", name, "--out", str(out), *sizes, "--quiet"]) == 0
+    assert main(["data", name, "--out", str(out), *sizes, "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("is_file", [True, False])
+def test_a_checkpoint_finds_its_robot_again(is_file, tmp_path):
+    scene = servo_scene(tmp_path) if is_file else load_scene("gymnasium/Ant-v5")
+    model = NeRD(scene, NETWORKS["tiny"])
+    save_checkpoint(model, tmp_path / "checkpoint", make_card(model))
+    again = load_checkpoint(tmp_path / "checkpoint", scene if is_file else None)
+    assert again.scene.hash == scene.hash
+    with pytest.raises(ValueError, match="unknown scene 'unicycle'"):
+        card = make_card(model) | {"scene": "unicycle"}
+        load_checkpoint(save_checkpoint(model, tmp_path / "other", card))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m.body_gravcomp.__iadd__(0.5),
+        lambda m: m.qpos_spring.__iadd__(0.5),
+        lambda m: m.dof_solref.__imul__(2.0),
+        lambda m: m.dof_dampingpoly[-1].__iadd__(0.1),
+        lambda m: setattr(m.opt, "noslip_iterations", 3),
+    ],
+)
+def test_rare_physics_changes_the_hash(change, robot):
+    again = replace(robot, model=copy.copy(robot.model))
+    assert again.hash == robot.hash
+    change(again.model)
+    assert replace(again).hash != robot.hash
+
+
+@pytest.mark.parametrize("named", REFUSED)
+def test_what_cannot_be_learned_is_refused_by_name(named, tmp_path):
+    with pytest.raises(ValueError, match=named) as error:
+        Scene.from_mjcf(write(tmp_path, *REFUSED[named]))
+    said = str(error.value)
+    assert "\n" not in said and ("'m'" in said or "robot.xml" in said)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("dm_control/quadruped-walk", "an equality constraint"),
+        ("dm_control/ball_in_cup-catch", "a tendon with a limit"),
+        ("dm_control/finger-spin", "2 moving trees"),
+        ("gymnasium/Reacher-v5", "2 moving trees"),
+        ("gymnasium/Ant-v4", "expected an environment .* version 5"),
+        ("gymnasium/CartPole-v1", "expected an environment"),
+        ("gymnasium/Unicycle-v5", "unknown environment 'Unicycle-v5'"),
+        ("dm_control/unicycle-ride", "unknown domain .* expected one of acrobot"),
+        ("dm_control/cheetah-fly", "unknown task .* expected one of run$"),
+        ("dm_control/cheetah", "unknown scene 'dm_control/cheetah'"),
+        ("nowhere/robot.xml", "expected an MJCF file, found none at nowhere"),
+    ],
+)
+def test_robots_that_cannot_be_had_are_refused_in_one_sentence(name, why):
+    with pytest.raises(ValueError, match=why) as error:
+        load_scene(name)
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_do_not_compile_are_refused_in_one_sentence(tmp_path):
+    twice = BODY + BODY
+    for world, why in ((twice, "repeated name 'a'"), ("<body", "XML"), ("<x/>", "x")):
+        with pytest.raises(ValueError, match="MuJoCo cannot compile") as error:
+            Scene.from_mjcf(write(tmp_path, world))
+        assert why in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="whole timesteps of 0.002 s, got 0.003 s"):
+        Scene.from_mjcf(write(tmp_path, BODY), control_step=0.003)
+
+
+def test_a_ground_per_row_needs_somebody_to_draw_it(tmp_path):
+    world = '<body mocap="true"><geom type="plane" size="1 1 1"/></body>'
+    world += (
+        '<body pos="0 0 1"><joint name="a"/><geom size="0.1" pos="0.3 0 0"/></body>'
+    )
+    path = write(tmp_path, world)
+    with pytest.raises(ValueError, match="expected ground="):
+        Scene.from_mjcf(path)
+
+    def level(qpos, generator):
+        return torch.tensor([0.0, 0.0, 1.0, 0.0]).double().expand(len(qpos), 4)
+
+    assert Scene.from_mjcf(path, ground=level).terrain.is_per_row

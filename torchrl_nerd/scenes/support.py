@@ -1,0 +1,149 @@
+"""What a model may have that no NeRD can learn yet, refused by name.
+
+A NeRD sees joints, joint torques and contact with the ground. Refused is what has a
+memory of its own, what acts through something else, and what makes a floating base move
+otherwise here than there. Left in is what the state alone decides although no feature
+names it: damping and springs, dry friction, still air or water, contact between the
+robot's own bodies.
+"""
+
+import copy
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, Base
+
+JOINT, IN_PARENT, TENDON = (
+    int(mujoco.mjtTrn.mjTRN_JOINT),
+    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+    int(mujoco.mjtTrn.mjTRN_TENDON),
+)
+GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+AFFINE = np.array([[GAINS[1]], [BIASES[1]]], int)
+NO_ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION
+NOTHING = -1  # where another has the type of a joint
+
+Refusal = tuple[str, Any, Callable[[int], Any] | None]
+"""What, a flag of the model or one per object, and how to get an object by its index."""
+
+
+def check_supported(name: str, model: mujoco.MjModel) -> None:
+    """Refuse a model that has something no feature describes.
+
+    Args:
+        name: of the scene, for the message.
+        model: compiled.
+
+    Raises:
+        ValueError: naming the first such thing, and which object it is.
+    """
+    for what, is_there, get in (*_parts(model), *_actuators(model)):
+        found = np.flatnonzero(is_there)
+        if len(found):
+            which = get(int(found[0])).name if get is not None else ""
+            which = f" ('{which}')" if which else ""
+            raise ValueError(f"scene '{name}' has {what}{which}: not supported")
+    try:
+        base = Base.from_model(model)
+    except ValueError as error:
+        raise ValueError(f"scene '{name}': {error}") from None
+    if base.is_floating and not _moves_alike_everywhere(model, base):
+        raise ValueError(
+            f"scene '{name}' has a floating base whose motion depends on where it is or "
+            "faces (wind, gravity off the vertical, a spring): not supported"
+        )
+
+
+def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
+    """Everything but the actuators."""
+    pulls = model.tendon_stiffness + model.tendon_damping + model.tendon_frictionloss
+    pulls = pulls + model.tendon_armature + model.tendon_limited
+    pulls = pulls + abs(model.tendon_stiffnesspoly).sum(-1)
+    pulls = pulls + abs(model.tendon_dampingpoly).sum(-1)
+    yield (
+        "a tendon with a limit, spring, damping, friction or mass",
+        pulls,
+        model.tendon,
+    )
+    yield "an equality constraint", np.ones(model.neq), model.equality
+    yield "a flexible body", model.nflex, None
+    yield "a plugin", model.nplugin, None
+    yield (
+        "a surface that moves under what stands on it",
+        model.geom_surfacevel.any(),
+        None,
+    )
+    is_static = model.body_weldid[model.geom_bodyid] == 0
+    paired = is_static[model.pair_geom1] | is_static[model.pair_geom2]
+    yield "a contact pair with the ground", paired, model.pair
+    sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    yield "bodies that may sleep", sleeps, None
+
+
+def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
+    """What an `ActuatorController` does not do."""
+    get = model.actuator
+    has_state = model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE
+    yield "an actuator with a state of its own", has_state, get
+    yield "a delayed actuator", model.actuator_delay, get
+    is_plain = np.isin(model.actuator_gaintype, GAINS)
+    is_plain &= np.isin(model.actuator_biastype, BIASES)
+    yield "an actuator that is no motor, position or velocity servo", ~is_plain, get
+    is_single = (model.actuator_ctrlnum == 1) & (model.actuator_outnum == 1)
+    yield "an actuator of several controls", ~is_single, get
+    own = model.actuator_damping + model.actuator_armature
+    own = own + abs(model.actuator_dampingpoly).sum(-1)
+    yield "an actuator with damping or armature of its own", own, get
+    joint_kind = np.array([_kind_of_joint(model, i) for i in range(model.nu)], int)
+    yield "an actuator on no joint or fixed tendon", joint_kind == NOTHING, get
+    yield "an actuator on its free joint", joint_kind == FREE, get
+    is_affine = np.stack((model.actuator_gaintype, model.actuator_biastype)) == AFFINE
+    slopes = np.stack((model.actuator_gainprm[:, 1], model.actuator_biasprm[:, 1]))
+    reads_angle = (is_affine & (slopes != 0.0)).any(0)
+    reads_angle |= model.actuator_trntype == IN_PARENT
+    yield (
+        "an actuator that reads the angle of a ball joint",
+        reads_angle & (joint_kind == BALL),
+        get,
+    )
+    is_off = [bool(model.opt.disableactuator & 1 << g) for g in model.actuator_group]
+    yield "a disabled actuator", is_off, get
+    all_off = model.nu and model.opt.disableflags & NO_ACTUATION
+    yield "actuators that are disabled", all_off, None
+    yield "gravity compensation by actuators", model.jnt_actgravcomp, model.joint
+
+
+def _kind_of_joint(model: mujoco.MjModel, actuator: int) -> int:
+    """Joint type that an actuator drives; a hinge stands for those of a fixed tendon."""
+    kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
+    if kind in (JOINT, IN_PARENT):
+        return int(model.jnt_type[target])
+    if kind != TENDON:
+        return NOTHING
+    wrap = model.wrap_type[model.tendon_adr[target]]
+    return HINGE if wrap == mujoco.mjtWrap.mjWRAP_JOINT else NOTHING
+
+
+def _moves_alike_everywhere(model: mujoco.MjModel, base: Base) -> bool:
+    """True where a free flight, moved and turned about the vertical, stays the same."""
+    flight = copy.copy(model)
+    for bit in ("CONTACT", "ACTUATION"):
+        flight.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}")
+    rng, yaw = np.random.default_rng(0), np.array([0.8, 0.0, 0.0, 0.6])
+    q, v = base.qpos_address, base.dof_address
+    data = mujoco.MjData(flight)
+    mujoco.mj_integratePos(flight, data.qpos, rng.normal(size=model.nv), 1.0)
+    data.qvel = rng.normal(size=model.nv)
+    moved = copy.copy(data)
+    moved.qpos[q : q + 3] += 10.0 * rng.normal(size=3)
+    mujoco.mju_mulQuat(moved.qpos[q + 3 : q + 7], yaw, data.qpos[q + 3 : q + 7])
+    mujoco.mju_rotVecQuat(moved.qvel[v : v + 3], data.qvel[v : v + 3], yaw)
+    for state in (data, moved):
+        mujoco.mj_step(flight, state)
+    expected = data.qvel.copy()
+    mujoco.mju_rotVecQuat(expected[v : v + 3], data.qvel[v : v + 3], yaw)
+    return abs(moved.qvel - expected).max() < 1e-9 * (1.0 + abs(expected).max())

@@ -1,0 +1,81 @@
+"""Three tasks of the Ant: run, spin, spin at 5 rad/s. Paper, appendix B."""
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.ant import STANDING_POSE
+from torchrl_nerd.tasks.floating import (
+    angular_velocity,
+    base_observation,
+    heading,
+    tilted_start,
+    uprightness,
+)
+from torchrl_nerd.tasks.task import State, Task
+
+START_HEIGHT = 1.0  # m
+START_SPREAD = (0.2, 0.2, 0.1)  # m
+START_TILT = torch.pi / 6  # rad
+MIN_HEIGHT = 0.3  # m
+SPIN_TARGET = 5.0  # rad/s
+
+
+class Ant(Task):
+    """What the three share: torques, starts, the 29 observed numbers, the end.
+
+    Observation: `base_observation`. Ends below 0.3 m. The reference code starts the
+    first joint at rest by a slip of its index and drops the 29th number (p_heading);
+    here as in the paper.
+    """
+
+    scene_name = "ant"
+    horizon = 500
+    num_uniforms = 29
+    observation_size = 29
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """Above the ground, tilted up to 30 degrees, near the standing pose."""
+        center = u.new_tensor((0.0, 0.0, START_HEIGHT, *STANDING_POSE))
+        return tilted_start(u, center, START_SPREAD, START_TILT)
+
+    def observation(self, state: State) -> Tensor:
+        """See `base_observation`."""
+        return base_observation(state)
+
+    @abstractmethod
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Of the state that the step led to."""
+
+    def terminated(self, next_state: State) -> Tensor:
+        """The torso is too low."""
+        return next_state[QPOS][..., 2] < MIN_HEIGHT
+
+
+class AntRun(Ant):
+    """Reward v_x + 0.1 p_up + p_heading."""
+
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Of the state that the step led to."""
+        speed = next_state[QVEL][..., 0]
+        return speed + 0.1 * uprightness(next_state) + heading(next_state)
+
+
+class AntSpin(Ant):
+    """Reward w_up + p_up: spin to the left as fast as it can."""
+
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Of the state that the step led to."""
+        return angular_velocity(next_state)[..., 2] + uprightness(next_state)
+
+
+class AntSpinTrack(Ant):
+    """Reward 5 exp(-(w_up - 5)^2 - 0.1 w_x^2 - 0.1 w_y^2) + 0.1 p_up."""
+
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Of the state that the step led to."""
+        x, y, up = angular_velocity(next_state).unbind(-1)
+        cost = (up - SPIN_TARGET) ** 2 + 0.1 * x**2 + 0.1 * y**2
+        return 5.0 * torch.exp(-cost) + 0.1 * uprightness(next_state)

@@ -1,0 +1,67 @@
+"""No goal: a cube is tossed, to measure dynamics. Paper, appendix C.4."""
+
+import torch
+from torch import Tensor
+
+from torchrl_nerd.geometry.frames import rotate
+from torchrl_nerd.geometry.kinematics import matrix_from_quat
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.cube import CLEARANCE, HALF, START
+from torchrl_nerd.tasks.floating import angular_velocity, random_tilt
+from torchrl_nerd.tasks.task import State, Task
+
+
+class CubeToss(Task):
+    """Zero reward, never terminated, nothing to act on: the action has no numbers.
+
+    Observation: height (m), orientation (wxyz), linear velocity of the centre and angular
+    velocity, both in world axes.
+    """
+
+    scene_name = "cube"
+    horizon = 74  # 0.5 s
+    num_uniforms = 13
+    observation_size = 11
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """Tosses of the training ranges.
+
+        The height is drawn from what is clear of the ground at that orientation; the
+        reference draws both again until they are.
+        """
+        where, turn, linear, angular = u.split([3, 4, 3, 3], -1)
+        quat = random_tilt(turn, START.tilt)
+        reach = HALF * matrix_from_quat(quat)[..., 2, :].abs().sum(-1)
+        low = u.new_tensor(START.low).expand_as(where).clone()
+        low[..., 2] = low[..., 2].maximum(reach + CLEARANCE)
+        position = low + (u.new_tensor(START.high) - low) * where
+        velocity = _between(START.linear_low, START.linear_high, linear)
+        spin = _between(START.angular_low, START.angular_high, angular)
+        return {
+            QPOS: torch.cat((position, quat), -1),
+            QVEL: torch.cat((rotate(quat, velocity), spin), -1),
+        }
+
+    def observation(self, state: State) -> Tensor:
+        """Height, orientation, velocities."""
+        parts = (state[QPOS][..., 2:], state[QVEL][..., :3], angular_velocity(state))
+        return torch.cat(parts, -1)
+
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Zero."""
+        return torch.zeros_like(next_state[QVEL][..., 0])
+
+    def terminated(self, next_state: State) -> Tensor:
+        """Never."""
+        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)
+
+
+class RealCubeToss(CubeToss):
+    """The same with the real cube's mass."""
+
+    scene_name = "cube_real"
+
+
+def _between(low: tuple[float, ...], high: tuple[float, ...], u: Tensor) -> Tensor:
+    a, b = u.new_tensor(low), u.new_tensor(high)
+    return a + (b - a) * u

@@ -1,0 +1,108 @@
+"""Franka brings its hand to a point that is drawn at each reset. Paper, appendix B."""
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchrl_nerd.geometry.frames import wrap_angle
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.keys import GOAL, QPOS, QVEL
+from torchrl_nerd.scenes.controllers import PDController
+from torchrl_nerd.scenes.franka import GAIN, HOME
+from torchrl_nerd.tasks.floating import symmetric
+from torchrl_nerd.tasks.task import State, Task
+
+START_SPREAD = 0.125  # rad about HOME
+GOAL_LOW, GOAL_HIGH = (0.3, -0.35, 0.05), (0.7, 0.35, 0.45)  # m, world; reference code
+EPSILON = 1e-4
+KP = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)  # N m/rad; reference code
+KD = (5.0, 5.0, 5.0, 5.0, 3.0, 2.5, 1.5)  # N m s/rad
+ACTION_SCALE = 0.03125  # rad per unit of action from the present position
+
+
+class FrankaReachTorque(Task):
+    """Reward -d + 1/(e^50d + e^-50d + 1e-4) + 1/(e^300d + e^-300d + 1e-4).
+
+    d is the distance (m) of the point between the fingertips to the goal. The action is
+    torque, up to the effort limits. Observation: joint angles in [-pi, pi), the point,
+    the goal; no velocities. Never terminated. 128 actions.
+    """
+
+    scene_name = "franka"
+    horizon = 128
+    num_uniforms = 10
+    observation_size = 13
+    parameters = {GOAL: 3}
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """At rest near home; the goal is uniform in a box before the robot."""
+        low, high = u.new_tensor(GOAL_LOW), u.new_tensor(GOAL_HIGH)
+        return {
+            QPOS: u.new_tensor(HOME) + symmetric(u[..., :7], START_SPREAD),
+            QVEL: torch.zeros_like(u[..., :7]),
+            GOAL: low + (high - low) * u[..., 7:],
+        }
+
+    def end_effector(self, qpos: Tensor) -> Tensor:
+        """The point between the fingertips, m, world, ``(*batch, 3)``."""
+        points, _ = self._kinematics.to(qpos.device)(qpos, torch.zeros_like(qpos))
+        position, rotation = self.scene.base_pose(qpos)
+        return position + (rotation @ points[..., 0, :, None]).squeeze(-1)
+
+    @cached_property
+    def _kinematics(self) -> PointKinematics:
+        model = self.scene.model
+        site = model.site("end_effector")
+        body = int(model.site_bodyid[site.id])
+        return PointKinematics(model, self.scene.base, [body], site.pos[None])
+
+    def observation(self, state: State) -> Tensor:
+        """Joint angles, the point, the goal."""
+        qpos = state[QPOS]
+        return torch.cat((wrap_angle(qpos), self.end_effector(qpos), state[GOAL]), -1)
+
+    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
+        """Of the state that the step led to."""
+        offset = self.end_effector(next_state[QPOS]) - next_state[GOAL]
+        distance = torch.linalg.vector_norm(offset, dim=-1)
+        return -distance + _peak(50.0 * distance) + _peak(300.0 * distance)
+
+    def terminated(self, next_state: State) -> Tensor:
+        """Never."""
+        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)
+
+
+class FrankaReach(FrankaReachTorque):
+    """The same goal by small moves: springs pull to the present position + 0.03125 a.
+
+    Each action holds for two control steps, and the target is taken anew from the
+    position at each of them.
+    """
+
+    steps_per_action = 2
+
+    @property
+    def controller(self) -> PDController:
+        """Springs to a place near the present one, within the effort limits."""
+        joints = tuple(range(7))
+        return PDController(
+            qpos_addresses=joints,
+            dof_addresses=joints,
+            kp=KP,
+            kd=KD,
+            scale=(ACTION_SCALE,) * 7,
+            relative_to="current",
+            limit=GAIN,
+        )
+
+
+class FrankaGravityReachTorque(FrankaReachTorque):
+    """The torque task with the real arm's inertials, under gravity; not in the paper."""
+
+    scene_name = "franka_gravity"
+
+
+def _peak(x: Tensor) -> Tensor:
+    """About one half at zero, falling like e^-x; x must not be negative."""
+    return 1.0 / (x.exp() + (-x).exp() + EPSILON)

@@ -1,0 +1,60 @@
+"""Settings of policy learning for every task that has a goal.
+
+As in the paper's reference code (rl_games), but for what does not carry over: its step
+size follows the policy's KL divergence, here it falls linearly; its Franka policy has an
+LSTM before the hidden layers, here it has none. Cartpole's are this package's own.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation: Schulman et al., https://arxiv.org/abs/1707.06347."""
+
+    total_frames: int = 3_000_000  # actions to learn from
+    num_envs: int = 1024  # rows stepped together
+    horizon: int = 32  # actions of every row between two updates
+    epochs: int = 5  # passes over those actions
+    minibatch: int = 2048  # actions per gradient
+    lr: float = 3e-3  # Adam's step size at the start; falls linearly to zero
+    gamma: float = 0.99  # discount per action
+    lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
+    clip: float = 0.2  # how far an action's probability ratio counts
+    widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic
+
+
+_ANT = PPOConfig(
+    total_frames=32_800_000,
+    num_envs=2048,
+    minibatch=16_384,
+    lr=3e-4,
+    widths=(128, 64, 32),
+)
+_ANYMAL = PPOConfig(
+    total_frames=65_500_000,
+    num_envs=2048,
+    minibatch=16_384,
+    lr=3e-4,
+    widths=(128, 64, 32),
+)
+_FRANKA = PPOConfig(
+    total_frames=26_200_000,
+    num_envs=1024,
+    horizon=128,
+    epochs=8,
+    minibatch=8192,
+    lr=3e-4,
+)
+
+PPO_CONFIGS: dict[str, PPOConfig] = {
+    "cartpole/swingup": PPOConfig(),
+    "ant/run": _ANT,
+    "ant/spin": _ANT,
+    "ant/spin_track": _ANT,
+    "franka/reach": _FRANKA,
+    "franka/reach_torque": _FRANKA,
+    "anymal/forward": _ANYMAL,
+    "anymal/sideways": _ANYMAL,
+}
+"""Task id -> settings."""
