@@ -21,6 +21,7 @@ from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.settings import SettingError
@@ -138,6 +139,8 @@ class Eval:
     """Of the starts; test seeds are never used in training or validation."""
     inference: Inference = "streaming"
     """streaming, or window: the paper's recomputation."""
+    unseen_terrain: bool = False
+    """Over grounds of kinds that no training data have, in place of the paper's."""
     device: str = "cpu"
     """cpu or cuda."""
     json: Path | None = None
@@ -148,17 +151,20 @@ class Eval:
         scene = load_scene(self.scene)
         if self.rows < 2:
             raise ValueError(f"expected at least 2 rows, got {self.rows}")
-        protocol = PROTOCOLS[self.scene]()
+        protocols = UNSEEN_TERRAIN if self.unseen_terrain else PROTOCOLS
+        if self.scene not in protocols:
+            raise ValueError(f"no unseen terrain for '{self.scene}'")
+        protocol = protocols[self.scene]()
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
-        learned = NeRDDynamics(model, inference=self.inference)
         rows = []
-        header = f"{'case':<10}{'steps':>6} {'quantity':<12}{'mean':>9}{'+-':>9}"
+        header = f"{'case':<13}{'steps':>6} {'quantity':<12}{'mean':>9}{'+-':>9}"
         print(f"{header}{'final':>9}{'p95':>9}  paper")
         for case, task in protocol.cases.items():
+            here = model if task.scene is scene else model.over(task.scene)
             errors = passive_errors(
                 task,
-                learned,
-                MujocoDynamics(scene),
+                NeRDDynamics(here, inference=self.inference),
+                MujocoDynamics(task.scene),
                 list(protocol.horizons),
                 self.rows,
                 self.seed,
@@ -171,7 +177,7 @@ class Eval:
                     row = {"case": case, "steps": horizon, "quantity": name}
                     rows.append({**row, **asdict(error), "paper": paper})
                     figures = (error.mean, error.interval, error.final, error.p95)
-                    line = f"{case:<10}{horizon:>6} {name:<9}{error.unit:<3}"
+                    line = f"{case:<13}{horizon:>6} {name:<9}{error.unit:<3}"
                     line += "".join(f"{figure:>9.5f}" for figure in figures)
                     print(f"{line}  {paper if paper is not None else '-'}")
         settings = {"rows": self.rows, "seed": self.seed, "inference": self.inference}

@@ -2,12 +2,18 @@
 
 import mujoco
 import numpy as np
+import pytest
 import torch
 from helpers import random_quats
 
 from torchrl_nerd.geometry.frames import rotate, rotate_inverse
 from torchrl_nerd.geometry.kinematics import matrix_from_quat
-from torchrl_nerd.geometry.surfaces import plane_distance, plane_in_frame
+from torchrl_nerd.geometry.surfaces import (
+    SHAPES,
+    into_frame,
+    plane_distance,
+    plane_in_frame,
+)
 
 ROWS, POINTS, RADIUS = 30, 5, 0.1
 BALL = f"""
@@ -71,3 +77,101 @@ def test_a_plane_seen_from_any_frame_is_the_same_plane(generator):
     torch.testing.assert_close(
         rotate(turn[:, None], normal_f), normal, rtol=0.0, atol=1e-14
     )
+
+
+SIZES = {"sphere": (0.7, 0.0, 0.0), "capsule": (0.4, 0.9, 0.0), "box": (0.5, 1.0, 0.3)}
+SHAPE = """
+<mujoco><worldbody>
+  <body mocap="true"><geom name="shape" type="{kind}" size="{size}"/></body>
+  <body mocap="true"><geom name="ball" size="1e-3"/></body>
+</worldbody></mujoco>"""
+each_shape = pytest.mark.parametrize("kind", SIZES)
+
+
+def to_shape(kind, points):
+    return SHAPES[int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"))](
+        points, torch.tensor(SIZES[kind], dtype=torch.float64)
+    )
+
+
+def points_about(kind, generator):
+    """Points in and round a shape, in its frame."""
+    reach = torch.tensor(SIZES[kind], dtype=torch.float64).max() * 1.5
+    u = torch.rand(ROWS, POINTS, 3, dtype=torch.float64, generator=generator)
+    return reach * (2.0 * u - 1.0)
+
+
+@each_shape
+def test_distance_from_outside_is_mujocos(kind, generator):
+    size = " ".join(map(str, SIZES[kind]))
+    xml = SHAPE.format(kind=kind, size=size)
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.opt.ccd_tolerance = 1e-12
+    data, segment = mujoco.MjData(model), np.empty(6)
+    shape, ball = model.geom("shape").id, model.geom("ball").id
+    quat, origin, _ = random_planes(ROWS, generator)
+    local = points_about(kind, generator)
+    distance, normal = to_shape(kind, local)
+    points = rotate(quat[:, None], local) + origin[:, None]
+    normal = rotate(quat[:, None], normal)
+    seen = 0
+    for row, index in (distance > 2e-3).nonzero().tolist():
+        data.mocap_pos[0], data.mocap_quat[0] = origin[row], quat[row]
+        data.mocap_pos[1] = points[row, index]
+        mujoco.mj_kinematics(model, data)
+        gap = mujoco.mj_geomDistance(model, data, shape, ball, 1e3, segment)
+        assert abs(gap + 1e-3 - float(distance[row, index])) < 1e-6
+        away = (segment[3:] - segment[:3]) / np.linalg.norm(segment[3:] - segment[:3])
+        np.testing.assert_allclose(normal[row, index], away, rtol=0.0, atol=2e-3)
+        seen += 1
+    assert seen > 0.2 * ROWS * POINTS
+
+
+@each_shape
+def test_distance_is_to_the_closest_point(kind, generator):
+    """No point of the surface is closer, and the one that is named is on it."""
+    points = points_about(kind, generator).reshape(-1, 3)
+    distance, normal = to_shape(kind, points)
+    closest = points - distance[:, None] * normal
+    assert to_shape(kind, closest)[0].abs().max() < 1e-13
+    around = 2.0 * torch.randn(2000, 3, dtype=torch.float64, generator=generator)
+    gap, outward = to_shape(kind, around)
+    surface = around - gap[:, None] * outward
+    gaps = torch.cdist(points, surface).amin(-1)
+    assert (gaps >= distance.abs() - 1e-12).all()
+    length = torch.linalg.vector_norm(normal, dim=-1)
+    torch.testing.assert_close(length, torch.ones_like(length), rtol=0.0, atol=1e-13)
+
+
+@each_shape
+def test_the_normal_is_the_slope_of_the_distance(kind, generator):
+    points = points_about(kind, generator).requires_grad_()
+    distance, normal = to_shape(kind, points)
+    (slope,) = torch.autograd.grad(distance.sum(), points)
+    torch.testing.assert_close(slope, normal.detach(), rtol=0.0, atol=1e-12)
+
+
+@each_shape
+def test_centres_edges_and_corners_have_finite_slopes(kind):
+    half = torch.tensor(SIZES[kind], dtype=torch.float64)
+    signs = torch.tensor([[0, 0, 0], [1, 1, 1], [1, 0, 0], [0, 1, -1], [0, 0, -0.5]])
+    points = (signs * half)[None].requires_grad_()
+    distance, normal = to_shape(kind, points)
+    (slope,) = torch.autograd.grad((distance + normal.sum(-1)).sum(), points)
+    length = torch.linalg.vector_norm(normal, dim=-1)
+    torch.testing.assert_close(length, torch.ones_like(length))
+    assert slope.isfinite().all()
+
+
+def test_a_frames_points_are_the_worlds(generator):
+    turn, origin, _ = random_planes(ROWS, generator)
+    base, position, _ = random_planes(ROWS, generator)
+    points = random_points(generator)
+    there, rotation = into_frame(
+        points, position, matrix_from_quat(base), origin, matrix_from_quat(turn)
+    )
+    world = rotate(base[:, None], points) + position[:, None]
+    want = rotate_inverse(turn[:, None], world - origin[:, None])
+    torch.testing.assert_close(there, want, rtol=0.0, atol=1e-13)
+    back = (there - there[:, :1]) @ rotation
+    torch.testing.assert_close(back, points - points[:, :1], rtol=0.0, atol=1e-13)

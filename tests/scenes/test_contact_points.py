@@ -170,8 +170,10 @@ def test_only_what_can_touch_has_points():
     assert len(one_shape(f'{ball} contype="2" conaffinity="4"').contacts) == 0
     assert len(one_shape(f'{ball} contype="0" conaffinity="1"').contacts) == 1
     assert one_shape(ball, ground="").terrain is None
-    second = '<geom type="plane" size="0 0 1" pos="0 0 -1"/>'
-    with pytest.raises(ValueError, match="expected one ground, got 2"):
-        _ = one_shape(ball, PLANE + second).terrain
-    with pytest.raises(ValueError, match="expected a plane as ground, got a box"):
-        _ = one_shape(ball, '<geom type="box" size="1 1 1"/>').terrain
+
+
+def test_only_what_the_robot_can_touch_is_ground():
+    ball = 'type="sphere" size="0.2"'
+    filtered = '<geom type="cylinder" size="1 1" contype="2" conaffinity="2"/>'
+    assert len(one_shape(ball, PLANE + filtered).terrain.surfaces) == 1
+    assert len(one_shape(ball, PLANE + PLANE).terrain.surfaces) == 2

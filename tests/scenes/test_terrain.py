@@ -88,11 +88,11 @@ def test_the_files_plane_is_the_default():
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    terrain = Terrain.from_model(model, 0)
-    normal, offset = terrain.default[:3], terrain.default[3]
+    terrain = Terrain.from_model(model, [0])
+    normal, offset = terrain.fixed_plane[:3], terrain.fixed_plane[3]
     np.testing.assert_allclose(normal, data.geom_xmat[0].reshape(3, 3)[:, 2])
     np.testing.assert_allclose(offset, normal @ data.geom_xpos[0])
-    assert not terrain.is_per_row
+    assert not terrain.is_per_row and terrain.size == 0 and not len(terrain.default)
 
 
 @pytest.mark.parametrize("number", range(7))

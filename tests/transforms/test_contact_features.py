@@ -51,7 +51,8 @@ def data_of(scene):
 def mujoco_contacts(scene, row):
     """Distance and velocity of every point, the ground's normal, the base's axes."""
     model, points, data = scene.model, scene.contacts, data_of(scene)
-    plane = row.get(TERRAIN, torch.from_numpy(scene.terrain.default)).numpy()
+    fixed = scene.terrain.fixed_plane
+    plane = row[TERRAIN].numpy() if fixed is None else fixed
     data.qpos, data.qvel = row[QPOS].numpy(), row[QVEL].numpy()
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -208,7 +209,7 @@ def test_equal_features_mean_equal_motion_on_a_slope(generator):
       <geom name="floor" type="plane" size="0 0 1" quat="0.95 0.3 0 0"/>
       <body><freejoint/><geom size="0.1"/></body></worldbody></mujoco>""")
     rows = random_transitions(scene, 50, generator)
-    normal = torch.from_numpy(scene.terrain.default[:3])
+    normal = torch.from_numpy(scene.terrain.fixed_plane[:3])
     rows[QPOS][:, :3], rows[QVEL][:] = 0.099 * normal, 0.0
     turned = moved_rows(scene, rows, 1.0, torch.zeros(3))
     turned[QPOS][:, :3] = rows[QPOS][:, :3]

@@ -92,6 +92,29 @@ class NeRD(nn.Module):
         delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
         return self.state_delta.integrate(qpos, qvel, delta)
 
+    def over(self, scene: Scene) -> "NeRD":
+        """The same weights for the same robot over another ground.
+
+        Raises:
+            ValueError: another robot, or a ground that is described by other features.
+        """
+        if scene.robot_hash != self.scene.robot_hash:
+            raise ValueError(
+                f"expected the robot of scene '{self.scene.name}' over another ground, "
+                f"got another robot in '{scene.name}'"
+            )
+        with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
+            model = NeRD(scene, self.config)
+        mine, other = self.tokens.contact.sizes, model.tokens.contact.sizes
+        if mine != other:
+            raise ValueError(
+                f"expected a ground with the features {dict(mine)} that the model was "
+                f"trained on, got one with {dict(other)}"
+            )
+        model.network.to(self.dtype)
+        model.load_state_dict(self.state_dict())
+        return model.to(next(self.parameters()).device).train(self.training)
+
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
         """Move everything, but cast the network alone: constants stay float64."""
         for part in (self.tokens, self.state_delta, self.normalize):

@@ -1,5 +1,6 @@
 """Double pendulum of the NeRD paper over a plane that differs from row to row."""
 
+from collections.abc import Callable
 from math import cos, pi, sin
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty import set_penalty_contact
-from torchrl_nerd.scenes.sampling import Sampling
+from torchrl_nerd.scenes.sampling import GroundSampler, Sampling
 from torchrl_nerd.scenes.scene import Scene
 
 GAIN = 1500.0  # N m per unit of action, both joints; env_pendulum_with_contact
@@ -33,10 +34,34 @@ GROUNDS = (
 )
 
 
+ASSET = Path(__file__).parent / "assets" / "double_pendulum.xml"
+
+
 def double_pendulum() -> Scene:
     """Build the scene. ``qpos`` = hinge angles; zero is both links along +x."""
-    path = Path(__file__).parent / "assets" / "double_pendulum.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
+    return _scene(mujoco.MjModel.from_xml_path(str(ASSET)), ground=sample_ground)
+
+
+def double_pendulum_over(add_ground: Callable[[mujoco.MjSpec], None]) -> Scene:
+    """The same robot over a fixed ground of any shape, in place of the random plane.
+
+    Args:
+        add_ground: adds shapes to the world; whatever it adds touches the pendulum and
+            has its contact parameters, as the plane does.
+    """
+    spec = mujoco.MjSpec.from_file(str(ASSET))
+    spec.delete(spec.body("ground"))
+    add_ground(spec)
+    for geom in spec.worldbody.geoms:
+        geom.contype, geom.conaffinity = 1, 0
+    return _scene(spec.compile(), clearance=0.0)
+
+
+def _scene(
+    model: mujoco.MjModel,
+    ground: GroundSampler | None = None,
+    clearance: float | None = None,
+) -> Scene:
     set_penalty_contact(model, **CONTACT)
     return Scene(
         name="double_pendulum",
@@ -49,7 +74,8 @@ def double_pendulum() -> Scene:
             qvel_low=(-2 * pi, -4 * pi),
             qvel_high=(2 * pi, 4 * pi),
             torque=(GAIN, GAIN),
-            ground=sample_ground,
+            ground=ground,
+            clearance=clearance,
         ),
     )
 

@@ -9,6 +9,8 @@ import hashlib
 import mujoco
 import numpy as np
 
+from torchrl_nerd.scenes.contact_points import ground_geoms
+
 ALWAYS = (
     *("body_parentid", "body_pos", "body_quat", "body_mass", "body_inertia"),
     *("body_ipos", "body_iquat", "jnt_type", "jnt_pos", "jnt_axis", "jnt_range"),
@@ -31,6 +33,13 @@ RARELY = {
 """Arrays and the value of which each of their entries is by default."""
 
 SOLVER = ("solver", "iterations", "noslip_iterations", "enableflags")  # no tolerances
+GROUND = (
+    *("geom_bodyid", "body_mocapid", "geom_dataid", "hfield_nrow", "hfield_ncol"),
+    *("hfield_adr",),
+)
+"""Of a ground that is more than one plane; a lone plane has nothing to say here."""
+NUMBERED = ("mesh", "hfield", "pair", "exclude")
+"""Of the ground too, or naming bodies and shapes by numbers that depend on it."""
 OVERRIDES = ("o_margin", "o_solref", "o_solimp", "o_friction")
 
 
@@ -39,14 +48,41 @@ def fingerprint(model: mujoco.MjModel, substeps: int) -> str:
     digest = hashlib.sha256()
     for field in ALWAYS:
         digest.update(np.ascontiguousarray(getattr(model, field)).tobytes())
+    digest.update(_stepping(model, substeps).tobytes())
+    unusual, grounds = _unusual(model), ground_geoms(model)
+    if len(grounds) > 1 or any(model.geom_type[grounds] != mujoco.mjtGeom.mjGEOM_PLANE):
+        unusual |= {name: np.asarray(getattr(model, name)) for name in GROUND}
+    for name, value in unusual.items():
+        digest.update(name.encode() + np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def robot_fingerprint(model: mujoco.MjModel, substeps: int) -> str:
+    """Hash of the robot and its steps: equal over any ground.
+
+    A fixed base counts with its place in the body that it stands on, not in the world.
+    """
+    moves = model.body_dofnum[model.body_weldid] > 0
+    chosen = {"body": moves, "geom": moves[model.geom_bodyid]}
+    digest = hashlib.sha256(_stepping(model, substeps).tobytes())
+    values = {name: np.asarray(getattr(model, name)) for name in ALWAYS}
+    # counted within the robot, from 1: its bodies' own numbers depend on the ground's
+    values["body_parentid"] = (np.cumsum(moves) * moves)[model.body_parentid]
+    others = {k: v for k, v in _unusual(model).items() if not k.startswith(NUMBERED)}
+    for name, value in {**values, **others}.items():
+        value = value[chosen.get(name.split("_")[0], ...)]
+        if name in values or np.any(value != RARELY.get(name)):
+            digest.update(name.encode() + np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _stepping(model: mujoco.MjModel, substeps: int) -> np.ndarray:
+    """Numbers of the whole world that decide a step."""
     option = model.opt
     numbers = [option.timestep, substeps, *option.gravity, option.impratio]
     numbers += [option.density, option.viscosity, *option.wind]
     numbers += [int(option.integrator), int(option.disableflags), int(option.cone)]
-    digest.update(np.array(numbers, float).tobytes())
-    for name, value in _unusual(model).items():
-        digest.update(name.encode() + np.ascontiguousarray(value).tobytes())
-    return digest.hexdigest()[:16]
+    return np.array(numbers, float)
 
 
 def _unusual(model: mujoco.MjModel) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ from torchrl_nerd.scenes.explain import (
     base_effects,
     find_symmetries,
 )
-from torchrl_nerd.scenes.fingerprint import fingerprint
+from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
 from torchrl_nerd.scenes.importer import (
     Imported,
     import_dm_control,
@@ -41,6 +41,7 @@ from torchrl_nerd.scenes.importer import (
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
 from torchrl_nerd.scenes.support import check_supported
 from torchrl_nerd.scenes.terrain import Terrain
+from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
 LARGEST_REDRAWS = 300  # of starts that are not clear of the ground
 
@@ -162,11 +163,18 @@ class Scene:
     def terrain(self) -> Terrain | None:
         """The ground, or None where nothing can touch it."""
         grounds = ground_geoms(self.model) if len(self.contacts) else []
-        if len(grounds) > 1:
-            raise ValueError(
-                f"expected one ground, got {len(grounds)} in '{self.name}'"
-            )
-        return Terrain.from_model(self.model, grounds[0]) if grounds else None
+        return Terrain.from_model(self.model, grounds) if grounds else None
+
+    @cached_property
+    def terrain_distance(self) -> TerrainDistance:
+        """Distance to the ground, exact wherever a contact point has features.
+
+        Raises:
+            ValueError: the scene has no ground.
+        """
+        if self.terrain is None:
+            raise ValueError(f"nothing in scene '{self.name}' can touch a ground")
+        return TerrainDistance(self.terrain, float(self.contacts.margins.max()))
 
     @cached_property
     def symmetries(self) -> Symmetries:
@@ -193,6 +201,11 @@ class Scene:
     def hash(self) -> str:
         """Fingerprint of the physics: equal for equal robots, steps and grounds."""
         return fingerprint(self.model, self.substeps)
+
+    @cached_property
+    def robot_hash(self) -> str:
+        """Fingerprint of the robot and its steps alone: equal over any ground."""
+        return robot_fingerprint(self.model, self.substeps)
 
     def sample_initial(
         self, rows: int, generator: Generator
@@ -260,9 +273,8 @@ class Scene:
             *qpos.shape[:-1], self.layout.nv
         )
         points, _ = self.point_kinematics.to(qpos.device)(qpos, at_rest)
-        ground = torch.as_tensor(self.terrain.default).to(qpos)
-        ground = ground.expand(*qpos.shape[:-1], -1) if terrain is None else terrain
-        distance, _ = self.terrain.distance(points, ground, *self.base_pose(qpos))
+        ground = self.terrain_distance.to(qpos.device)
+        distance, _ = ground(points, terrain, *self.base_pose(qpos))
         return distance - torch.as_tensor(self.contacts.radii).to(qpos)
 
     def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

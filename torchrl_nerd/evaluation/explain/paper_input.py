@@ -167,11 +167,8 @@ def see_ground(
     rotation: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Distance (m) and normal of points in a frame; ``terrain`` None: as in the file."""
-    assert scene.terrain is not None
-    if terrain is None:
-        default = torch.as_tensor(scene.terrain.default).to(points)
-        terrain = default.expand(*points.shape[:-2], -1)
-    return scene.terrain.distance(points, terrain, position, rotation)
+    ground = scene.terrain_distance.to(points.device)
+    return ground(points, terrain, position, rotation)
 
 
 def contact_pieces(

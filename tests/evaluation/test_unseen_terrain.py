@@ -1,0 +1,79 @@
+"""Trained on planes, run over other ground: the same weights, and MuJoCo's contacts."""
+
+import mujoco
+import pytest
+import torch
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli import main
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
+from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
+from torchrl_nerd.files import read_json
+from torchrl_nerd.keys import QPOS
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes.double_pendulum import double_pendulum_over
+from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
+
+CASES = UNSEEN_TERRAIN["double_pendulum"]().cases
+each_case = pytest.mark.parametrize("case", CASES)
+
+
+@each_case
+def test_only_the_ground_differs(case):
+    scene, trained = CASES[case].scene, load_scene("double_pendulum")
+    assert scene.robot_hash == trained.robot_hash and scene.hash != trained.hash
+    assert not scene.terrain.is_per_row
+    links = [scene.model.geom(name).id for name in ("link1", "link2")]
+    others = [trained.model.geom(name).id for name in ("link1", "link2")]
+    for field in ("geom_solref", "geom_solimp", "geom_friction", "geom_priority"):
+        ours, theirs = getattr(scene.model, field), getattr(trained.model, field)
+        assert (ours[links] == theirs[others]).all()
+
+
+@each_case
+def test_starts_are_those_over_planes_and_in_the_clear(case, seed):
+    task = CASES[case]
+    start = initial_states(task, 500, seed)
+    over_planes = initial_states(DoublePendulumPassive(0), 500, seed)
+    assert torch.equal(start[QPOS], over_planes[QPOS])
+    assert "terrain" not in start.keys() and not task.parameters
+    assert task.scene.clearances(start[QPOS]).min() > 0.0
+
+
+@each_case
+def test_the_pendulum_hits_the_ground_and_the_trained_model_follows(case, seed):
+    """Far nearer to the truth than the same model without any ground in reach."""
+    task, rows, steps = CASES[case], 64, 40
+    start = initial_states(task, rows, seed)
+    truth = open_loop(MujocoDynamics(task.scene, 1), start, steps)
+    model = from_pretrained("double_pendulum")
+    learned = open_loop(NeRDDynamics(model.over(task.scene)), start, steps)
+    air = torch.tensor([0.0, 0.0, 1.0, -50.0]).double().expand(rows, -1)
+    blind = open_loop(NeRDDynamics(model), start.clone().set("terrain", air), steps)
+    touching = task.scene.clearances(truth).amin((1, 2)) < 0.0
+    assert touching.any()
+    errors = [(x - truth)[touching].abs().mean() for x in (learned, blind)]
+    assert errors[0] < 0.4 * errors[1]
+
+
+def test_other_robots_and_other_features_are_refused():
+    model = from_pretrained("double_pendulum")
+    with pytest.raises(ValueError, match="got another robot in 'cartpole'"):
+        model.over(load_scene("cartpole"))
+
+    def floor(spec):
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1, 1, 1))
+
+    with pytest.raises(ValueError, match="ground with the features .*contact_normal"):
+        model.over(double_pendulum_over(floor))
+
+
+def test_the_command_measures_them(tmp_path, capsys):
+    out = tmp_path / "errors.json"
+    argv = ["eval", "double_pendulum", "--unseen-terrain", "--rows", "4"]
+    assert main([*argv, "--json", str(out)]) == 0
+    rows = read_json(out)["errors"]
+    assert [row["case"] for row in rows] == [case for case in CASES for _ in range(2)]
+    assert main(["eval", "cartpole", "--unseen-terrain"]) == 2
+    assert "no unseen terrain for 'cartpole'" in capsys.readouterr().err

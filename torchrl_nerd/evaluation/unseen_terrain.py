@@ -1,0 +1,103 @@
+"""Grounds of kinds that the training data never had: only planes are trained on.
+
+A contact point sees the nearest surface's distance and normal, whatever the surface is,
+so the trained weights run unchanged. Two things they cannot see: a surface that touches a
+link between its contact points, as the edge of a box does, and that MuJoCo gives a height
+field one contact for every prism of it that a cap dips into, so that its ground is
+several times stiffer near seams than a plane. The flat field, which is ground 1 of the
+paper as a height field, shows how much of an error is the latter.
+"""
+
+from collections.abc import Callable
+from math import cos, pi, sin
+
+import mujoco
+import numpy as np
+from torch import Tensor
+
+from torchrl_nerd.evaluation.protocols import Protocol
+from torchrl_nerd.keys import TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.double_pendulum import double_pendulum_over
+from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
+
+
+class DoublePendulumOver(DoublePendulumPassive):
+    """The passive double pendulum over a fixed ground; the same starts as over planes.
+
+    Args:
+        add_ground: see `double_pendulum_over`.
+    """
+
+    parameters = {}
+
+    def __init__(self, add_ground: Callable[[mujoco.MjSpec], None]) -> None:
+        super().__init__(ground=0)
+        self._scene = double_pendulum_over(add_ground)
+
+    @property
+    def scene(self) -> Scene:
+        """The pendulum and its ground."""
+        return self._scene
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """As over planes, without a row's ground."""
+        state = super().initial_state(u)
+        del state[TERRAIN]
+        return state
+
+
+def two_planes(spec: mujoco.MjSpec) -> None:
+    """A valley: slopes of 15 and 30 degrees that meet 2.75 m below the root."""
+    for tilt in (pi / 12, -pi / 6):
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            pos=(0.0, 0.0, -0.75),
+            quat=(cos(tilt / 2), 0.0, sin(tilt / 2), 0.0),
+            size=(4.0, 4.0, 0.1),
+        )
+
+
+def box_edge(spec: mujoco.MjSpec) -> None:
+    """A step: right of the edge 1.8 m below the root, left of it out of reach."""
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, pos=(2.5, -1.0, -0.8), size=(2.0, 1.0, 1.0)
+    )
+
+
+def height_field(spec: mujoco.MjSpec) -> None:
+    """Waves 0.25 m high in cells of half a metre, up to 2.05 m below the root."""
+    x, y = np.meshgrid(np.linspace(-4.0, 4.0, 17), np.linspace(-2.0, 2.0, 9))
+    waves = np.sin(1.7 * x + 0.4) * np.cos(1.1 * y) + 0.5 * np.sin(2.9 * x - 1.3 * y)
+    _add_field(spec, waves, base=-0.3)
+
+
+def flat_field(spec: mujoco.MjSpec) -> None:
+    """The level plane 2 m below the root, as a height field of the same cells."""
+    _add_field(spec, np.zeros((9, 17)), base=0.0)
+
+
+def _add_field(spec: mujoco.MjSpec, heights: np.ndarray, base: float) -> None:
+    rows, columns = heights.shape
+    size = (4.0, 2.0, 0.25, 0.5)  # m: half x, half y, height of the highest, depth
+    spec.add_hfield(
+        name="field", nrow=rows, ncol=columns, size=size, userdata=heights.reshape(-1)
+    )
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field", pos=(0.0, -1.0, base)
+    )
+
+
+def double_pendulum() -> Protocol:
+    """Four grounds, 100 passive steps; the paper has none of them."""
+    grounds = (two_planes, box_edge, height_field, flat_field)
+    cases: dict[str, Task] = {
+        ground.__name__.replace("_", " "): DoublePendulumOver(ground)
+        for ground in grounds
+    }
+    return Protocol(cases, (100,), {})
+
+
+UNSEEN_TERRAIN: dict[str, Callable[[], Protocol]] = {"double_pendulum": double_pendulum}
+"""Protocols over unseen ground, by scene."""
