@@ -3,13 +3,25 @@
 from collections.abc import Callable
 from functools import cache
 
+from torchrl_nerd.scenes.ant import ant
+from torchrl_nerd.scenes.anymal import anymal
 from torchrl_nerd.scenes.cartpole import cartpole
+from torchrl_nerd.scenes.cube import cube
+from torchrl_nerd.scenes.cube_real import cube_real
 from torchrl_nerd.scenes.double_pendulum import double_pendulum
+from torchrl_nerd.scenes.franka import franka
+from torchrl_nerd.scenes.franka_gravity import franka_gravity
 from torchrl_nerd.scenes.scene import Scene
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "cartpole": cartpole,
     "double_pendulum": double_pendulum,
+    "ant": ant,
+    "franka": franka,
+    "franka_gravity": franka_gravity,
+    "anymal": anymal,
+    "cube": cube,
+    "cube_real": cube_real,
 }
 
 

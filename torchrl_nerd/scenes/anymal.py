@@ -1,0 +1,99 @@
+"""ANYmal C of the NeRD paper: twelve joints, driven by springs to random targets."""
+
+from math import pi
+from pathlib import Path
+
+import mujoco
+import torch
+from torch import Generator, Tensor
+
+from torchrl_nerd.scenes.controllers import TorqueController
+from torchrl_nerd.scenes.penalty import set_penalty_contact, set_penalty_limit
+from torchrl_nerd.scenes.sampling import BaseSampling, Sampling
+from torchrl_nerd.scenes.scene import Scene
+
+LEGS = ("LF", "RF", "LH", "RH")  # left and right, fore and hind
+GAIN = (75.0, 60.0, 12.0) * 4  # N m per unit of action: HAA, HFE, KFE; reference code
+SUBSTEPS = 10  # of 1/600 s: control step 1/60 s; paper, appendix B
+LIMIT_STIFFNESS = 1e3  # N m/rad, beyond the HAA's range; reference importer's limit_ke
+LIMIT_DAMPING = 10.0  # N m s/rad; limit_kd
+# Means of the robot's and the ground's numbers, as the reference engine takes them:
+# N/m, N s/m, N s/m, -
+CONTACT = {"ke": 5.1e4, "kd": 750.0, "kf": 550.0, "mu": 0.625}
+
+# The stance that the published policies stand in, knees outward, rad, leg by leg (HAA,
+# HFE, KFE). The reference lists its numbers for LF, RF, LH, RH, but its importer orders
+# the legs RH, LH, RF, LF; the usual stance (HFE +0.4 fore, knees inward) is the other one.
+STANDING_POSE = (
+    *(-0.03, -0.4, 0.8),
+    *(0.03, -0.4, 0.8),
+    *(-0.03, 0.4, -0.8),
+    *(0.03, 0.4, -0.8),
+)
+STANDING_HEIGHT = 0.6230  # m, of the base's origin, feet touching
+
+KP, KD = 85.0, 2.0  # N m/rad, N m s/rad: the tasks' controller; reference code
+ACTION_SCALE = 0.5  # rad per unit of action about the standing pose
+RANDOM_KP = (30.0, 200.0)  # N m/rad; reference code, trajectory_sampler_anymal
+RANDOM_KD = (0.0, 1.0)  # N m s/rad
+
+
+def anymal() -> Scene:
+    """Build the scene. ``qpos`` = base position (m), quaternion, joints (rad).
+
+    Joints in the order of `LEGS`, each HAA, HFE, KFE.
+    """
+    path = Path(__file__).parent / "assets" / "anymal.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    set_penalty_contact(model, **CONTACT)
+    for leg in LEGS:
+        set_penalty_limit(model, f"{leg}_HAA", ke=LIMIT_STIFFNESS, kd=LIMIT_DAMPING)
+    # Starts of the reference's data, which are those of its env.
+    base = BaseSampling(
+        low=(-0.2, -0.2, 0.65),
+        high=(0.2, 0.2, 1.0),
+        tilt=pi / 6,
+        linear_low=(-0.1,) * 3,
+        linear_high=(0.1,) * 3,
+        angular_low=(-0.25,) * 3,
+        angular_high=(0.25,) * 3,
+    )
+    return Scene(
+        name="anymal",
+        model=model,
+        substeps=SUBSTEPS,
+        controller=TorqueController(GAIN),
+        sampling=Sampling(
+            qpos_low=tuple(q - 0.2 for q in STANDING_POSE),
+            qpos_high=tuple(q + 0.2 for q in STANDING_POSE),
+            qvel_low=(-0.25,) * 12,
+            qvel_high=(0.25,) * 12,
+            torque=GAIN,
+            base=base,
+            drive=random_pd,
+            passive_share=0.1,
+            quiet_share=0.3,
+        ),
+    )
+
+
+def random_pd(
+    qpos: Tensor, qvel: Tensor, scale: Tensor, generator: Generator
+) -> Tensor:
+    """Springs and dampers to random targets about the standing pose, N m, ``(n, 12)``.
+
+    target = pose + 0.5 a, a uniform in [-1, 1]. Rows of scale 1 are the reference's: Kp
+    and Kd are drawn anew at every step, here per row (there one for all rows). Quiet rows
+    (0 < scale < 1) have the tasks' Kp and Kd and targets within ``scale`` of that range:
+    they stand and shuffle as a policy would, which the violent ones never do. Rows of
+    scale 0 are passive.
+    """
+    rows = len(qpos)
+    draw = torch.rand(rows, 14, dtype=torch.float64, generator=generator)
+    (low_kp, high_kp), (low_kd, high_kd) = RANDOM_KP, RANDOM_KD
+    is_quiet = scale < 1.0
+    kp = torch.where(is_quiet, KP, low_kp + (high_kp - low_kp) * draw[:, :1])
+    kd = torch.where(is_quiet, KD, low_kd + (high_kd - low_kd) * draw[:, 1:2])
+    reach = ACTION_SCALE * scale * (2.0 * draw[:, 2:] - 1.0)
+    offset = draw.new_tensor(STANDING_POSE) + reach - qpos[:, 7:]
+    return torch.where(scale > 0.0, kp * offset - kd * qvel[:, 6:], 0.0)

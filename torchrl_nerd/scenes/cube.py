@@ -1,0 +1,54 @@
+"""Cube of the NeRD paper's simulated tosses: 1.151 kg, no joints, no motors."""
+
+from math import pi
+from pathlib import Path
+
+import mujoco
+
+from torchrl_nerd.scenes.controllers import TorqueController
+from torchrl_nerd.scenes.penalty import set_penalty_contact
+from torchrl_nerd.scenes.sampling import BaseSampling, Sampling
+from torchrl_nerd.scenes.scene import Scene
+
+SUBSTEPS = 20  # of 1/2960 s: control step 1/148 s, the real tosses' frame rate
+CONTACT = {"ke": 1e4, "kd": 1e3, "kf": 50.0, "mu": 0.15}  # N/m, N s/m, N s/m, -
+HALF = 0.0524  # m, half the side
+
+# Starts of tosses; reference code, env_cube_toss. Drawn again until all corners are clear.
+START = BaseSampling(
+    low=(-1.048, -1.048, 0.0472),
+    high=(1.048, 1.048, 0.262),
+    tilt=pi / 6,
+    linear_low=(-3.5, -3.5, -1.0),
+    linear_high=(3.5, 3.5, 0.2),
+    angular_low=(-10.0, -10.0, -7.0),
+    angular_high=(12.0, 8.0, 4.0),
+)
+CLEARANCE = 1e-3  # m
+
+
+def cube() -> Scene:
+    """Build the scene. ``qpos`` = centre (m), quaternion."""
+    return cube_scene("cube", CONTACT)
+
+
+def cube_scene(name: str, contact: dict[str, float]) -> Scene:
+    """A cube of that name in the assets, with penalty contacts."""
+    path = Path(__file__).parent / "assets" / f"{name}.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    set_penalty_contact(model, **contact)
+    return Scene(
+        name=name,
+        model=model,
+        substeps=SUBSTEPS,
+        controller=TorqueController(()),
+        sampling=Sampling(
+            qpos_low=(),
+            qpos_high=(),
+            qvel_low=(),
+            qvel_high=(),
+            torque=(),
+            base=START,
+            clearance=CLEARANCE,
+        ),
+    )
