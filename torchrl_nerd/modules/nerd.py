@@ -23,7 +23,7 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
     "mlp": MLPConfig(),
-    "mlp-wide": MLPConfig(depth=4, width=128),
+    "mlp-wide": MLPConfig(depth=4, width=120),
     "mlp-large": MLPConfig(depth=4, width=256),
     "gru": GRUConfig(),
 }

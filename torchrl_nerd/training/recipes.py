@@ -23,7 +23,13 @@ RECIPES: dict[str, Recipe] = {
     ),
     "double_pendulum": Recipe(
         DataConfig(trajectories=40_000, steps=100),
-        TrainConfig(network="wide", steps=36_000, rollout_steps=4_000, softening=1.0),
+        TrainConfig(
+            network="mlp-wide",
+            steps=36_000,
+            rollout_steps=4_000,
+            single_share=1.0,
+            softening=1.0,
+        ),
         "double_pendulum/passive",
     ),
 }

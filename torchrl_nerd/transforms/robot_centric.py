@@ -117,7 +117,9 @@ class _JointFeatures:
                 if v in ignored.velocities:
                     found.gated.append((len(found.limited), v))
                 low, high = (float(x) for x in model.jnt_range[joint])
-                margin = LIMIT_STEPS * scene.control_step * float(speed[v])
+                # from the end: the ranges may leave out a floating base, which is first
+                fastest = float(speed[v - model.nv])
+                margin = LIMIT_STEPS * scene.control_step * fastest
                 found.limited.append(q)
                 found.limits.append((low, high, margin))
         return found
