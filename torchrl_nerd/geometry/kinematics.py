@@ -23,9 +23,9 @@ FREE, BALL, SLIDE, HINGE = (
 )
 
 
-BodyPose = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Origin (m), rotation matrix, angular velocity (rad/s) and velocity of the origin (m/s)
-of a body, in B_t and relative to it."""
+BodyPoses = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Origins ``(*batch, n, 3)`` m, rotations ``(*batch, n, 3, 3)``, angular velocities rad/s
+and velocities of the origins m/s, both ``(*batch, n, 3)``, in B_t and relative to it."""
 
 
 @dataclass(frozen=True)
@@ -88,17 +88,23 @@ def skew(v: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Joint:
-    kind: int
-    qpos_address: int
-    dof_address: int
-    rest: float  # qpos0: the position at which the body stands as the file wrote it
-    is_at_origin: bool
-    constants: str  # name of the buffer [axis, anchor, skew(axis), skew(axis)^2]
+class _Group:
+    """Bodies at one depth of the tree that have joints of the same kinds."""
+
+    name: str  # of its buffers
+    bodies: list[int]
+    parents: list[int]  # places in the depth above
+    kinds: tuple[int, ...]
+    qpos_addresses: list[list[int]]  # per joint, per body
+    dof_addresses: list[list[int]]
+    is_at_origin: list[bool]  # per joint: every anchor is the body's origin
+    is_placed: bool  # False for a fixed base, whose mount is B_t itself
 
 
 class PointKinematics(nn.Module):
     """Positions and velocities of body-fixed points, in and relative to the base frame.
+
+    Bodies of equal depth and kind are moved together: four legs cost as much as one.
 
     Args:
         model: compiled model.
@@ -106,6 +112,8 @@ class PointKinematics(nn.Module):
         bodies: body id of each of the P points.
         positions: ``(P, 3)``, m, in the body's frame.
     """
+
+    points: Tensor
 
     def __init__(
         self,
@@ -116,39 +124,82 @@ class PointKinematics(nn.Module):
     ) -> None:
         super().__init__()
         self.base = base
-        self.points_of: dict[int, list[int]] = {}
-        for index, body in enumerate(bodies):
-            self.points_of.setdefault(body, []).append(index)
-        self.order = [i for points in self.points_of.values() for i in points]
-        self.inverse_order = [int(i) for i in np.argsort(self.order)]
-        self.chain = _bodies_on_path(model, base, bodies)
-        self.parent = {b: int(model.body_parentid[b]) for b in self.chain}
-        self.joints = {b: self._joints(model, b) for b in self.chain}
-        for body in self.chain:
-            self._constant(f"pos_{body}", model.body_pos[body])
-            self._constant(f"rot_{body}", quat_matrix(model.body_quat[body]))
-        for body, points in self.points_of.items():
-            self._constant(f"points_{body}", positions[points])
+        depth: dict[int, int] = {}
+        for body in _bodies_on_path(model, base, bodies):  # parents first
+            depth[body] = depth.get(int(model.body_parentid[body]), -1) + 1
+        self.depths: list[list[_Group]] = []
+        order, above = [base.body] if base.is_floating else [], {base.body: 0}
+        for level in range(max(depth.values(), default=-1) + 1):
+            here = [body for body in depth if depth[body] == level]
+            groups = self._groups(model, here, above, level)
+            ordered = [body for group in groups for body in group.bodies]
+            above = {body: index for index, body in enumerate(ordered)}
+            order += ordered
+            self.depths.append(groups)
+        self.body_of_point = [order.index(body) for body in bodies]
+        self._constant("points", np.asarray(positions).reshape(-1, 3))
 
-    def _constant(self, name: str, value: np.ndarray) -> None:
+    def _constant(self, name: str, value: object) -> None:
         tensor = torch.as_tensor(np.array(value), dtype=torch.float64)
         self.register_buffer(name, tensor, persistent=False)
 
-    def _joints(self, model: mujoco.MjModel, body: int) -> list[_Joint]:
-        start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        joints = []
-        for j in range(start, start + count):
-            if model.jnt_type[j] == FREE:
-                continue
-            axis, anchor = model.jnt_axis[j], model.jnt_pos[j]
-            k = skew(axis)
-            self._constant(f"joint_{j}", np.vstack((axis, anchor, k, k @ k)))
-            q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-            is_ball = model.jnt_type[j] == BALL
-            rest = 0.0 if is_ball else float(model.qpos0[q])
-            kind = int(model.jnt_type[j])
-            joints.append(_Joint(kind, q, v, rest, not anchor.any(), f"joint_{j}"))
-        return joints
+    def _groups(
+        self,
+        model: mujoco.MjModel,
+        bodies: list[int],
+        above: dict[int, int],
+        depth: int,
+    ) -> list[_Group]:
+        by_kind: dict[tuple[int, ...], list[int]] = {}
+        for body in bodies:
+            kinds = tuple(int(model.jnt_type[j]) for j in _joints(model, body))
+            by_kind.setdefault(kinds, []).append(body)
+        groups = []
+        for number, (kinds, members) in enumerate(by_kind.items()):
+            name = f"{depth}_{number}"
+            self._constant(f"pos_{name}", model.body_pos[members])
+            self._constant(
+                f"rot_{name}", [quat_matrix(model.body_quat[b]) for b in members]
+            )
+            slots = list(zip(*(_joints(model, body) for body in members), strict=True))
+            for slot, joints in enumerate(slots):
+                self._joint_constants(model, f"{name}_{slot}", joints)
+            is_placed = members[0] != self.base.body
+            groups.append(
+                _Group(
+                    name,
+                    members,
+                    [
+                        above[int(model.body_parentid[b])] if is_placed else 0
+                        for b in members
+                    ],
+                    kinds,
+                    [[int(model.jnt_qposadr[j]) for j in joints] for joints in slots],
+                    [[int(model.jnt_dofadr[j]) for j in joints] for joints in slots],
+                    [
+                        not any(model.jnt_pos[j].any() for j in joints)
+                        for joints in slots
+                    ],
+                    is_placed,
+                )
+            )
+        return groups
+
+    def _joint_constants(
+        self, model: mujoco.MjModel, name: str, joints: tuple[int, ...]
+    ) -> None:
+        """Axes, anchors, rest positions, and the cross-product matrix and its square."""
+        crosses = [skew(model.jnt_axis[j]) for j in joints]
+        # qpos0: the position at which the body stands as the file wrote it
+        rest = [
+            0.0 if model.jnt_type[j] == BALL else model.qpos0[model.jnt_qposadr[j]]
+            for j in joints
+        ]
+        self._constant(f"axis_{name}", [model.jnt_axis[j] for j in joints])
+        self._constant(f"anchor_{name}", [model.jnt_pos[j] for j in joints])
+        self._constant(f"rest_{name}", rest)
+        self._constant(f"cross_{name}", crosses)
+        self._constant(f"square_{name}", [k @ k for k in crosses])
 
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """Positions and velocities of the points relative to the base frame.
@@ -161,55 +212,53 @@ class PointKinematics(nn.Module):
             positions ``(*batch, P, 3)``, m, and velocities ``(*batch, P, 3)``, m/s, as
             seen by an observer who rides on the base; both in B_t.
         """
-        at_base = _at_rest(qpos)
-        pose = {self.base.body: at_base}
-        positions, velocities = [], []
-        for body in self.chain:
-            parent = at_base if body == self.base.body else pose[self.parent[body]]
-            pose[body] = self._body_pose(body, parent, qpos, qvel)
-        for body in self.points_of:
-            position, rotation, omega, velocity = pose[body]
-            arm = getattr(self, f"points_{body}") @ rotation.mT
-            positions.append(position[..., None, :] + arm)
-            turning = torch.linalg.cross(omega[..., None, :].expand_as(arm), arm)
-            velocities.append(velocity[..., None, :] + turning)
-        order = self.inverse_order
-        position, velocity = torch.cat(positions, -2), torch.cat(velocities, -2)
-        return position[..., order, :], velocity[..., order, :]
+        above = _at_rest(qpos)
+        poses = [above] if self.base.is_floating else []
+        for groups in self.depths:
+            moved = [self._move(g, _pick(above, g.parents), qpos, qvel) for g in groups]
+            above = _join(moved)
+            poses.append(above)
+        position, rotation, omega, velocity = _pick(_join(poses), self.body_of_point)
+        arm = _turn(rotation, self.points)
+        return position + arm, velocity + torch.linalg.cross(omega, arm)
 
-    def _body_pose(
-        self, body: int, parent: BodyPose, qpos: Tensor, qvel: Tensor
-    ) -> BodyPose:
-        """Pose and motion of one body: its place in the parent, then its joints."""
+    def _move(
+        self, group: _Group, parent: BodyPoses, qpos: Tensor, qvel: Tensor
+    ) -> BodyPoses:
+        """Poses and motions of a group: its places in the parents, then its joints."""
         position, rotation, omega, velocity = parent
-        if body != self.base.body:
-            offset = rotation @ getattr(self, f"pos_{body}")
+        if group.is_placed:
+            offset = _turn(rotation, getattr(self, f"pos_{group.name}"))
             position = position + offset
             velocity = velocity + torch.linalg.cross(omega, offset)
-            rotation = rotation @ getattr(self, f"rot_{body}")
-        for joint in self.joints[body]:
-            constants = getattr(self, joint.constants)
-            q = qpos[..., joint.qpos_address] - joint.rest
-            v = qvel[..., joint.dof_address, None]
-            axis = rotation @ constants[0]
-            if joint.kind == SLIDE:
+            rotation = rotation @ getattr(self, f"rot_{group.name}")
+        for slot, kind in enumerate(group.kinds):
+            if kind == FREE:
+                continue
+            name = f"{group.name}_{slot}"
+            q_at, v_at = group.qpos_addresses[slot], group.dof_addresses[slot]
+            q = qpos[..., q_at] - getattr(self, f"rest_{name}")
+            v = qvel[..., v_at, None]
+            axis = _turn(rotation, getattr(self, f"axis_{name}"))
+            if kind == SLIDE:
                 position = position + axis * q[..., None]
                 velocity = velocity + torch.linalg.cross(omega, axis * q[..., None])
                 velocity = velocity + axis * v
                 continue
-            if joint.kind == HINGE:
+            if kind == HINGE:
                 sine, cosine = q.sin()[..., None, None], q.cos()[..., None, None]
-                turn = eye_like(sine) + sine * constants[2:5]
-                turn = turn + (1.0 - cosine) * constants[5:8]
+                turn = eye_like(sine) + sine * getattr(self, f"cross_{name}")
+                turn = turn + (1.0 - cosine) * getattr(self, f"square_{name}")
                 spin = axis * v
             else:
-                a, d = joint.qpos_address, joint.dof_address
-                turn = matrix_from_quat(quat_normalize(qpos[..., a : a + 4]))
-                local = qvel[..., d : d + 3, None]
-                spin = (rotation @ turn @ local)[..., 0]
+                quat = torch.stack([qpos[..., q_at_ : q_at_ + 4] for q_at_ in q_at], -2)
+                turn = matrix_from_quat(quat_normalize(quat))
+                local = torch.stack([qvel[..., d : d + 3] for d in v_at], -2)
+                spin = _turn(rotation @ turn, local)
             turned = rotation @ turn
-            if not joint.is_at_origin:  # the body swings about the joint's anchor
-                before, after = rotation @ constants[1], turned @ constants[1]
+            if not group.is_at_origin[slot]:  # the body swings about the joint's anchor
+                anchor = getattr(self, f"anchor_{name}")
+                before, after = _turn(rotation, anchor), _turn(turned, anchor)
                 velocity = velocity + torch.linalg.cross(omega, before)
                 velocity = velocity - torch.linalg.cross(omega + spin, after)
                 position = position + before - after
@@ -218,9 +267,46 @@ class PointKinematics(nn.Module):
         return position, rotation, omega, velocity
 
 
-def _at_rest(qpos: Tensor) -> BodyPose:
-    zero = qpos.new_zeros(*qpos.shape[:-1], 3)
-    return zero, eye_like(qpos).expand(*qpos.shape[:-1], 3, 3), zero, zero
+def _turn(rotation: Tensor, vector: Tensor) -> Tensor:
+    """``rotation (*batch, n, 3, 3)`` applied to ``vector (*, n, 3)``."""
+    return (rotation @ vector[..., None])[..., 0]
+
+
+def _pick(poses: BodyPoses, places: list[int]) -> BodyPoses:
+    """The poses at these places, in this order."""
+    position, rotation, omega, velocity = poses
+    if places == list(range(position.shape[-2])):
+        return poses
+    return (
+        position[..., places, :],
+        rotation[..., places, :, :],
+        omega[..., places, :],
+        velocity[..., places, :],
+    )
+
+
+def _join(poses: list[BodyPoses]) -> BodyPoses:
+    """Poses side by side."""
+    if len(poses) == 1:
+        return poses[0]
+    position, rotation, omega, velocity = zip(*poses, strict=True)
+    return (
+        torch.cat(position, -2),
+        torch.cat(rotation, -3),
+        torch.cat(omega, -2),
+        torch.cat(velocity, -2),
+    )
+
+
+def _at_rest(qpos: Tensor) -> BodyPoses:
+    """The base itself, one body."""
+    zero = qpos.new_zeros(*qpos.shape[:-1], 1, 3)
+    return zero, eye_like(qpos).expand(*qpos.shape[:-1], 1, 3, 3), zero, zero
+
+
+def _joints(model: mujoco.MjModel, body: int) -> range:
+    start = int(model.body_jntadr[body])
+    return range(start, start + int(model.body_jntnum[body]))
 
 
 def eye_like(x: Tensor) -> Tensor:
