@@ -18,7 +18,16 @@ LIMIT_DAMPING = 100.0  # N m s/rad; limit_kd
 # Means of the robot's and the ground's numbers, as the reference engine takes them:
 # N/m, N s/m, N s/m, -
 CONTACT = {"ke": 7e4, "kd": 550.0, "kf": 2e3, "mu": 0.625}
-STANDING_POSE = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)  # rad, in the order of JOINTS
+STANDING_POSE = (
+    0.0,
+    1.0,
+    0.0,
+    -1.0,
+    0.0,
+    -1.0,
+    0.0,
+    1.0,
+)  # rad, in the order of JOINTS
 STANDING_HEIGHT = 0.556  # m, of the torso's centre, feet touching
 
 HIP = 2 * pi / 9  # 40 deg

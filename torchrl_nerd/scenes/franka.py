@@ -9,7 +9,15 @@ from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.scene import Scene
 
-GAIN = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # N m per unit of action: effort limits
+GAIN = (
+    87.0,
+    87.0,
+    87.0,
+    87.0,
+    12.0,
+    12.0,
+    12.0,
+)  # N m per unit of action: effort limits
 SUBSTEPS = 9  # of 1/1080 s: control step 1/120 s; paper, appendix B
 TRAINING_TORQUE = (100.0,) * 4 + (20.0,) * 3  # N m; reference code, utils/commons.py
 HOME = (0.0, -0.7853, 0.0, -2.3575, 0.0, 1.5703, 0.7857)  # rad; reference code
