@@ -88,7 +88,7 @@ def test_the_files_plane_is_the_default():
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    terrain = Terrain.from_model(model, 0)
+    terrain = Terrain.from_model(model, [0])
     normal, offset = terrain.default[:3], terrain.default[3]
     np.testing.assert_allclose(normal, data.geom_xmat[0].reshape(3, 3)[:, 2])
     np.testing.assert_allclose(offset, normal @ data.geom_xpos[0])

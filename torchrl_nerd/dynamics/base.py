@@ -40,7 +40,10 @@ class Dynamics(Protocol):
 def check_step(
     scene: Scene, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
 ) -> None:
-    """Raise ValueError where a shape is not the scene's, naming got and expected."""
+    """Raise ValueError where a shape is not the scene's, naming got and expected.
+
+    So does a ground that is not finite: unlike a state, it never becomes so by itself.
+    """
     rows = state.batch_size[0] if state.batch_size else state[QPOS].shape[0]
     expected = {
         QPOS: (state[QPOS], (rows, scene.model.nq)),
@@ -52,7 +55,7 @@ def check_step(
             raise ValueError(
                 f"scene '{scene.name}' has a ground per row: got no terrain"
             )
-        expected["terrain"] = (terrain, (rows, scene.terrain.size))
+        scene.terrain.check(terrain, (rows, scene.terrain.size))
     for name, (value, shape) in expected.items():
         if tuple(value.shape) != shape:
             raise ValueError(

@@ -72,8 +72,9 @@ class DMControlDynamics:
             for x in (state[QPOS], state[QVEL], joint_torque)
         )
         pose = None
-        if terrain is not None and self.scene.terrain is not None:
-            pose = self.scene.terrain.mocap_pose(terrain.double().cpu()).numpy()
+        ground = self.scene.terrain
+        if terrain is not None and ground is not None and ground.is_per_row:
+            pose = ground.mocap_pose(terrain.double().cpu()).numpy()
         next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
         for row, physics in enumerate(self._rows):
             self._place(
@@ -103,15 +104,14 @@ class DMControlDynamics:
         pose: np.ndarray | None,
     ) -> None:
         """Put a row where it should be, unless it is there already."""
-        data, mocap = physics.data, 0
+        data, size = physics.data, 3 * physics.model.nmocap
         is_there = np.array_equal(data.qpos, qpos) and np.array_equal(data.qvel, qvel)
         if pose is not None:
-            mocap = self.scene.terrain.mocap if self.scene.terrain else 0
-            ground = np.concatenate((data.mocap_pos[mocap], data.mocap_quat[mocap]))
+            ground = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
             is_there = is_there and np.array_equal(ground, pose)
         if is_there:
             return
         with physics.reset_context():
             data.qpos[:], data.qvel[:] = qpos, qvel
             if pose is not None:
-                data.mocap_pos[mocap], data.mocap_quat[mocap] = pose[:3], pose[3:]
+                data.mocap_pos.flat, data.mocap_quat.flat = pose[:size], pose[size:]

@@ -57,8 +57,8 @@ def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
     positions: list[np.ndarray] = []
     radii: list[float] = []
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        for geom in range(model.ngeom):
-            if model.body_weldid[model.geom_bodyid[geom]] and _touches(model, geom):
+        for geom in _moving_geoms(model):
+            if any(_collide(model, geom, ground) for ground in ground_geoms(model)):
                 points, radius = _points_of(model, geom)
                 bodies += [int(model.geom_bodyid[geom])] * len(points)
                 positions += list(points)
@@ -76,22 +76,23 @@ def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
 
 def ground_geoms(model: mujoco.MjModel) -> list[int]:
     """Static or mocap shapes that something moving can touch."""
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if model.body_weldid[model.geom_bodyid[geom]] == 0
-        or model.body_mocapid[model.geom_bodyid[geom]] >= 0
-        if model.geom_contype[geom] or model.geom_conaffinity[geom]
-    ]
+    moving, grounds = _moving_geoms(model), []
+    for geom in range(model.ngeom):
+        weld = model.body_weldid[model.geom_bodyid[geom]]
+        if weld == 0 or model.body_mocapid[weld] >= 0:
+            if any(_collide(model, geom, other) for other in moving):
+                grounds.append(geom)
+    return grounds
 
 
-def _touches(model: mujoco.MjModel, geom: int) -> bool:
-    is_moving = bool(model.body_dofnum[model.body_weldid[model.geom_bodyid[geom]]])
-    return is_moving and any(
-        model.geom_contype[geom] & model.geom_conaffinity[other]
-        or model.geom_contype[other] & model.geom_conaffinity[geom]
-        for other in ground_geoms(model)
-    )
+def _moving_geoms(model: mujoco.MjModel) -> list[int]:
+    welds = (model.body_weldid[body] for body in model.geom_bodyid)
+    return [geom for geom, weld in enumerate(welds) if model.body_dofnum[weld]]
+
+
+def _collide(model: mujoco.MjModel, geom: int, other: int) -> bool:
+    kinds, partners = model.geom_contype, model.geom_conaffinity
+    return bool(kinds[geom] & partners[other] or kinds[other] & partners[geom])
 
 
 def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:

@@ -25,6 +25,7 @@ from torchrl_nerd.scenes.controllers import Controller
 from torchrl_nerd.scenes.explain import Symmetries, find_symmetries
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
 from torchrl_nerd.scenes.terrain import Terrain
+from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
 _HASHED_FIELDS = (
     *("body_parentid", "body_pos", "body_quat", "body_mass", "body_inertia"),
@@ -102,11 +103,18 @@ class Scene:
     def terrain(self) -> Terrain | None:
         """The ground, or None where nothing can touch it."""
         grounds = ground_geoms(self.model) if len(self.contacts) else []
-        if len(grounds) > 1:
-            raise ValueError(
-                f"expected one ground, got {len(grounds)} in '{self.name}'"
-            )
-        return Terrain.from_model(self.model, grounds[0]) if grounds else None
+        return Terrain.from_model(self.model, grounds) if grounds else None
+
+    @cached_property
+    def terrain_distance(self) -> TerrainDistance:
+        """Distance to the ground, exact wherever a contact point has features.
+
+        Raises:
+            ValueError: the scene has no ground.
+        """
+        if self.terrain is None:
+            raise ValueError(f"nothing in scene '{self.name}' can touch a ground")
+        return TerrainDistance(self.terrain, float(self.contacts.margins.max()))
 
     @cached_property
     def symmetries(self) -> Symmetries:
@@ -176,9 +184,8 @@ class Scene:
             *qpos.shape[:-1], self.layout.nv
         )
         points, _ = self.point_kinematics.to(qpos.device)(qpos, at_rest)
-        ground = torch.as_tensor(self.terrain.default).to(qpos)
-        ground = ground.expand(*qpos.shape[:-1], -1) if terrain is None else terrain
-        distance, _ = self.terrain.distance(points, ground, *self.base_pose(qpos))
+        ground = self.terrain_distance.to(qpos.device)
+        distance, _ = ground(points, terrain, *self.base_pose(qpos))
         return distance - torch.as_tensor(self.contacts.radii).to(qpos)
 
     def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,9 +1,10 @@
 """What the robot's contact points see of the ground, in the robot's own frame.
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
-zeroed beyond the margin xi. Over one plane, p1 follows from kinematics, n and d, so it is
-left out; where all rows share a plane that is level, or that a fixed base cannot turn
-against, n follows from gravity and pose and is left out too. Added is what decides an
+zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out; where
+all there is is one plane that all rows share and that is level, or that a fixed base
+cannot turn against, n follows from gravity and pose and is left out too. Of several
+surfaces each point sees the nearest, so that a model fits any number of them. Added is what decides an
 impact: the point's velocity, and how deep it will be if it goes on: whether a point
 touches within the step is a threshold, which a network learns slowly from distance and
 speed. All of it fades to zero at the margin without a jump.
@@ -27,6 +28,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
 
 MAX_GLANCES = 5  # times within a step at which the coming penetration is foreseen
@@ -61,7 +63,6 @@ class ContactFeatures(FeatureTransform):
     why_no_inverse = "distances do not determine a pose"
     radii: Tensor
     margins: Tensor
-    plane: Tensor
     mount_pos: Tensor
     mount_rot: Tensor
     glances: Tensor
@@ -77,8 +78,9 @@ class ContactFeatures(FeatureTransform):
             sizes[CONTACT_DEPTH] = glances * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
-            is_level = abs(float(terrain.default[2])) > 1.0 - 1e-12
-            if terrain.is_per_row or (scene.base.is_floating and not is_level):
+            plane = terrain.fixed_plane
+            is_level = plane is not None and abs(float(plane[2])) > 1.0 - 1e-12
+            if plane is None or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
@@ -89,8 +91,8 @@ class ContactFeatures(FeatureTransform):
         self.kinematics = PointKinematics(
             scene.model, scene.base, points.bodies, points.positions
         )
+        self.ground = TerrainDistance(terrain, float(points.margins.max()))
         constants = {"radii": points.radii, "margins": points.margins}
-        constants |= {"plane": terrain.default}
         constants |= {"glances": np.arange(glances) / glances}
         constants |= dict(zip(("mount_pos", "mount_rot"), scene.mount, strict=True))
         for name, value in constants.items():
@@ -105,7 +107,7 @@ class ContactFeatures(FeatureTransform):
         Args:
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
-            terrain: ``(*batch, 4)`` in the world; None for the scene's own plane.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
         """
         if self.terrain is None:
             return []
@@ -117,8 +119,7 @@ class ContactFeatures(FeatureTransform):
             angular = qvel[..., None, v + 3 : v + 6].expand_as(points)
             turning = torch.linalg.cross(angular, points)
             velocity = velocity + linear[..., None, :] + turning
-        plane = self.plane.expand(*qpos.shape[:-1], -1) if terrain is None else terrain
-        distance, normal = self.terrain.distance(points, plane, position, rotation)
+        distance, normal = self.ground(points, terrain, position, rotation)
         beyond = distance - self.margins
         gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
         gate = gate[..., None]
@@ -126,25 +127,29 @@ class ContactFeatures(FeatureTransform):
         sliding = velocity - speed * normal
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
-        depth = self._coming_depth(qpos, qvel, plane, distance, speed)
+        depth = self._coming_depth(qpos, qvel, terrain, distance, speed)
         features.append((gate * depth).flatten(-2))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features
 
     def _coming_depth(
-        self, qpos: Tensor, qvel: Tensor, plane: Tensor, distance: Tensor, speed: Tensor
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        terrain: Tensor | None,
+        distance: Tensor,
+        speed: Tensor,
     ) -> Tensor:
         """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
 
         The distance is the parabola through its value and slope now and its value after
         a whole step at constant ``qvel``.
         """
-        assert self.terrain is not None  # or there are no features
         step = self.step_size
         later = integrate_pos(self.layout, qpos, step * qvel)
         points, _ = self.kinematics(later, qvel)
-        end, _ = self.terrain.distance(points, plane, *self._base_pose(later))
+        end, _ = self.ground(points, terrain, *self._base_pose(later))
         distance, slope = distance[..., None], step * speed
         bend = end[..., None] - distance - slope
         path = distance + slope * self.glances + bend * self.glances**2
