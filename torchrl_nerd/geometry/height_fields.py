@@ -87,7 +87,9 @@ def _closest(vertices: Vector, dx: float, dy: float) -> Tensor:
         _on_segment(along_y, end_y[2] - along_y[2], 0.0, dy),
         _on_segment(origin, across[2] - origin[2], dx, dy),
         # z(u, v) = z0 + slope_x u + slope_y v over either triangle
-        _on_face(origin, right[2] - origin[2], across[2] - right[2], dx, dy, below=True),
+        _on_face(
+            origin, right[2] - origin[2], across[2] - right[2], dx, dy, below=True
+        ),
         _on_face(origin, across[2] - up[2], up[2] - origin[2], dx, dy, below=False),
     ]
     offset = torch.cat([torch.stack(c, -1).flatten(-3, -2) for c in candidates], -2)
