@@ -22,9 +22,9 @@ ON_SURFACE = 1e-12  # m: closer to a centre or an edge, the direction is roundin
 
 def plane_distance(points: Tensor, plane: Tensor) -> tuple[Tensor, Tensor]:
     """Signed distance to a plane (unit normal, offset in m), and its normal."""
-    normal, offset = plane[..., None, :3], plane[..., None, 3]
-    distance = (points * normal).sum(-1) - offset
-    return distance, normal.expand_as(points)
+    normal, offset = plane[..., :3], plane[..., 3:]
+    distance = (points @ normal[..., None])[..., 0] - offset
+    return distance, normal[..., None, :].expand_as(points)
 
 
 def plane_in_frame(plane: Tensor, position: Tensor, rotation: Tensor) -> Tensor:

@@ -88,19 +88,20 @@ def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarr
     bodies: list[int] = []
     positions: list[np.ndarray] = []
     radii: list[float] = []
-    if not model.opt.disableflags & NO_CONTACT:
-        grounds = ground_geoms(model)
-        for geom in _moving_geoms(model):
-            if any(_collide(model, geom, ground) for ground in grounds):
-                points, radius = _points_of(model, geom)
-                bodies += [int(model.geom_bodyid[geom])] * len(points)
-                positions += list(points)
-                radii += [radius] * len(points)
+    grounds = ground_geoms(model)
+    for geom in _moving_geoms(model):
+        if any(_collide(model, geom, ground) for ground in grounds):
+            points, radius = _points_of(model, geom)
+            bodies += [int(model.geom_bodyid[geom])] * len(points)
+            positions += list(points)
+            radii += [radius] * len(points)
     return bodies, np.array(positions).reshape(-1, 3), np.array(radii)
 
 
 def ground_geoms(model: mujoco.MjModel) -> list[int]:
     """Static or mocap shapes that something moving can touch."""
+    if model.opt.disableflags & NO_CONTACT:
+        return []
     moving, grounds = _moving_geoms(model), []
     for geom in range(model.ngeom):
         weld = model.body_weldid[model.geom_bodyid[geom]]

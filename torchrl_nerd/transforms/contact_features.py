@@ -112,49 +112,45 @@ class ContactFeatures(FeatureTransform):
         """
         if self.terrain is None:
             return []
-        points, velocity = self.kinematics(qpos, qvel)
-        position, rotation = self._base_pose(qpos)
+        later = integrate_pos(self.layout, qpos, self.step_size * qvel)
+        both = torch.stack((qpos, later)), torch.stack((qvel, qvel))
+        points, velocities = self.kinematics(*both)
+        position, rotation = self._base_pose(both[0])
+        if terrain is not None:
+            terrain = terrain.expand(2, *terrain.shape)
+        (distance, end), (normal, _) = self.ground(points, terrain, position, rotation)
+        velocity = velocities[0]
         if self.base.is_floating:  # from riding on the base to standing on the ground
             v = self.base.dof_address
-            linear = (rotation.mT @ qvel[..., v : v + 3, None])[..., 0]
-            angular = qvel[..., None, v + 3 : v + 6].expand_as(points)
-            turning = torch.linalg.cross(angular, points)
+            linear = _turn_inverse(rotation[0], qvel[..., v : v + 3])
+            angular = qvel[..., None, v + 3 : v + 6].expand_as(velocity)
+            turning = torch.linalg.cross(angular, points[0])
             velocity = velocity + linear[..., None, :] + turning
-        distance, normal = self.ground(points, terrain, position, rotation)
         beyond = distance - self.margins
         gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
         gate = gate[..., None]
-        speed = (velocity * normal).sum(-1, keepdim=True)
+        speed = velocity[..., None, :] @ normal[..., None]
+        speed = speed[..., 0]
         sliding = velocity - speed * normal
+        depth = self._coming_depth(distance, self.step_size * speed, end)
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
-        depth = self._coming_depth(qpos, qvel, terrain, distance, speed)
         features.append((gate * depth).flatten(-2))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features
 
-    def _coming_depth(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        terrain: Tensor | None,
-        distance: Tensor,
-        speed: Tensor,
-    ) -> Tensor:
+    def _coming_depth(self, distance: Tensor, slope: Tensor, end: Tensor) -> Tensor:
         """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
 
-        The distance is the parabola through its value and slope now and its value after
-        a whole step at constant ``qvel``.
+        The distance is the parabola through its value and slope now and its value
+        ``end`` after a whole step at constant ``qvel``.
         """
-        step = self.step_size
-        later = integrate_pos(self.layout, qpos, step * qvel)
-        points, _ = self.kinematics(later, qvel)
-        end, _ = self.ground(points, terrain, *self._base_pose(later))
-        distance, slope = distance[..., None], step * speed
-        bend = end[..., None] - distance - slope
-        path = distance + slope * self.glances + bend * self.glances**2
-        return (self.radii[:, None] - path).clamp_min(0.0)
+        start = (self.radii - distance)[..., None]
+        bend = self.radii[:, None] - end[..., None] - start + slope
+        powers = torch.stack((-self.glances, self.glances**2))
+        path = start + torch.cat((slope, bend), -1) @ powers
+        return path.clamp_min(0.0)
 
     def _base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
@@ -170,3 +166,7 @@ class ContactFeatures(FeatureTransform):
         terrain = tensordict[TERRAIN] if self.terrain.is_per_row else None
         values = self.contact_features(tensordict[QPOS], tensordict[QVEL], terrain)
         return dict(zip(self.out_keys, values, strict=True))
+
+
+def _turn_inverse(rotation: Tensor, vector: Tensor) -> Tensor:
+    return (rotation.mT @ vector[..., None])[..., 0]
