@@ -100,8 +100,8 @@ def train(cfg: Run) -> tuple[Policy, list[dict[str, float]]]:
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
-    options = {"entropy_bonus": False, "normalize_advantage": True}
-    loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, **options)
+    loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
+    loss.normalize_advantage = True
     optimizer = Adam(loss.parameters(), lr=cfg.lr)
     frames = cfg.num_envs * cfg.horizon
     total = cfg.total_frames // frames * frames
