@@ -25,18 +25,14 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_nerd import make_env
-from torchrl_nerd.evaluation.plots import plot_learning_curve, plot_states
+from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.evaluation import plots, policy_transfer
 from torchrl_nerd.evaluation.policy import (
     Policy,
     Standardize,
     make_actor,
     mlp,
     save_policy,
-)
-from torchrl_nerd.evaluation.policy_transfer import (
-    hardest_episode,
-    transfer,
-    transfer_table,
 )
 from torchrl_nerd.files import write_json
 from torchrl_nerd.tasks import make_task
@@ -59,7 +55,8 @@ class Run(PPOConfig):
 
 def parse() -> Run:
     """Settings from the command line; the task chooses the defaults of all others."""
-    task = tyro.cli(Run).task
+    known, _ = tyro.cli(Run, add_help=False, return_unknown_args=True)
+    task = known.task
     return tyro.cli(
         Run, default=Run(**vars(PPO_CONFIGS.get(task, PPOConfig())), task=task)
     )
@@ -103,13 +100,8 @@ def train(cfg: Run) -> tuple[Policy, list[dict[str, float]]]:
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
-    loss = ClipPPOLoss(
-        actor,
-        critic,
-        clip_epsilon=cfg.clip,
-        entropy_bonus=False,
-        normalize_advantage=True,
-    )
+    loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
+    loss.normalize_advantage = True
     optimizer = Adam(loss.parameters(), lr=cfg.lr)
     frames = cfg.num_envs * cfg.horizon
     total = cfg.total_frames // frames * frames
@@ -124,7 +116,8 @@ def train(cfg: Run) -> tuple[Policy, list[dict[str, float]]]:
         schedule.step()
         progress.update(frames)
         if number % cfg.evaluate_every == 0 or number * frames == total:
-            returns = transfer(cfg.task, actor, [cfg.dynamics], 256, seed=cfg.seed + 1)
+            where, seed = [cfg.dynamics], cfg.seed + 1
+            returns = policy_transfer.transfer(cfg.task, actor, where, 256, seed=seed)
             means = {name: summary.mean for name, summary in returns.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})
@@ -136,15 +129,18 @@ def main(cfg: Run) -> None:
     torch.manual_seed(cfg.seed)
     policy, curve = train(cfg)
     save_policy(policy, cfg.out, {"task": cfg.task, "dynamics": cfg.dynamics})
-    plot_learning_curve(curve, cfg.out / "learning_curve.png")
+    plots.plot_learning_curve(curve, cfg.out / "learning_curve.png")
 
     actor, seed = make_actor(policy), cfg.seed + 2
-    everywhere = (cfg.dynamics, "nerd", "mujoco", "dm_control")
-    returns = transfer(cfg.task, actor, everywhere, cfg.episodes, seed=seed)
-    print(transfer_table(returns))
+    scene = make_task(cfg.task).scene
+    learned = ("nerd",) if scene.name in shipped_models() else ()
+    everywhere = (cfg.dynamics, *learned, "mujoco", "dm_control")
+    where = (cfg.task, actor, everywhere)
+    returns = policy_transfer.transfer(*where, cfg.episodes, seed=seed)
+    print(policy_transfer.transfer_table(returns))
     write_json(cfg.out / "returns.json", {k: asdict(v) for k, v in returns.items()})
-    episodes = hardest_episode(cfg.task, actor, everywhere[:3], seed)
-    plot_states(episodes, make_task(cfg.task).scene, cfg.out / "episode.png")
+    episodes = policy_transfer.hardest_episode(cfg.task, actor, everywhere[:3], seed)
+    plots.plot_states(episodes, scene, cfg.out / "episode.png")
 
 
 if __name__ == "__main__":
