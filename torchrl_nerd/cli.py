@@ -72,7 +72,7 @@ class Train:
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum."""
+    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
     out: Path | None = None
     """Folder of the run; runs/SCENE by default."""
     data: Path | None = None
@@ -130,7 +130,7 @@ class Eval:
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum."""
+    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
     model: Path | None = None
     """Checkpoint folder; the shipped model by default."""
     rows: int = 2048
@@ -157,7 +157,7 @@ class Eval:
         protocol = protocols[self.scene]()
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         rows = []
-        header = f"{'case':<13}{'steps':>6} {'quantity':<12}{'mean':>9}{'+-':>9}"
+        header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"
         print(f"{header}{'final':>9}{'p95':>9}  paper")
         for case, task in protocol.cases.items():
             here = model if task.scene is scene else model.over(task.scene)
@@ -177,7 +177,7 @@ class Eval:
                     row = {"case": case, "steps": horizon, "quantity": name}
                     rows.append({**row, **asdict(error), "paper": paper})
                     figures = (error.mean, error.interval, error.final, error.p95)
-                    line = f"{case:<13}{horizon:>6} {name:<9}{error.unit:<3}"
+                    line = f"{case:<13}{horizon:>6} {name:<17}{error.unit:<3}"
                     line += "".join(f"{figure:>9.5f}" for figure in figures)
                     print(f"{line}  {paper if paper is not None else '-'}")
         settings = {"rows": self.rows, "seed": self.seed, "inference": self.inference}
@@ -224,7 +224,7 @@ class Explain:
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum."""
+    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
     rows: int = 1024
     """Random states to ask the true solver about, and rows of the timing."""
     seed: int = 0

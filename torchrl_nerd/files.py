@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,18 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON object atomically."""
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    """Write a JSON object atomically; numbers that are not finite become null."""
+    text = json.dumps(_without_nan(content), indent=2, allow_nan=False) + "\n"
     write_atomically(path, lambda aside: aside.write_text(text))
+
+
+def _without_nan(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _without_nan(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_without_nan(value) for value in content]
+    is_odd = isinstance(content, float) and not isfinite(content)
+    return None if is_odd else content
 
 
 def read_json(path: Path) -> dict[str, Any]:

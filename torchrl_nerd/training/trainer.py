@@ -265,8 +265,9 @@ class Trainer:
         score = sum(
             v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}")
         )
-        if score < self.best:
-            self.best = score
+        is_first = not (self.folder / "best").exists()
+        if score < self.best or is_first:  # even a model whose rollouts blow up
+            self.best = score if score < self.best else self.best
             self._save_model("best", summaries)
         return figures
 
