@@ -9,9 +9,10 @@ import pytest
 
 from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
-from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training.recipes import RECIPES
 
+QUICK = ("cartpole", "double_pendulum", "cube")  # the others take minutes in all
 TINY = ["--network", "mlp", "--rows", "64", "--rollout-rows", "8", "--quiet"]
 
 
@@ -146,8 +147,15 @@ def test_no_traceback_reaches_the_terminal():
     assert done.stderr.count("\n") == 1 and done.stderr.startswith("nerd: unknown")
 
 
-def test_from_data_to_figures(scene, tmp_path, seed, capsys):
-    name = scene.name
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+        for name in SCENES
+    ],
+)
+def test_from_data_to_figures(name, tmp_path, seed, capsys):
+    scene = load_scene(name)
     data, run, best = (str(tmp_path / x) for x in ("data", "run", "best"))
     figures = {x: tmp_path / f"{x}.json" for x in ("data", "train", "eval")}
     argv = ["data", name, "--out", data, "--trajectories", "300", "--steps", "20"]

@@ -56,7 +56,7 @@ def test_kinds_lie_where_they_are_said_to(scene, generator):
     token, slices = tokens(*inputs), token_slices(tokens)
     assert sum(at.stop - at.start for at in slices.values()) == tokens.size
     speed = states[QVEL][:, tokens.robot.joints.velocities]
-    assert torch.equal(token[:, slices[kinds.SPEED]], speed)
+    assert torch.equal(token[:, slices.get(kinds.SPEED, slice(0))], speed)
     if kinds.TORQUE in slices:
         assert torch.equal(token[:, slices[kinds.TORQUE]], states[JOINT_TORQUE])
     if kinds.DISTANCE in slices:
@@ -71,7 +71,7 @@ def test_helpers_are_told_from_what_is_needed(scene, generator):
     found = feature_kinds(scene, draw_states(scene, 60, generator)[:20])
     adds = {kind.name: kind.adds for kind in found}
     assert all(0 <= kind.adds <= kind.width for kind in found)
-    assert adds[kinds.SPEED] == len(SceneTokens(scene).robot.joints.velocities)
+    assert adds.get(kinds.SPEED, 0) == len(SceneTokens(scene).robot.joints.velocities)
     assert adds.get(kinds.GRAVITY, 2) == 2
     assert adds.get(kinds.ANGLE, 0) == len(SceneTokens(scene).robot.joints.angles)
     assert not adds.get(kinds.VELOCITY) and not adds.get(kinds.DEPTH)

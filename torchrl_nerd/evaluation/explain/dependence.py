@@ -9,7 +9,7 @@ the ground.
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from typing import cast
 
 import mujoco
@@ -223,7 +223,7 @@ def step(scene: Scene, states: TensorDict, lifted: int) -> Tensor:
     """The true target ``(rows, 2 nv)`` with some of MuJoCo's forces switched off."""
     model = copy.copy(scene.model)
     model.opt.disableflags |= lifted
-    dynamics = MujocoDynamics(replace(scene, model=model), num_threads=1)
+    dynamics = MujocoDynamics(_with_model(scene, model), num_threads=1)
     ground = None if lifted & CONTACT else states.get(TERRAIN, None)
     after = dynamics.step(states.select(QPOS, QVEL), states[JOINT_TORQUE], ground)
     delta = StateDelta(scene).delta
@@ -251,7 +251,7 @@ def carried(
         qpos[:, q : q + 3] = (qpos[:, q : q + 3] - pivot) @ turn.T + to
         qpos[:, q + 3 : q + 7] = quat_multiply(quat, qpos[:, q + 3 : q + 7])
         qvel[:, v : v + 3] = qvel[:, v : v + 3] @ turn.T
-        return replace(scene, model=model), after
+        return _with_model(scene, model), after
     # the mount moves: its place is written in the frame of a body that stands still
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -263,7 +263,15 @@ def carried(
     local = np.ascontiguousarray(axes.T @ turn.numpy() @ rotation)
     mujoco.mju_mat2Quat(model.body_quat[base.body], local.reshape(-1))
     model.body_sameframe[base.body] = 0  # or MuJoCo skips the new pose
-    return replace(scene, model=model), after
+    return _with_model(scene, model), after
+
+
+def _with_model(scene: Scene, model: mujoco.MjModel) -> Scene:
+    """The scene with another model, which need not be one that can be learned."""
+    other = object.__new__(Scene)
+    values = {field.name: getattr(scene, field.name) for field in fields(scene)}
+    other.__dict__.update(values, model=model)
+    return other
 
 
 def _largest(before: Tensor, after: Tensor, states: TensorDict) -> float:

@@ -113,9 +113,10 @@ def rebuild(scene: Scene, paper: PaperInput, token: Tensor) -> dict[str, Tensor]
 
 def recover_state(scene: Scene, part: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
     """``qpos``, ``qvel`` up to place, heading and whole turns, from parts of tokens."""
-    rows, joints = len(part[SPEED]), SceneTokens(scene).robot.joints
-    qpos = part[SPEED].new_tensor(scene.model.qpos0).repeat(rows, 1)
-    qvel = part[SPEED].new_zeros(rows, scene.layout.nv)
+    any_part, joints = next(iter(part.values())), SceneTokens(scene).robot.joints
+    rows = len(any_part)
+    qpos = any_part.new_tensor(scene.model.qpos0).repeat(rows, 1)
+    qvel = any_part.new_zeros(rows, scene.layout.nv)
     if ANGLE in part:
         sine, cosine = part[ANGLE].chunk(2, -1)
         qpos[:, joints.angles] = torch.atan2(sine, cosine)
@@ -126,7 +127,8 @@ def recover_state(scene: Scene, part: dict[str, Tensor]) -> tuple[Tensor, Tensor
         third = torch.linalg.cross(columns[..., 0], columns[..., 1])
         matrix = torch.cat((columns, third[..., None]), -1)
         qpos[:, q : q + 4] = quat_from_matrix(matrix)
-    qvel[:, joints.velocities] = part[SPEED]
+    if SPEED in part:
+        qvel[:, joints.velocities] = part[SPEED]
     if GRAVITY in part:
         q, v = scene.base.qpos_address, scene.base.dof_address
         down = -1.0 if scene.model.opt.gravity[2] <= 0.0 else 1.0
