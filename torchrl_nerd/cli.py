@@ -318,6 +318,8 @@ def _curve(card: dict[str, Any]) -> str:
     """Validation error of a card in one line."""
     parts = [
         f"{name} {figures['mean']:.2g} {figures['unit']} at {horizon} steps"
+        if figures["mean"] is not None
+        else f"{name} not finite at {horizon} steps"
         for horizon, by_name in card.get("validation_error", {}).items()
         for name, figures in by_name.items()
     ]
