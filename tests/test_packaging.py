@@ -53,7 +53,9 @@ def test_every_shipped_model_is_small_and_complete(wheel):
     assert models
     for model in models:
         assert model / "card.json" in sizes
-        assert 0 < sizes[model / "model.safetensors"] < 2_000_000
+        is_simple = model.name.startswith(("cartpole", "double_pendulum"))
+        limit = 2_000_000 if is_simple else 4_000_000  # bytes
+        assert 0 < sizes[model / "model.safetensors"] < limit
 
 
 def test_wheel_installs_the_nerd_command_and_the_licence(wheel):

@@ -100,9 +100,10 @@ def test_statistics_are_those_of_the_whole_data_set(scene, generator):
         torch.testing.assert_close(stats[key].std[moving], std[moving])
 
 
-def test_normalised_data_have_mean_zero_and_size_one(sequences):
-    for x in (sequences.tokens, sequences.targets):
+def test_normalised_data_have_mean_zero_and_size_one(model, sequences):
+    for key, x in ((TOKEN, sequences.tokens), (TARGET, sequences.targets)):
         x = x.flatten(0, 1).double()
+        hardly_moves = model.normalize.std(key) < 1e-5  # near the floor, or on it
         std = x.std(0, correction=0)
         torch.testing.assert_close(x.mean(0), torch.zeros_like(std), rtol=0, atol=1e-4)
-        assert (((std - 1.0).abs() < 1e-3) | (std < 1e-2)).all()
+        assert (((std - 1.0).abs() < 1e-3) | hardly_moves & (std < 1.001)).all()
