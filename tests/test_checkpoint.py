@@ -3,6 +3,7 @@
 import json
 import re
 import warnings
+from dataclasses import asdict
 from pathlib import Path
 
 import mujoco
@@ -14,15 +15,18 @@ import torchrl_nerd
 from torchrl_nerd import from_pretrained, load_scene
 from torchrl_nerd.checkpoint import (
     CARD,
+    PRETRAINED,
     WEIGHTS,
     load_checkpoint,
     make_card,
     save_checkpoint,
+    shipped_models,
 )
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json, write_atomically, write_json
 from torchrl_nerd.modules.nerd import NETWORKS
 from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.training.recipes import RECIPES
 
 SCENE = load_scene(next(iter(SCENES)))
 
@@ -139,3 +143,12 @@ def test_nothing_is_ever_unpickled():
         text = path.read_text()
         found = re.search(r"\b(import pickle|pickle\.\w+\(|torch\.(load|save)\()", text)
         assert found is None, f"{path.name}: {found}"
+
+
+@pytest.mark.parametrize("name", sorted(set(shipped_models()) & set(RECIPES)))
+def test_recipes_are_those_of_the_shipped_models(name):
+    made = read_json(PRETRAINED / name / CARD)["training"]
+    recipe = RECIPES[name]
+    assert made["trajectories"] == recipe.data.trajectories
+    settings = asdict(recipe.train)
+    assert {key: made[key] for key in settings} == settings

@@ -15,67 +15,40 @@ class Recipe:
     task: str
 
 
-def _arm(task: str) -> Recipe:
-    """A fixed base without contact."""
-    config = TrainConfig(
-        network="mlp", steps=10_000, rollout_steps=1_000, single_share=1.0
-    )
-    return Recipe(DataConfig(trajectories=10_000, steps=100), config, task)
-
-
-def _cube(task: str) -> Recipe:
-    """A free body with nothing but contact."""
-    config = TrainConfig(
-        network="mlp",
-        steps=10_000,
-        rollout_steps=1_000,
+def _mlp(
+    task: str,
+    trajectories: int,
+    network: str,
+    steps: int,
+    rollout_steps: int,
+    softening: float,
+) -> Recipe:
+    """An MLP on single states: without a history, sequences tell it less."""
+    train = TrainConfig(
+        network=network,
+        steps=steps,
+        rollout_steps=rollout_steps,
         single_share=1.0,
-        softening=0.1,
+        softening=softening,
     )
-    return Recipe(DataConfig(trajectories=10_000, steps=100), config, task)
+    return Recipe(DataConfig(trajectories=trajectories, steps=100), train, task)
 
 
 RECIPES: dict[str, Recipe] = {
     "cartpole": Recipe(
         DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(steps=30_000, rollout_steps=3_000),
+        TrainConfig(steps=30_000, rollout_steps=3_000, single_share=0.0),
         "cartpole/swingup",
     ),
-    "double_pendulum": Recipe(
-        DataConfig(trajectories=40_000, steps=100),
-        TrainConfig(
-            network="mlp-wide",
-            steps=36_000,
-            rollout_steps=4_000,
-            single_share=1.0,
-            softening=1.0,
-        ),
-        "double_pendulum/passive",
+    "double_pendulum": _mlp(
+        "double_pendulum/passive", 40_000, "mlp-wide", 36_000, 4_000, softening=1.0
     ),
-    "ant": Recipe(
-        DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(
-            network="mlp-large",
-            steps=26_000,
-            rollout_steps=1_500,
-            single_share=1.0,
-            softening=0.02,
-        ),
-        "ant/run",
+    "ant": _mlp("ant/run", 20_000, "mlp-large", 26_000, 1_500, softening=0.02),
+    "anymal": _mlp("anymal/forward", 10_000, "mlp-large", 10_000, 500, softening=0.02),
+    "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),
+    "franka_gravity": _mlp(
+        "franka_gravity/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01
     ),
-    "anymal": Recipe(
-        DataConfig(trajectories=10_000, steps=100),
-        TrainConfig(
-            network="mlp-large",
-            steps=10_000,
-            rollout_steps=500,
-            single_share=1.0,
-            softening=0.02,
-        ),
-        "anymal/forward",
-    ),
-    "franka": _arm("franka/reach_torque"),
-    "franka_gravity": _arm("franka_gravity/reach_torque"),
-    "cube": _cube("cube/toss"),
-    "cube_real": _cube("cube_real/toss"),
+    "cube": _mlp("cube/toss", 10_000, "mlp", 10_000, 1_000, softening=0.1),
+    "cube_real": _mlp("cube_real/toss", 10_000, "mlp", 10_000, 1_000, softening=0.1),
 }
