@@ -9,18 +9,13 @@ from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.scene import Scene
 
-GAIN = (
-    87.0,
-    87.0,
-    87.0,
-    87.0,
-    12.0,
-    12.0,
-    12.0,
-)  # N m per unit of action: effort limits
+GAIN = (87.0,) * 4 + (12.0,) * 3  # N m per unit of action: effort limits
 SUBSTEPS = 9  # of 1/1080 s: control step 1/120 s; paper, appendix B
 TRAINING_TORQUE = (100.0,) * 4 + (20.0,) * 3  # N m; reference code, utils/commons.py
 HOME = (0.0, -0.7853, 0.0, -2.3575, 0.0, 1.5703, 0.7857)  # rad; reference code
+
+
+Joints = tuple[float, ...]
 
 
 def franka() -> Scene:
@@ -29,17 +24,22 @@ def franka() -> Scene:
     The masses are not those that the inertias belong to: so the reference has it. Angles
     are drawn from several turns, as there.
     """
-    path = Path(__file__).parent / "assets" / "franka.xml"
+    return arm_scene("franka", (-10.0,) * 7, (10.0,) * 7, TRAINING_TORQUE)
+
+
+def arm_scene(name: str, low: Joints, high: Joints, torque: Joints) -> Scene:
+    """An arm of that name in the assets, its ranges of angles (rad) and torque (N m)."""
+    path = Path(__file__).parent / "assets" / f"{name}.xml"
     return Scene(
-        name="franka",
+        name=name,
         model=mujoco.MjModel.from_xml_path(str(path)),
         substeps=SUBSTEPS,
         controller=TorqueController(GAIN),
         sampling=Sampling(
-            qpos_low=(-10.0,) * 7,
-            qpos_high=(10.0,) * 7,
+            qpos_low=low,
+            qpos_high=high,
             qvel_low=(-pi,) * 7,
             qvel_high=(pi,) * 7,
-            torque=TRAINING_TORQUE,
+            torque=torque,
         ),
     )

@@ -1,13 +1,6 @@
 """Franka Panda under gravity, with the inertials that were identified on the real arm."""
 
-from math import pi
-from pathlib import Path
-
-import mujoco
-
-from torchrl_nerd.scenes.controllers import TorqueController
-from torchrl_nerd.scenes.franka import GAIN, SUBSTEPS
-from torchrl_nerd.scenes.sampling import Sampling
+from torchrl_nerd.scenes.franka import GAIN, arm_scene
 from torchrl_nerd.scenes.scene import Scene
 
 LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # rad; data sheet
@@ -21,17 +14,4 @@ def franka_gravity() -> Scene:
     (1 N m s/rad) and armature (0.1 kg m^2) of MuJoCo Menagerie's arm without a hand; time
     steps and torques of the paper's.
     """
-    path = Path(__file__).parent / "assets" / "franka_gravity.xml"
-    return Scene(
-        name="franka_gravity",
-        model=mujoco.MjModel.from_xml_path(str(path)),
-        substeps=SUBSTEPS,
-        controller=TorqueController(GAIN),
-        sampling=Sampling(
-            qpos_low=LOW,
-            qpos_high=HIGH,
-            qvel_low=(-pi,) * 7,
-            qvel_high=(pi,) * 7,
-            torque=GAIN,
-        ),
-    )
+    return arm_scene("franka_gravity", LOW, HIGH, GAIN)

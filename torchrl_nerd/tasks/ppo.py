@@ -5,7 +5,7 @@ size follows the policy's KL divergence, here it falls linearly; its Franka poli
 LSTM before the hidden layers, here it has none. Cartpole's are this package's own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,7 @@ _ANT = PPOConfig(
     lr=3e-4,
     widths=(128, 64, 32),
 )
-_ANYMAL = PPOConfig(
-    total_frames=65_500_000,
-    num_envs=2048,
-    minibatch=16_384,
-    lr=3e-4,
-    widths=(128, 64, 32),
-)
+_ANYMAL = replace(_ANT, total_frames=65_500_000)
 _FRANKA = PPOConfig(
     total_frames=26_200_000,
     num_envs=1024,
