@@ -153,7 +153,9 @@ class Eval:
             raise ValueError(f"expected at least 2 rows, got {self.rows}")
         protocols = UNSEEN_TERRAIN if self.unseen_terrain else PROTOCOLS
         if self.scene not in protocols:
-            raise ValueError(f"no unseen terrain for '{self.scene}'")
+            what = "unseen terrain" if self.unseen_terrain else "protocol"
+            known = ", ".join(protocols)
+            raise ValueError(f"no {what} for '{self.scene}', expected one of {known}")
         protocol = protocols[self.scene]()
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         rows = []

@@ -44,8 +44,9 @@ PLANAR = [f"dm_control/{x}" for x in ("cheetah-run", "hopper-hop", "walker-walk"
 PLANAR += [f"gymnasium/{x}-v5" for x in ("HalfCheetah", "Hopper", "Walker2d")]
 
 SERVOS = """
-<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody>
-  <geom name="floor" type="plane" size="0 0 1"/>
+<mujoco><option timestep="0.002" integrator="{integrator}"/>
+  <default><geom contype="1" conaffinity="0"/></default><worldbody>
+  <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
   <body pos="0 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="3"/>
     <body pos="0.3 0 0"><joint name="a" axis="0 1 0" range="-60 60"
         limited="true" actuatorfrcrange="-6 5"/>

@@ -187,11 +187,9 @@ class SceneEnv(EnvBase):
         state = self._state()
         is_fine = torch.all(action.isfinite(), -1, keepdim=True)
         action = torch.where(is_fine, action, 0.0)
-        controller, moved = self.task.controller, state
-        torque = state[QVEL][..., self.scene.actuated]
-        for _ in range(self.task.steps_per_action):
-            torque = controller(action, moved[QPOS], moved[QVEL])
-            moved = self.dynamics.step(moved, torque, state.get(TERRAIN, None))
+        moved, torque = self._control_step(state, action, state)
+        for _ in range(self.task.steps_per_action - 1):
+            moved, torque = self._control_step(moved, action, state)
         for key in (QPOS, QVEL):
             is_fine = is_fine & torch.all(moved[key].isfinite(), -1, keepdim=True)
         next_values = {
@@ -211,6 +209,13 @@ class SceneEnv(EnvBase):
                 "truncated": truncated,
             }
         )
+
+    def _control_step(
+        self, moving: TensorDictBase, action: Tensor, row: TensorDict
+    ) -> tuple[TensorDictBase, Tensor]:
+        """The state one control step later, and the torque that took it there."""
+        torque = self.task.controller(action, moving[QPOS], moving[QVEL])
+        return self.dynamics.step(moving, torque, row.get(TERRAIN, None)), torque
 
     def _output(self, state: TensorDict, torque: Tensor) -> TensorDict:
         """A tensordict that shares no memory with the env."""

@@ -67,6 +67,17 @@ def quat_exp(rotation_vector: Tensor) -> Tensor:
     return torch.cat((real, half_sinc * rotation_vector), -1)
 
 
+def random_tilt(u: Tensor, largest: float) -> Tensor:
+    """Orientation ``(*batch, 4)`` from uniform numbers ``(*batch, 4)`` in [0, 1).
+
+    Upright, then turned by U(-1, 1) times ``largest`` (rad) about a random axis, a
+    normalised U(-1, 1)^3, as in the paper's reference code.
+    """
+    v = 2.0 * u - 1.0
+    length = torch.linalg.vector_norm(v[..., :3], dim=-1, keepdim=True)
+    return quat_exp(v[..., :3] / length.clamp_min(1e-12) * (v[..., 3:] * largest))
+
+
 def quat_log(q: Tensor) -> Tensor:
     """Rotation vector (rad, length at most pi) of a unit quaternion, ``(*batch, 3)``.
 

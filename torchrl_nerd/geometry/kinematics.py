@@ -75,6 +75,24 @@ def mount_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarra
     return position, rotation @ quat_matrix(model.body_quat[base.body])
 
 
+def base_pose(
+    base: Base, qpos: Tensor, mount_position: Tensor, mount_rotation: Tensor
+) -> tuple[Tensor, Tensor]:
+    """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t.
+
+    Args:
+        base: floating, read from ``qpos (*batch, nq)``, or fixed, where its mount is.
+        qpos: of the robot.
+        mount_position: ``(3,)``, m, world.
+        mount_rotation: ``(3, 3)``.
+    """
+    if not base.is_floating:
+        batch = qpos.shape[:-1]
+        return mount_position.expand(*batch, 3), mount_rotation.expand(*batch, 3, 3)
+    q = base.qpos_address
+    return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
+
+
 def quat_matrix(quat: np.ndarray) -> np.ndarray:
     """Rotation matrix ``(3, 3)`` of one quaternion ``wxyz``."""
     matrix = np.empty(9)

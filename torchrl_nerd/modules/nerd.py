@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.settings import SettingError
 from torchrl_nerd.transforms import (
     ContactFeatures,
     Normalize,
@@ -30,6 +31,19 @@ NETWORKS: dict[str, NetworkConfig] = {
 """Networks by name, for the command line."""
 
 TOKEN, TARGET = "token", "target"
+
+
+def network_config(name: str) -> NetworkConfig:
+    """The network of that name in `NETWORKS`.
+
+    Raises:
+        SettingError: no such network.
+    """
+    if name not in NETWORKS:
+        raise SettingError(
+            f"unknown network '{name}', expected one of {', '.join(NETWORKS)}"
+        )
+    return NETWORKS[name]
 
 
 class Memory(Protocol):

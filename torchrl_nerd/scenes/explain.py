@@ -192,8 +192,11 @@ def _largest_change(
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
         data.qvel = rng.normal(size=model.nv)
         data.qfrc_applied = rng.normal(size=model.nv) * model.dof_M0  # any robot's size
-        if base is not None:  # a force in world axes would not turn with the robot
-            data.qfrc_applied[base.dof_address : base.dof_address + 3] = 0.0
+        if base is not None:
+            q, v = base.qpos_address, base.dof_address
+            data.qpos[q : q + 3] = rng.normal(size=3)  # far off, digits are lost
+            # a force in world axes would not turn with the robot
+            data.qfrc_applied[v : v + 3] = 0.0
         moved = copy.copy(data)
         move(moved, rng)
         size = abs(data.qvel).max()

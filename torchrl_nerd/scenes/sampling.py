@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from torchrl_nerd.geometry.frames import quat_exp, quat_multiply, rotate
+from torchrl_nerd.geometry.frames import quat_multiply, random_tilt, rotate
 
 GroundSampler = Callable[[Tensor, Generator], Tensor]
 """``(qpos (n, nq), generator) -> terrain (n, terrain.size)``."""
@@ -44,11 +44,13 @@ class BaseSampling:
     def draw(self, rows: int, generator: Generator) -> tuple[Tensor, Tensor]:
         """``qpos (rows, 7)`` and ``qvel (rows, 6)`` of the free joint, float64."""
         position = uniform(self.low, self.high, rows, generator)
-        axis = uniform((-1.0,) * 3, (1.0,) * 3, rows, generator)
-        axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True)
-        angle = uniform((-self.tilt,), (self.tilt,), rows, generator)
+        axis, angle = (
+            torch.rand(rows, size, dtype=torch.float64, generator=generator)
+            for size in (3, 1)
+        )
         upright = torch.tensor(self.quat, dtype=torch.float64).expand(rows, 4)
-        quat = quat_multiply(upright, quat_exp(axis * angle))
+        tilt = random_tilt(torch.cat((axis, angle), -1), self.tilt)
+        quat = quat_multiply(upright, tilt)
         linear = uniform(self.linear_low, self.linear_high, rows, generator)
         angular = uniform(self.angular_low, self.angular_high, rows, generator)
         qvel = torch.cat((rotate(quat, linear), angular), -1)

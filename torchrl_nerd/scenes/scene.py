@@ -14,7 +14,7 @@ from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.geometry.kinematics import (
     Base,
     PointKinematics,
-    matrix_from_quat,
+    base_pose,
     mount_pose,
 )
 from torchrl_nerd.geometry.manifold import JointLayout
@@ -277,14 +277,20 @@ class Scene:
         distance, _ = ground(points, terrain, *self.base_pose(qpos))
         return distance - torch.as_tensor(self.contacts.radii).to(qpos)
 
+    def set_down(self, state: dict[str, torch.Tensor], gap: torch.Tensor) -> None:
+        """Raise or lower floating bases, in place, to ``gap (rows,)`` m over the ground.
+
+        That of the lowest contact point; fixed bases and robots without contact stay.
+        """
+        if self.base.is_floating and self.terrain is not None:
+            qpos = state["qpos"]
+            lowest = self.clearances(qpos, state.get("terrain")).amin(-1)
+            qpos[:, self.base.qpos_address + 2] += gap - lowest
+
     def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
-        if not self.base.is_floating:
-            batch = qpos.shape[:-1]
-            position, rotation = (torch.as_tensor(x).to(qpos) for x in self.mount)
-            return position.expand(*batch, 3), rotation.expand(*batch, 3, 3)
-        q = self.base.qpos_address
-        return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
+        mount = (torch.as_tensor(x).to(qpos) for x in self.mount)
+        return base_pose(self.base, qpos, *mount)
 
     @cached_property
     def point_kinematics(self) -> PointKinematics:

@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import rotate
+from torchrl_nerd.geometry.frames import random_tilt, rotate
 from torchrl_nerd.geometry.kinematics import matrix_from_quat
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.cube import CLEARANCE, HALF, START
-from torchrl_nerd.tasks.floating import angular_velocity, random_tilt
+from torchrl_nerd.tasks.floating import angular_velocity
 from torchrl_nerd.tasks.task import State, Task
 
 

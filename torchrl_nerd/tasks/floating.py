@@ -7,7 +7,7 @@ reference code's axes are y up; here z is up, x forward and y to the left (its -
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import quat_exp, rotate
+from torchrl_nerd.geometry.frames import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.tasks.task import State
 
@@ -15,17 +15,6 @@ from torchrl_nerd.tasks.task import State
 def symmetric(u: Tensor, half: Tensor | float) -> Tensor:
     """Numbers in [-half, half) from uniform ones in [0, 1), ``(*batch, n)``."""
     return (2.0 * u - 1.0) * half
-
-
-def random_tilt(u: Tensor, largest: float) -> Tensor:
-    """Orientation ``(*batch, 4)`` from uniform numbers ``(*batch, 4)``.
-
-    Upright, then turned by U(-1, 1) times ``largest`` (rad) about a random axis, a
-    normalised U(-1, 1)^3.
-    """
-    axis = symmetric(u[..., :3], 1.0)
-    length = torch.linalg.vector_norm(axis, dim=-1, keepdim=True).clamp_min(1e-12)
-    return quat_exp(axis / length * symmetric(u[..., 3:], largest))
 
 
 def tilted_start(

@@ -1,5 +1,6 @@
 """Training data on the device: tokens and targets once, batches by one gather."""
 
+from dataclasses import dataclass
 from typing import cast
 
 import torch
@@ -10,9 +11,60 @@ from torch import Generator, Tensor
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneTokens
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training.images import Images, telling_rows
+from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_contact
 from torchrl_nerd.transforms import StateDelta, Stats
 
 PART = 1024  # trajectories turned into tokens at a time
+LOOK = 8  # parts in which images of tokens are looked for
+# ... and beside them states in which every contact point has features, which those of a
+# small data set may never have
+LOW_ROWS, SUNKEN = 256, 1.0  # -, m
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Isometries of a robot and what they do to its tokens and targets.
+
+    | field | meaning |
+    |---|---|
+    | ``isometries`` | the identity first |
+    | ``images`` | of `TOKEN` and `TARGET` |
+    """
+
+    isometries: tuple[Isometry, ...]
+    images: dict[str, Images]
+
+    @classmethod
+    def of(cls, scene: Scene, data: TensorDict) -> "Symmetry":
+        """The symmetry of a robot, its tokens' images found in samples of ``data``."""
+        isometries = find_isometries(scene)
+        tokens, targets = SceneTokens(scene), StateDelta(scene)
+        low = states_in_contact(scene, LOW_ROWS, SUNKEN)
+        flat = cast(TensorDict, data[: LOOK * PART].flatten(0, 1))
+        token, target = raw_tokens(tokens, targets, flat)
+        some = flat[torch.cat((telling_rows(token), telling_rows(target))).unique()]
+        token_images, target_images = [], []
+        for isometry in isometries:
+            token, target = raw_tokens(tokens, targets, isometry(some))
+            image = isometry(low)
+            keys = (QPOS, QVEL, JOINT_TORQUE)
+            other = tokens(*(image[k] for k in keys), image.get(TERRAIN, None))
+            token_images.append(torch.cat((token, other)))
+            target_images.append(target)
+        found = {TOKEN: token_images, TARGET: target_images}
+        images = {key: Images(x[0], x) for key, x in found.items()}
+        return cls(isometries, images)
+
+    def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
+        """Statistics of tokens and targets with all their images."""
+        return {key: self.images[str(key)].complete(x) for key, x in stats.items()}
+
+    def to(self, device: torch.device) -> "Symmetry":
+        """The same on another device."""
+        isometries = tuple(isometry.to(device) for isometry in self.isometries)
+        images = {key: image.to(device) for key, image in self.images.items()}
+        return Symmetry(isometries, images)
 
 
 class Sequences:
@@ -22,9 +74,16 @@ class Sequences:
         model: its features and statistics.
         data: ``[trajectories, steps]``.
         device: where batches are wanted.
+        symmetry: show each sample as a random one of its images.
     """
 
-    def __init__(self, model: NeRD, data: TensorDict, device: torch.device) -> None:
+    def __init__(
+        self,
+        model: NeRD,
+        data: TensorDict,
+        device: torch.device,
+        symmetry: Symmetry | None = None,
+    ) -> None:
         tokens, targets = [], []
         for part in data.split(PART):
             token, target = raw_tokens(model.tokens, model.state_delta, part)
@@ -32,6 +91,7 @@ class Sequences:
             targets.append(model.normalize.normalize(TARGET, target).float())
         self.tokens, self.targets = (torch.cat(x).to(device) for x in (tokens, targets))
         self.data = data.to(device)
+        self.symmetry = symmetry.to(device) if symmetry else None
         self.steps = data.batch_size[1]
 
     def pick(
@@ -49,7 +109,13 @@ class Sequences:
     ) -> tuple[Tensor, Tensor]:
         """Tokens and targets ``(rows, length, D)``."""
         row, time_index = self.pick(rows, length, generator)
-        return self.tokens[row, time_index], self.targets[row, time_index]
+        tokens, targets = self.tokens[row, time_index], self.targets[row, time_index]
+        if self.symmetry is None:
+            return tokens, targets
+        count = len(self.symmetry.isometries)
+        choice = torch.randint(count, (rows,), generator=generator).to(tokens.device)
+        images = self.symmetry.images
+        return images[TOKEN](tokens, choice), images[TARGET](targets, choice)
 
     def rollout(
         self, rows: int, length: int, generator: Generator
@@ -57,6 +123,11 @@ class Sequences:
         """True states ``(rows, length + 1, ...)``, torques and ground."""
         row, time_index = self.pick(rows, length, generator)
         batch = cast(TensorDict, self.data[row, time_index])
+        if self.symmetry is not None:  # the rows are in no order: a part for each
+            isometries = self.symmetry.isometries
+            parts = zip(isometries, batch.chunk(len(isometries)), strict=False)
+            images = [isometry(cast(TensorDict, part)) for isometry, part in parts]
+            batch = cast(TensorDict, torch.cat(images))  # pyright: ignore
         qpos = torch.cat((batch[QPOS], batch[NEXT_QPOS][:, -1:]), 1)
         qvel = torch.cat((batch[QVEL], batch[NEXT_QVEL][:, -1:]), 1)
         terrain = batch.get(TERRAIN, None)

@@ -15,14 +15,14 @@ from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.settings import SettingError, expect_at_least
+from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
-from torchrl_nerd.training.sequences import Sequences, data_stats
+from torchrl_nerd.training.sequences import Sequences, Symmetry, data_stats
 
 VALIDATION_SEED = 1_000_003
 VALIDATION_ROWS = 256
@@ -43,6 +43,7 @@ class TrainConfig:
     | ``rollout_steps`` | further updates on the model's own rollouts |
     | ``rows``, ``length`` | sequences per update and tokens of each |
     | ``single_share`` | share of updates on as many single states instead |
+    | ``use_symmetry`` | show each sample as a random one of its mirror images |
     | ``rollout_rows``, ``rollout_length`` | the same for rollouts |
     | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
     | ``rollout_lr`` | share of the peak at which the rollout updates begin |
@@ -61,6 +62,7 @@ class TrainConfig:
     rows: int = 64
     length: int = 16
     single_share: float = 0.75
+    use_symmetry: bool = False
     rollout_rows: int = 128
     rollout_length: int = 8
     lr: float = 0.01
@@ -75,10 +77,7 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.network not in NETWORKS:
-            raise SettingError(
-                f"unknown network '{self.network}', expected one of {', '.join(NETWORKS)}"
-            )
+        network_config(self.network)  # or refuse its name
         for name, value in asdict(self).items():
             if name != "network":
                 expect_at_least(1 if name in COUNTS else 0, **{name: value})
@@ -133,8 +132,12 @@ class Trainer:
                 f"got {data.batch_size[1]}"
             )
         torch.manual_seed(config.seed)
-        model = NeRD(scene, NETWORKS[config.network], data_stats(scene, data))
-        self.sequences = Sequences(model, data, self.device)
+        stats, symmetry = data_stats(scene, data), None
+        if config.use_symmetry:
+            symmetry = Symmetry.of(scene, data)
+            stats = symmetry.complete(stats)
+        model = NeRD(scene, network_config(config.network), stats)
+        self.sequences = Sequences(model, data, self.device, symmetry)
         self.model = model.to(self.device)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
@@ -265,9 +268,11 @@ class Trainer:
         score = sum(
             v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}")
         )
-        is_first = not (self.folder / "best").exists()
-        if score < self.best or is_first:  # even a model whose rollouts blow up
-            self.best = score if score < self.best else self.best
+        is_best = score < self.best
+        if is_best:
+            self.best = score
+        # the first one is kept even if its rollouts blow up
+        if is_best or not (self.folder / "best").exists():
             self._save_model("best", summaries)
         return figures
 

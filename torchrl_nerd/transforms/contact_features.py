@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_nerd.geometry.kinematics import PointKinematics, matrix_from_quat
+from torchrl_nerd.geometry.kinematics import PointKinematics, base_pose
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
@@ -115,22 +115,22 @@ class ContactFeatures(FeatureTransform):
         later = integrate_pos(self.layout, qpos, self.step_size * qvel)
         both = torch.stack((qpos, later)), torch.stack((qvel, qvel))
         points, velocities = self.kinematics(*both)
-        position, rotation = self._base_pose(both[0])
+        mount = self.mount_pos, self.mount_rot
+        position, rotation = base_pose(self.base, both[0], *mount)
         if terrain is not None:
             terrain = terrain.expand(2, *terrain.shape)
         (distance, end), (normal, _) = self.ground(points, terrain, position, rotation)
         velocity = velocities[0]
         if self.base.is_floating:  # from riding on the base to standing on the ground
             v = self.base.dof_address
-            linear = _turn_inverse(rotation[0], qvel[..., v : v + 3])
+            linear = (rotation[0].mT @ qvel[..., v : v + 3, None])[..., 0]
             angular = qvel[..., None, v + 3 : v + 6].expand_as(velocity)
             turning = torch.linalg.cross(angular, points[0])
             velocity = velocity + linear[..., None, :] + turning
         beyond = distance - self.margins
         gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
         gate = gate[..., None]
-        speed = velocity[..., None, :] @ normal[..., None]
-        speed = speed[..., 0]
+        speed = (velocity[..., None, :] @ normal[..., None])[..., 0]
         sliding = velocity - speed * normal
         depth = self._coming_depth(distance, self.step_size * speed, end)
         features = [beyond.clamp_max(0.0)]
@@ -152,21 +152,9 @@ class ContactFeatures(FeatureTransform):
         path = start + torch.cat((slope, bend), -1) @ powers
         return path.clamp_min(0.0)
 
-    def _base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
-        """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
-        if not self.base.is_floating:
-            batch = qpos.shape[:-1]
-            return self.mount_pos.expand(*batch, 3), self.mount_rot.expand(*batch, 3, 3)
-        q = self.base.qpos_address
-        return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
-
     def _features(self, tensordict: TensorDictBase) -> dict:
         if self.terrain is None:
             return {}
         terrain = tensordict[TERRAIN] if self.terrain.is_per_row else None
         values = self.contact_features(tensordict[QPOS], tensordict[QVEL], terrain)
         return dict(zip(self.out_keys, values, strict=True))
-
-
-def _turn_inverse(rotation: Tensor, vector: Tensor) -> Tensor:
-    return (rotation.mT @ vector[..., None])[..., 0]

@@ -22,12 +22,9 @@ from torchrl_nerd.evaluation.explain.paper_input import (
 )
 from torchrl_nerd.evaluation.explain.rebuild import Piece, rebuild_errors
 from torchrl_nerd.evaluation.explain.states import draw_states
-from torchrl_nerd.evaluation.explain.timing import (
-    StepTime,
-    check_network,
-    time_inputs,
-)
+from torchrl_nerd.evaluation.explain.timing import StepTime, time_inputs
 from torchrl_nerd.keys import QPOS, TERRAIN
+from torchrl_nerd.modules.nerd import network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.explain import SolverReport
 from torchrl_nerd.settings import expect_at_least
@@ -115,7 +112,7 @@ def explain(
     """
     expect_at_least(16, rows=rows)
     if network is not None:
-        check_network(network)
+        network_config(network)
     generator = Generator().manual_seed(seed)
     states = draw_states(scene, rows, generator)
     kinds = feature_kinds(scene, _telling(scene, states))

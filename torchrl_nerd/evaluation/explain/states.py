@@ -4,10 +4,9 @@ from typing import cast
 
 import torch
 from tensordict import TensorDict
-from torch import Generator, Tensor
+from torch import Generator
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
@@ -28,10 +27,8 @@ def draw_states(scene: Scene, rows: int, generator: Generator) -> TensorDict:
         ``qpos``, ``qvel``, (``terrain``) and ``("next", "joint_torque")``, float64.
     """
     start, scale = scene.sample_initial(rows, generator)
-    for q, _ in scene.layout.rotations:
-        start[QPOS][:, q : q + 4] = quat_normalize(start[QPOS][:, q : q + 4])
-    if scene.base.is_floating and len(scene.contacts):
-        _set_down(scene, start, generator)
+    draw = torch.rand(rows, dtype=torch.float64, generator=generator)
+    scene.set_down(start, (NEAR + DEEP) * draw - DEEP)
     terrain = start.pop(TERRAIN, None)
     state = TensorDict(start, batch_size=[rows])
     torque = sample_torque(scene.sampling, scale, STEPS + 1, generator)
@@ -47,13 +44,3 @@ def draw_states(scene: Scene, rows: int, generator: Generator) -> TensorDict:
         taken[TERRAIN] = terrain
     is_sound = taken[QPOS].isfinite().all(-1) & taken[QVEL].isfinite().all(-1)
     return cast(TensorDict, taken[is_sound])
-
-
-def _set_down(scene: Scene, start: dict[str, Tensor], generator: Generator) -> None:
-    """Move floating bases up or down, so that their lowest shape is near the ground."""
-    height = scene.base.qpos_address + 2
-    rows = len(start[QPOS])
-    draw = torch.rand(rows, dtype=torch.float64, generator=generator)
-    wanted = (NEAR + DEEP) * draw - DEEP
-    gap = scene.clearances(start[QPOS], start.get(TERRAIN)).amin(-1)
-    start[QPOS][:, height] += wanted - gap

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_nerd.evaluation.explain.paper_input import PaperInput
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import NETWORKS, SceneTokens
+from torchrl_nerd.modules.nerd import SceneTokens, network_config
 from torchrl_nerd.scenes import Scene
 
 ROUNDS = 40
@@ -39,13 +39,6 @@ class StepTime:
     ratio: float
 
 
-def check_network(name: str) -> None:
-    """Raise ValueError for a network that is not one of `NETWORKS`."""
-    if name not in NETWORKS:
-        expected = ", ".join(NETWORKS)
-        raise ValueError(f"unknown network '{name}', expected one of {expected}")
-
-
 @torch.no_grad()
 def time_inputs(scene: Scene, states: TensorDict, network: str) -> StepTime:
     """Both inputs through one kind of network, turn by turn so that load hits both.
@@ -56,14 +49,14 @@ def time_inputs(scene: Scene, states: TensorDict, network: str) -> StepTime:
         network: one of `NETWORKS`.
 
     Raises:
-        ValueError: no such network.
+        SettingError: no such network.
     """
-    check_network(network)
+    config = network_config(network)
     ground = states.get(TERRAIN, None)
     inputs = states[QPOS], states[QVEL], states[JOINT_TORQUE], ground
     runs = []
     for encoder in (SceneTokens(scene), PaperInput(scene)):
-        net = NETWORKS[network].build(encoder.size, 2 * scene.layout.nv)
+        net = config.build(encoder.size, 2 * scene.layout.nv)
         runs.append((encoder, net, net.empty_memory(len(states))))
     times: list[list[float]] = [[], [], [], []]
     for _ in range(WARM_UP + ROUNDS):

@@ -1,0 +1,160 @@
+"""A robot's isometries: groups that the true solver and the features agree with."""
+
+import pytest
+import torch
+from torch import Generator
+
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.geometry.frames import orientation_error
+from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.baselines import MLPConfig
+from torchrl_nerd.modules.nerd import NETWORKS, TARGET, TOKEN, NeRD, SceneTokens
+from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.tasks import make_task
+from torchrl_nerd.training.images import Images
+from torchrl_nerd.training.losses import rollout_loss
+from torchrl_nerd.training.sequences import Sequences, Symmetry, data_stats, raw_tokens
+from torchrl_nerd.training.symmetry import find_isometries
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.transforms import StateDelta
+
+# Quarter turns and mirrors of the ant; the cube's whole group; ANYmal's trunk and the
+# arm's links are heavier on one side.
+ORDERS = {"cartpole": 2, "ant": 8, "cube": 48, "anymal": 1, "franka": 1}
+
+
+@pytest.mark.parametrize(("name", "order"), ORDERS.items())
+def test_the_groups_are_those_of_the_shapes(name, order):
+    assert len(find_isometries(load_scene(name))) == order
+
+
+@pytest.fixture
+def data(scene, generator):
+    data = simulate(scene, 60, 40, generator)
+    return data[is_sound(data)]
+
+
+def test_the_image_of_a_trajectory_is_the_trajectory_of_the_image(scene, data):
+    """Whole rollouts of the true solver, impacts included."""
+    steps, start = 10, data[:, 0]
+    torque = data[JOINT_TORQUE][:, :steps]
+    dynamics = MujocoDynamics(scene, num_threads=1)
+    for isometry in find_isometries(scene):
+        image = isometry(start)
+        dynamics.reset(image)
+        path = dynamics.rollout(
+            image, isometry.torque(torque), image.get(TERRAIN, None)
+        )
+        expected = isometry.qpos(data[NEXT_QPOS][:, :steps])
+        assert _apart(scene, path[QPOS], expected).median() < 1e-9
+        assert _apart(scene, path[QPOS], expected).max() < 1e-3  # chaos, in contact
+        expected = isometry.qvel(data[NEXT_QVEL][:, :steps])
+        assert (path[QVEL] - expected).abs().median() < 1e-8
+
+
+def _apart(scene: Scene, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    if not scene.base.is_floating:
+        return (a - b).abs().amax(-1)
+    rest = torch.cat((a[..., :3] - b[..., :3], a[..., 7:] - b[..., 7:]), -1)
+    return rest.abs().amax(-1) + orientation_error(a[..., 3:7], b[..., 3:7])
+
+
+def test_the_group_is_closed_and_has_inverses(scene, data):
+    """Every product of two is one of them again."""
+    state = data[:, 0]
+    group = find_isometries(scene)
+    images = [isometry(state) for isometry in group]
+    for first in group[:8]:
+        for second in group[-8:]:
+            twice = second(first(state))
+            gaps = [_apart(scene, twice[QPOS], image[QPOS]).max() for image in images]
+            assert min(gaps) < 1e-9
+
+
+def test_tokens_and_targets_are_renumbered(scene, data):
+    symmetry = Symmetry.of(scene, data)
+    encode = SceneTokens(scene), StateDelta(scene)
+    flat = data.flatten(0, 1)[::7]
+    here = raw_tokens(*encode, flat)
+    for number, isometry in enumerate(symmetry.isometries):
+        there = raw_tokens(*encode, isometry(flat))
+        choice = torch.full((len(flat),), number)
+        for key, x, expected in zip((TOKEN, TARGET), here, there, strict=True):
+            image = symmetry.images[key](x[:, None], choice)[:, 0]
+            torch.testing.assert_close(image, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_statistics_are_those_of_all_images(scene, data):
+    """So that normalised vectors are renumbered as raw ones are."""
+    symmetry = Symmetry.of(scene, data)
+    found = symmetry.complete(data_stats(scene, data))
+    images = [isometry(data) for isometry in symmetry.isometries]
+    expected = data_stats(scene, torch.cat(images))
+    for key in (TOKEN, TARGET):
+        assert found[key].count == expected[key].count
+        torch.testing.assert_close(
+            found[key].mean, expected[key].mean, atol=1e-6, rtol=0
+        )
+        torch.testing.assert_close(
+            found[key].std, expected[key].std, rtol=1e-5, atol=1e-6
+        )
+        for source, sign in zip(
+            symmetry.images[key].sources, symmetry.images[key].signs, strict=True
+        ):
+            mean, std = found[key].mean, found[key].std
+            torch.testing.assert_close(mean, sign * mean[source], atol=1e-9, rtol=1e-9)
+            torch.testing.assert_close(std, std[source], atol=1e-12, rtol=1e-9)
+
+
+def test_batches_show_images_of_the_data(scene, data, generator):
+    """Those of one step and those of rollouts, which the true solver also takes."""
+    symmetry = Symmetry.of(scene, data)
+    model = NeRD(scene, MLPConfig(1, 4), symmetry.complete(data_stats(scene, data)))
+    sequences = Sequences(model, data, torch.device("cpu"), symmetry)
+    qpos, qvel, torque, terrain = sequences.rollout(32, 2, generator)
+    dynamics = MujocoDynamics(scene, num_threads=1)
+    start = {QPOS: qpos[:, 0], QVEL: qvel[:, 0]}
+    if terrain is not None:
+        start[TERRAIN] = terrain
+    state = data[:32, 0].empty().update(start)
+    dynamics.reset(state)
+    path = dynamics.rollout(state, torque, terrain)
+    assert _apart(scene, path[QPOS], qpos[:, 1:]).median() < 1e-6
+    loss = rollout_loss(model, qpos, qvel, torque, terrain, 0.02)
+    assert loss.isfinite()
+    tokens, targets = sequences.one_step(64, 2, generator)
+    assert tokens.shape[:2] == targets.shape[:2] == (64, 2)
+
+
+def test_what_is_no_symmetry_is_refused():
+    x = torch.randn(20, 3).double()
+    with pytest.raises(ValueError, match="entry 1 of the image"):
+        Images(x, [x * torch.tensor([1.0, 2.0, 1.0])])
+    swapped = torch.stack((x[:, 1], -x[:, 0], x[:, 2]), -1)
+    images = Images(x, [x, swapped])
+    assert images.sources.tolist() == [[0, 1, 2], [1, 0, 2]]
+    assert images.signs.tolist() == [[1, 1, 1], [1, -1, 1]]
+
+
+def test_training_with_symmetry_resumes_to_the_same_bits(tmp_path):
+    scene = load_scene("ant")
+    data = simulate(scene, 60, 12, Generator().manual_seed(1))
+    config = TrainConfig(
+        **dict(network="mlp", use_symmetry=True, steps=6, rollout_steps=4, rows=16),
+        **dict(length=4, rollout_rows=16, rollout_length=4, save_every=4),
+        validate_every=20,
+    )
+    task = make_task("ant/run")
+
+    def train(name: str, *stops: int) -> dict:
+        for stop in stops:
+            trainer = Trainer(
+                scene, data, task, config, tmp_path / name, horizons=(2,), quiet=True
+            )
+            model = trainer.run(stop)
+        return model.state_dict()
+
+    assert config.network in NETWORKS
+    whole, parts = train("whole", 10), train("parts", 4, 8, 10)
+    assert all(torch.equal(whole[key], parts[key]) for key in whole)
