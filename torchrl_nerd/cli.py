@@ -104,6 +104,7 @@ class Train:
             generate(scene, recipe.data, folder, self.quiet)
         if self.threads:
             torch.set_num_threads(self.threads)
+        protocol = PROTOCOLS[self.scene]()
         trainer = Trainer(
             scene,
             load_data(scene, folder),
@@ -111,7 +112,8 @@ class Train:
             self.config,
             out,
             self.device,
-            horizons=PROTOCOLS[self.scene]().horizons[:2],
+            horizons=protocol.horizons[:2],
+            random_actions=protocol.random_actions,
             quiet=self.quiet,
         )
         trainer.run()

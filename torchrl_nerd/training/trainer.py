@@ -103,6 +103,7 @@ class Trainer:
         folder: where.
         device: of model and data; bf16 autocast on CUDA, float32 on the CPU.
         horizons: control steps of the validation rollouts.
+        random_actions: validate under random actions in place of none.
         quiet: no progress bar.
 
     Raises:
@@ -118,11 +119,13 @@ class Trainer:
         folder: Path,
         device: torch.device | str = "cpu",
         horizons: tuple[int, ...] = (100, 500),
+        random_actions: bool = False,
         quiet: bool = False,
     ) -> None:
         self.scene, self.task, self.config = scene, task, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
-        self.horizons, self.quiet = horizons, quiet
+        self.horizons, self.random_actions = horizons, random_actions
+        self.quiet = quiet
         longest = max(
             config.length, config.rollout_length if config.rollout_steps else 1
         )
@@ -247,7 +250,7 @@ class Trainer:
         return model.eval()
 
     def validate(self) -> dict[str, float]:
-        """Mean passive error of the averaged model at every horizon.
+        """Mean open-loop error of the averaged model at every horizon.
 
         The starts (their seed) are of no test: choices are made on them.
         """
@@ -259,6 +262,7 @@ class Trainer:
             rows=VALIDATION_ROWS,
             seed=VALIDATION_SEED,
             device=self.device,
+            random_actions=self.random_actions,
         )
         figures = {
             f"{name}_{horizon}": summary.mean
