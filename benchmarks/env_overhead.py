@@ -2,8 +2,9 @@
 
     python benchmarks/env_overhead.py --rows 512
 
-Times `EnvBase.step` and, within the same calls, the env's own `_step` and the dynamics;
-prints median shares. TorchRL's overhead is what lies outside `_step`.
+Times `EnvBase.step` and, within the same calls, the env's own `_step`, the dynamics and,
+where there is contact, kinematics and collision; prints median shares. TorchRL's overhead
+is what lies outside `_step`.
 """
 
 import platform
@@ -55,15 +56,25 @@ def step_times(
     if model is not None:
         env.dynamics = NeRDDynamics(model)
     dynamics, own = timed(env.dynamics, "step"), timed(env, "_step")
+    contact = env.dynamics.model.tokens.contact  # pyright: ignore
+    looks = [
+        timed(getattr(contact, name), "forward")
+        for name in ("kinematics", "ground")
+        if contact.terrain is not None
+    ]
     td, whole = env.rand_action(env.reset()), timed(env, "step")
     for _ in range(steps):
         env.step(td)
+    looking = [sum(parts) for parts in zip(*looks, strict=True)] or [0.0] * steps
     calls = list(zip(dynamics, own, whole, strict=True))
     return {
         "step_s": median(whole),
         "dynamics_s": median(dynamics),
         "torchrl_share": median(1.0 - own / whole for _, own, whole in calls),
         "task_share": median((own - inner) / whole for inner, own, whole in calls),
+        "contact_share": median(
+            look / inner for look, inner in zip(looking, dynamics, strict=True)
+        ),
     }
 
 
@@ -78,7 +89,7 @@ def main(options: Options) -> None:
     print(f"{options.task}, {options.rows} rows, {torch.get_num_threads()} threads")
     print(
         f"{'model':<10}{'step ms':>9}{'dynamics ms':>13}{'TorchRL':>9}{'task':>7}"
-        f"{'steps/s':>10}"
+        f"{'steps/s':>10}  kinematics, collision (share of the dynamics)"
     )
     for name, model in models.items():
         row = step_times(options.task, model, options.rows, options.steps)
@@ -86,7 +97,7 @@ def main(options: Options) -> None:
         rate = options.rows / row["step_s"]
         line = f"{name:<10}{1e3 * row['step_s']:>9.2f}{1e3 * row['dynamics_s']:>13.2f}"
         shares = f"{row['torchrl_share']:>9.1%}{row['task_share']:>7.1%}"
-        print(f"{line}{shares}{rate:>10.0f}")
+        print(f"{line}{shares}{rate:>10.0f}{row['contact_share']:>9.1%}")
     if options.json is not None:
         machine = {"processor": platform.machine(), "threads": torch.get_num_threads()}
         write_json(options.json, {"rows": options.rows, **machine, "models": figures})

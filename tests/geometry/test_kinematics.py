@@ -137,3 +137,16 @@ def test_points_must_be_on_the_robot(rng):
     assert model.body_parentid[base.body] == 1  # body 1 is fixed in the world
     with pytest.raises(ValueError, match="moving bodies of the robot"):
         PointKinematics(model, base, [1], np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("is_floating", [True, False])
+@pytest.mark.parametrize("moving", [0, 1, 3])
+def test_the_first_positions_alone_may_have_velocities(is_floating, moving, rng):
+    model = random_tree(rng, is_floating)
+    base = Base.from_model(model)
+    kinematics = PointKinematics(model, base, *random_points(model, base, rng))
+    qpos, qvel = random_states(model, 5, rng)
+    positions, velocities = kinematics(qpos, qvel)
+    same, first = kinematics(qpos, qvel[:moving])
+    torch.testing.assert_close(same, positions, rtol=0, atol=1e-12)
+    torch.testing.assert_close(first, velocities[:moving], rtol=0, atol=1e-11)

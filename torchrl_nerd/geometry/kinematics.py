@@ -26,8 +26,8 @@ FREE, BALL, SLIDE, HINGE = (
 Motion = tuple[Tensor, Tensor, Tensor, Tensor]
 """Of n bodies in N rows: origins ``(3, n, N)`` m, rotations ``(3, 3, n, N)``, angular
 velocities rad/s and velocities of the origins m/s, both ``(3, n, N)``, in B_t and relative
-to it. N is 1 where all rows are alike. Rows come last, so that a product of many small
-matrices is a few operations on long rows."""
+to it. N is 1 where all rows are alike; velocities may be of the first rows alone. Rows come
+last, so that a product of many small matrices is a few operations on long rows."""
 
 
 @dataclass(frozen=True)
@@ -239,17 +239,18 @@ class PointKinematics(nn.Module):
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """Positions and velocities of the points relative to the base frame.
 
+        Where there are fewer velocities than positions, the first positions have one.
+
         Args:
             qpos: ``(*batch, nq)``, float64.
-            qvel: ``(*batch, nv)``, float64.
+            qvel: ``(*moving, nv)``, float64; of no rows where only positions are wanted.
 
         Returns:
-            positions ``(*batch, P, 3)``, m, and velocities ``(*batch, P, 3)``, m/s, as
+            positions ``(*batch, P, 3)``, m, and velocities ``(*moving, P, 3)``, m/s, as
             seen by an observer who rides on the base; both in B_t.
         """
-        batch = qpos.shape[:-1]
         q, v = (x.reshape(-1, x.shape[-1]).T.contiguous() for x in (qpos, qvel))
-        above = _at_rest(q)
+        above = _at_rest(q, v)
         motions = [above] if self.base.is_floating else []
         for groups in self.depths:
             moved = [self._move(g, _pick(above, g.parents), q, v) for g in groups]
@@ -257,11 +258,12 @@ class PointKinematics(nn.Module):
             motions.append(above)
         position, rotation, omega, velocity = _pick(_join(motions), self.body_of_point)
         arm = _turn(rotation, self.points)
-        position, velocity = position + arm, velocity + _cross(omega, arm)
-        shape = 3, len(self.body_of_point), q.shape[-1]
+        velocity = velocity + _cross(omega, arm[..., : v.shape[-1]])
         return tuple(  # pyright: ignore
-            x.expand(shape).permute(2, 1, 0).reshape(*batch, *shape[1::-1])
-            for x in (position, velocity)
+            x.expand(*x.shape[:-1], rows.shape[-1])
+            .permute(2, 1, 0)
+            .reshape(*like.shape[:-1], *x.shape[1::-1])
+            for x, rows, like in ((position + arm, q, qpos), (velocity, v, qvel))
         )
 
     def _move(
@@ -269,9 +271,10 @@ class PointKinematics(nn.Module):
     ) -> Motion:
         """Motion of a group: its places in the parents, then its joints."""
         position, rotation, omega, velocity = parent
+        moving = slice(qvel.shape[-1])  # the rows that have velocities
         offset = _turn(rotation, getattr(self, f"pos_{group.name}"))
         position = position + offset
-        velocity = velocity + _cross(omega, offset)
+        velocity = velocity + _cross(omega, offset[..., moving])
         for slot, kind in enumerate(group.kinds):
             if kind == FREE:
                 continue
@@ -283,26 +286,26 @@ class PointKinematics(nn.Module):
                 turn = matrix_from_quat(quat_normalize(quat)).movedim((-2, -1), (0, 1))
                 turned = _matmul(_matmul(rotation, still), turn)
                 local = torch.stack([qvel[d : d + 3] for d in v_at], 1)
-                spin = _turn(turned, local)
+                spin = _turn(turned[..., moving], local)
             else:
                 q, v = qpos[q_at] - getattr(self, f"rest_{name}"), qvel[v_at]
                 axis = _turn(rotation, getattr(self, f"axis_{name}"))
                 if kind == SLIDE:
                     path = axis * q
                     position = position + path
-                    velocity = velocity + _cross(omega, path) + axis * v
+                    velocity = velocity + _cross(omega, path[..., moving])
+                    velocity = velocity + axis[..., moving] * v
                     rotation = _matmul(rotation, still)
                     continue
                 turn = torch.addcmul(still, getattr(self, f"cross_{name}"), q.sin())
                 bend = getattr(self, f"square_{name}")
                 turned = _matmul(rotation, torch.addcmul(turn, bend, 1.0 - q.cos()))
-                spin = axis * v
+                spin = axis[..., moving] * v
             if not group.is_at_origin[slot]:  # the body swings about the joint's anchor
                 before = _turn(rotation, getattr(self, f"from_{name}"))
                 after = _turn(turned, getattr(self, f"anchor_{name}"))
-                velocity = (
-                    velocity + _cross(omega, before) - _cross(omega + spin, after)
-                )
+                velocity = velocity + _cross(omega, before[..., moving])
+                velocity = velocity - _cross(omega + spin, after[..., moving])
                 position = position + before - after
             omega = omega + spin
             rotation = turned
@@ -347,19 +350,22 @@ def _join(motions: list[Motion]) -> Motion:
     """Motions side by side."""
     if len(motions) == 1:
         return motions[0]
-    rows = max(position.shape[-1] for position, *_ in motions)
-    joined = (
-        torch.cat([x.expand(*x.shape[:-1], rows) for x in same], -2)
-        for same in zip(*motions, strict=True)
+    position, rotation, omega, velocity = (
+        _side_by_side(same) for same in zip(*motions, strict=True)
     )
-    position, rotation, omega, velocity = joined
     return position, rotation, omega, velocity
 
 
-def _at_rest(like: Tensor) -> Motion:
+def _side_by_side(parts: tuple[Tensor, ...]) -> Tensor:
+    """Bodies together; where all rows of a part are alike, there as many as elsewhere."""
+    rows = max(part.shape[-1] for part in parts)
+    return torch.cat([part.expand(*part.shape[:-1], rows) for part in parts], -2)
+
+
+def _at_rest(qpos: Tensor, qvel: Tensor) -> Motion:
     """The base itself, one body."""
-    zero = like.new_zeros(3, 1, 1)
-    return zero, eye_like(like)[..., None, None], zero, zero
+    zero, still = qpos.new_zeros(3, 1, 1), qvel.new_zeros(3, 1, min(1, qvel.shape[-1]))
+    return zero, eye_like(qpos)[..., None, None], still, still
 
 
 def _joints(model: mujoco.MjModel, body: int) -> range:

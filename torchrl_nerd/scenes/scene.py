@@ -269,10 +269,8 @@ class Scene:
         """
         if self.terrain is None:
             return qpos.new_zeros(*qpos.shape[:-1], 0)
-        at_rest = torch.zeros_like(qpos[..., :1]).expand(
-            *qpos.shape[:-1], self.layout.nv
-        )
-        points, _ = self.point_kinematics.to(qpos.device)(qpos, at_rest)
+        still = qpos.new_zeros(0, self.layout.nv)
+        points, _ = self.point_kinematics.to(qpos.device)(qpos, still)
         ground = self.terrain_distance.to(qpos.device)
         distance, _ = ground(points, terrain, *self.base_pose(qpos))
         return distance - torch.as_tensor(self.contacts.radii).to(qpos)

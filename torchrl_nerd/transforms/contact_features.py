@@ -113,14 +113,13 @@ class ContactFeatures(FeatureTransform):
         if self.terrain is None:
             return []
         later = integrate_pos(self.layout, qpos, self.step_size * qvel)
-        both = torch.stack((qpos, later)), torch.stack((qvel, qvel))
-        points, velocities = self.kinematics(*both)
+        both = torch.stack((qpos, later))
+        points, velocity = self.kinematics(both, qvel)
         mount = self.mount_pos, self.mount_rot
-        position, rotation = base_pose(self.base, both[0], *mount)
+        position, rotation = base_pose(self.base, both, *mount)
         if terrain is not None:
             terrain = terrain.expand(2, *terrain.shape)
         (distance, end), (normal, _) = self.ground(points, terrain, position, rotation)
-        velocity = velocities[0]
         if self.base.is_floating:  # from riding on the base to standing on the ground
             v = self.base.dof_address
             linear = (rotation[0].mT @ qvel[..., v : v + 3, None])[..., 0]

@@ -153,8 +153,7 @@ class BaseFrame(nn.Module):
         batch = qpos.shape[:-1]
         if self.is_same:
             return torch.eye(3).to(qpos).expand(*batch, 3, 3), qpos.new_zeros(*batch, 3)
-        at_rest = qpos.new_zeros(*batch, self.num_dofs)
-        corners, _ = self.corners(qpos, at_rest)
+        corners, _ = self.corners(qpos, qpos.new_zeros(0, self.num_dofs))
         origin = corners[..., 0, :]
         return (corners[..., 1:, :] - origin[..., None, :]).mT, origin
 
