@@ -154,7 +154,7 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
     if options.scene not in RECIPES:
         known = ", ".join(RECIPES)
         raise ValueError(f"expected a scene of {known}, got '{options.scene}'")
-    task_id = options.task or RECIPES[options.scene].task
+    task_id = str(options.task or RECIPES[options.scene].task)
     task, folder = make_task(task_id), options.out / options.scene
     policy, explorer = options.policy, options.explorer
     if task_id in PPO_CONFIGS:

@@ -13,12 +13,15 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
+from torchrl_nerd.evaluation.rollout_error import (
+    ErrorSummary,
+    Source,
+    passive_errors,
+)
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import Task
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
@@ -98,12 +101,13 @@ class Trainer:
     Args:
         scene: the robot.
         data: from `load_data`.
-        task: its reset distribution starts the validation rollouts.
+        source: a task or the scene; its resets or ranges start the validation rollouts.
         config: how.
         folder: where.
         device: of model and data; bf16 autocast on CUDA, float32 on the CPU.
         horizons: control steps of the validation rollouts.
         quiet: no progress bar.
+        random_actions: validate under random actions in place of zero ones.
 
     Raises:
         ValueError: the folder cannot be written or holds a run of another configuration.
@@ -113,14 +117,16 @@ class Trainer:
         self,
         scene: Scene,
         data: TensorDict,
-        task: Task,
+        source: Source,
         config: TrainConfig,
         folder: Path,
         device: torch.device | str = "cpu",
         horizons: tuple[int, ...] = (100, 500),
         quiet: bool = False,
+        random_actions: bool = False,
     ) -> None:
-        self.scene, self.task, self.config = scene, task, config
+        self.scene, self.source, self.config = scene, source, config
+        self.random_actions = random_actions
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.horizons, self.quiet = horizons, quiet
         longest = max(
@@ -247,18 +253,19 @@ class Trainer:
         return model.eval()
 
     def validate(self) -> dict[str, float]:
-        """Mean passive error of the averaged model at every horizon.
+        """Mean open-loop error of the averaged model at every horizon.
 
         The starts (their seed) are of no test: choices are made on them.
         """
         summaries = passive_errors(
-            self.task,
+            self.source,
             NeRDDynamics(self.averaged_model()),
             MujocoDynamics(self.scene),
             list(self.horizons),
             rows=VALIDATION_ROWS,
             seed=VALIDATION_SEED,
             device=self.device,
+            random_actions=self.random_actions,
         )
         figures = {
             f"{name}_{horizon}": summary.mean
