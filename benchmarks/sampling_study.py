@@ -62,7 +62,7 @@ class Options:
     explorer: Path | None = None
     """Folder of the policy that makes data; another seed of the same by default."""
     policy_frames: int = 2_000_000
-    """Actions that these two learn from."""
+    """Actions that these two learn from; 0: only policies that are given are used."""
     learn_frames: int = 0
     """Actions that a policy learns from in each model, then run in MuJoCo; 0: none."""
     episodes: int = 256
@@ -157,7 +157,7 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
     task_id = str(options.task or RECIPES[options.scene].task)
     task, folder = make_task(task_id), options.out / options.scene
     policy, explorer = options.policy, options.explorer
-    if task_id in PPO_CONFIGS:
+    if task_id in PPO_CONFIGS and options.policy_frames:
         where = (task_id, "mujoco")
         sizes = options.policy_frames
         policy = policy or learned_policy(folder / "measured", *where, 0, sizes)
