@@ -53,9 +53,9 @@ def strategies(
     | ``correlated`` | torques that keep for one control step to a second |
     | ``starts`` | equal parts of ``shares``, standing and fallen starts |
     | ``policy`` | the way of an exploring policy |
-    | ``mixed`` | equal parts from the ranges, standing, fallen, all with scales and \
-    correlation, and of the policy |
+    | ``mixed`` | equal parts of ranges, standing, fallen and policy |
 
+    All but the policy's part of ``mixed`` have scales and correlation.
     Scenes whose torques follow the state have no correlation; without an explorer there is
     no ``policy``, nor a part of it in ``mixed``.
 

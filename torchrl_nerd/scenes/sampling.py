@@ -79,8 +79,9 @@ class Sampling:
     | ``quiet_share`` | share whose torque and velocity are scaled down by U(0, 1) |
     | ``starts`` | draws the initial states, in place of the ranges |
     | ``least_scale`` | torque scales of the other rows log-uniform from this to 1, not 1 |
-    | ``correlation`` | torques keep for about as long as a time (s) drawn log-uniformly \
-    from this pair for each row, in place of being drawn anew at every step |
+    | ``correlation`` | lowest and highest time, s, that a row's torques keep |
+
+    Without a ``correlation`` torques are drawn anew at every step.
 
     Raises:
         ValueError: a scale or times that are not positive and in order, or a correlation
