@@ -21,16 +21,17 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import (
+    Source,
     action_drive,
     initial_states,
     open_loop,
     position_errors,
+    scene_of,
 )
 from torchrl_nerd.files import write_json
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.tasks import Task
 
 FLOOR = 1e-6  # m and rad: no model's error is compared below it
 
@@ -65,30 +66,31 @@ def moved(scene: Scene, start: TensorDict, yaw: float, shift: Tensor) -> TensorD
 
 
 def error_curves(
-    task: Task, learned: NeRDDynamics, start: TensorDict, steps: int, random: bool
+    source: Source, learned: NeRDDynamics, start: TensorDict, steps: int, random: bool
 ) -> dict[str, Tensor]:
     """Mean error over rows at every step, ``(steps,)``."""
-    drive = action_drive(task, len(start), steps, 0, random)
+    scene = scene_of(source)
+    drive = action_drive(source, len(start), steps, 0, random)
     paths = [
         open_loop(dynamics, start, steps, drive)
-        for dynamics in (MujocoDynamics(task.scene), learned)
+        for dynamics in (MujocoDynamics(scene), learned)
     ]
-    return {k: e.mean(0) for k, e in position_errors(task.scene, *paths).items()}
+    return {k: e.mean(0) for k, e in position_errors(scene, *paths).items()}
 
 
 def main(options: Options) -> dict[str, float]:
     """Print a line for each quantity."""
     protocol = PROTOCOLS[options.scene]()
-    (task,) = protocol.cases.values()
-    scene, steps = task.scene, max(protocol.horizons)
+    ((case, source),) = protocol.cases.items()
+    scene, steps = scene_of(source), max(protocol.horizons)
     learned = NeRDDynamics(from_pretrained(options.model or options.scene, scene))
     generator = torch.Generator().manual_seed(options.seed)
     yaw, way = (2.0 * math.pi * torch.rand(2, generator=generator)).tolist()
     shift = torch.tensor([math.cos(way), math.sin(way), 0.0]).double()
-    start = initial_states(task, options.rows, options.seed)
+    start = initial_states(source, options.rows, options.seed)
     there = moved(scene, start, yaw, options.distance * shift)
-    random = protocol.random_actions
-    curves = [error_curves(task, learned, x, steps, random) for x in (start, there)]
+    random = case in protocol.random_actions
+    curves = [error_curves(source, learned, x, steps, random) for x in (start, there)]
     figures = {}
     for name, here in curves[0].items():
         apart = (curves[1][name] - here).abs() / here.clamp_min(FLOOR)

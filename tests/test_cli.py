@@ -9,6 +9,7 @@ import pytest
 
 from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
+from torchrl_nerd.files import folder_name
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training.recipes import RECIPES
 
@@ -189,6 +190,68 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
         key = (row["case"], row["steps"], row["quantity"])
         assert row["paper"] == protocol.published.get(key)
         assert row["case"] in line and row["quantity"] in line
+
+
+def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
+    """Default folders, whose names hold no slash; the recipe and protocol of any robot."""
+    monkeypatch.chdir(tmp_path)
+    name, folder = "dm_control/cheetah-run", "dm_control-cheetah-run"
+    sizes = ["--trajectories", "300", "--steps", "20", "--seed", str(seed), "--quiet"]
+    assert main(["data", name, *sizes]) == 0
+    argv = ["train", name, *TINY, "--steps", "150", "--rollout-steps", "2"]
+    assert main([*argv, "--validate-every", "152", "--json", "train.json"]) == 0
+    card = json.loads((tmp_path / "train.json").read_text())
+    assert card["scene"] == name and card["training"]["single_share"] == 1.0
+    assert set(card["validation_error"]) == {"20", "100"}
+    for place in ("datasets", "runs"):
+        assert [path.name for path in (tmp_path / place).iterdir()] == [folder]
+
+    model = ["--model", f"runs/{folder}/best", "--rows", "8", "--json", "eval.json"]
+    assert main(["eval", name, *model]) == 0
+    rows = json.loads((tmp_path / "eval.json").read_text())["errors"]
+    assert {(row["case"], row["steps"]) for row in rows} == {
+        (case, steps) for case in ("passive", "random") for steps in (20, 100)
+    }
+    assert len(rows) == 4 * load_scene(name).model.njnt
+    capsys.readouterr()
+    assert "expected a shipped model" in refusal(capsys, "eval", name)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("../../etc/passwd", "unknown scene '../../etc/passwd'"),
+        ("dm_control/../../etc-passwd", "unknown domain"),
+        ("gymnasium/../Ant-v5", "unknown environment '../Ant-v5'"),
+        ("dm_control/cheetah-fly", "unknown task in 'dm_control/cheetah-fly'"),
+        ("../nowhere.xml", "found none at ../nowhere.xml"),
+    ],
+)
+@pytest.mark.parametrize("command", ["data", "train", "eval"])
+def test_names_that_lead_elsewhere_are_refused(
+    command, name, words, tmp_path, monkeypatch, capsys
+):
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    monkeypatch.chdir(inside)
+    assert words in refusal(capsys, command, name)
+    assert list(tmp_path.rglob("*")) == [inside]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("cartpole", "cartpole"),
+        ("dm_control/cheetah-run", "dm_control-cheetah-run"),
+        ("gymnasium/HalfCheetah-v5", "gymnasium-HalfCheetah-v5"),
+        ("robots/my arm.xml", "robots-my-arm"),
+        ("../../robot.xml", "robot"),
+        ("/home/me/robot.v2.xml", "home-me-robot.v2"),
+        (".xml", "robot"),
+    ],
+)
+def test_names_of_robots_are_names_of_folders(name, expected):
+    assert folder_name(name) == expected
 
 
 def test_a_scene_is_explained(scene, tmp_path, seed, capsys):

@@ -42,15 +42,13 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
     """
     scene, config = model.scene, model.config
     kind = next(name for name, cls in KINDS.items() if type(config) is cls)
-    ranges = asdict(scene.sampling)
-    ranges = {k: v for k, v in ranges.items() if k not in ("ground", "drive")}
     return {
         "format": 1,
         "scene": scene.name,
         "scene_hash": scene.hash,
         "control_step": scene.control_step,
         "network": {"kind": kind, **asdict(config)},
-        "training_ranges": ranges,
+        "training_ranges": scene.sampling.ranges(),
         "versions": {
             "torchrl_nerd": __version__,
             "mujoco": mujoco.__version__,

@@ -22,14 +22,14 @@ from torchrl_nerd.evaluation.explain.report import explain
 from torchrl_nerd.evaluation.explain.table import report_table
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
-from torchrl_nerd.evaluation.protocols import PROTOCOLS
-from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.evaluation.protocols import protocol_of
+from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
 from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
-from torchrl_nerd.files import read_json, writable_folder, write_json
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
+from torchrl_nerd.scenes import is_import, load_scene
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.tasks import make_task
-from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.training.recipes import RECIPES, recipe_of
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
 
 Positional = tyro.conf.Positional
@@ -57,7 +57,7 @@ class Data:
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
         scene = load_scene(self.scene)
-        out = self.out or Path("datasets") / Path(self.scene).stem
+        out = self.out or Path("datasets") / folder_name(self.scene)
         generate(scene, self.config, out, self.quiet)
         card = read_json(out / CARD)
         print(
@@ -70,12 +70,14 @@ class Data:
 class Train:
     """Train a NeRD; without options, exactly as the shipped model of the scene.
 
+    Robots of others get one recipe for all, validated from their own sampling ranges.
     Missing data are generated first. A killed run goes on where it stopped.
     Example: nerd train cartpole --out runs/cartpole --network mlp
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
     out: Path | None = None
     """Folder of the run; runs/SCENE by default."""
     data: Path | None = None
@@ -95,28 +97,23 @@ class Train:
     def run(self) -> dict[str, Any]:
         """Train and return the card of the best checkpoint."""
         scene = load_scene(self.scene)
-        if self.scene not in RECIPES:
-            raise ValueError(
-                f"expected a scene with a recipe ({', '.join(RECIPES)}), got "
-                f"'{self.scene}': train it with torchrl_nerd.training.trainer.Trainer"
-            )
-        recipe = RECIPES[self.scene]
-        out = writable_folder(self.out or Path("runs") / self.scene)
-        folder = self.data or Path("datasets") / self.scene
+        recipe, name = recipe_of(self.scene), folder_name(self.scene)
+        out = writable_folder(self.out or Path("runs") / name)
+        folder = self.data or Path("datasets") / name
         if not (folder / CARD).exists():
             generate(scene, recipe.data, folder, self.quiet)
         if self.threads:
             torch.set_num_threads(self.threads)
-        protocol = PROTOCOLS[self.scene]()
+        protocol = protocol_of(scene)
         trainer = Trainer(
             scene,
             load_data(scene, folder),
-            make_task(recipe.task),
+            recipe.source(scene),
             self.config,
             out,
             self.device,
             horizons=protocol.horizons[:2],
-            random_actions=protocol.random_actions,
+            random_actions=bool(protocol.random_actions),
             quiet=self.quiet,
         )
         trainer.run()
@@ -131,11 +128,13 @@ class Train:
 class Eval:
     """Open-loop error of a model against true physics, beside the paper's figures.
 
+    Robots of others start within their own sampling ranges, without and with actions.
     Example: nerd eval cartpole --json results/cartpole.json
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
     model: Path | None = None
     """Checkpoint folder; the shipped model by default."""
     rows: int = 2048
@@ -156,27 +155,30 @@ class Eval:
         scene = load_scene(self.scene)
         if self.rows < 2:
             raise ValueError(f"expected at least 2 rows, got {self.rows}")
-        protocols = UNSEEN_TERRAIN if self.unseen_terrain else PROTOCOLS
-        if self.scene not in protocols:
-            what = "unseen terrain" if self.unseen_terrain else "protocol"
-            known = ", ".join(protocols)
-            raise ValueError(f"no {what} for '{self.scene}', expected one of {known}")
-        protocol = protocols[self.scene]()
+        protocol = protocol_of(scene)
+        if self.unseen_terrain:
+            if self.scene not in UNSEEN_TERRAIN:
+                known = ", ".join(UNSEEN_TERRAIN)
+                raise ValueError(
+                    f"no unseen terrain for '{self.scene}', expected one of {known}"
+                )
+            protocol = UNSEEN_TERRAIN[self.scene]()
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         rows = []
         header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"
         print(f"{header}{'final':>9}{'p95':>9}  paper")
-        for case, task in protocol.cases.items():
-            here = model if task.scene is scene else model.over(task.scene)
+        for case, source in protocol.cases.items():
+            place = scene_of(source)
+            here = model if place is scene else model.over(place)
             errors = passive_errors(
-                task,
+                source,
                 NeRDDynamics(here, inference=self.inference),
-                MujocoDynamics(task.scene),
+                MujocoDynamics(place),
                 list(protocol.horizons),
                 self.rows,
                 self.seed,
                 self.device,
-                protocol.random_actions,
+                case in protocol.random_actions,
             )
             for horizon, by_name in errors.items():
                 for name, error in by_name.items():
@@ -231,7 +233,8 @@ class Explain:
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
     rows: int = 1024
     """Random states to ask the true solver about, and rows of the timing."""
     seed: int = 0
@@ -359,10 +362,13 @@ def _parse(kind: type, argv: list[str]) -> Any:
 
 def _default(kind: type, args: list[str]) -> Any:
     """Defaults of a command: a scene's recipe where the command has one."""
-    scene = next((arg for arg in args if arg in RECIPES), None)
+    known = [arg for arg in args if arg in RECIPES]
+    scene = next(
+        (arg for arg in (*known, *args) if arg in known or is_import(arg)), None
+    )
     if scene is None or kind not in (Data, Train):
         return tyro.MISSING_NONPROP
-    recipe = RECIPES[scene]
+    recipe = recipe_of(scene)
     if kind is Data:
         return Data(scene, config=recipe.data)
     return Train(scene, config=recipe.train)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
@@ -78,3 +79,13 @@ def writable_folder(path: Path) -> Path:
             f"expected a folder that can be written, got {path}: {error.strerror}"
         ) from None
     return path
+
+
+def folder_name(name: str) -> str:
+    """A scene's name as that of one folder: ``dm_control-cheetah-run``.
+
+    Whatever is no letter, digit, dot, dash or underscore becomes a dash, and none leads, so
+    that no name leads out of the folder it is put in; an MJCF file loses its ending.
+    """
+    safe = re.sub(r"[^\w.-]+", "-", name.removesuffix(".xml")).strip("-.")
+    return safe or "robot"

@@ -1,12 +1,14 @@
 """Every robot is measured as in the paper, beside the figures that the paper prints."""
 
 import pytest
+import torch
 
-from torchrl_nerd.evaluation.protocols import PROTOCOLS
+from torchrl_nerd.evaluation.protocols import PROTOCOLS, protocol_of
+from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
 from torchrl_nerd.modules.nerd import NETWORKS
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.tasks import TASKS, make_task
-from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.training.recipes import RECIPES, recipe_of
 
 CARTPOLE = """
                         100     500     1000
@@ -41,7 +43,9 @@ def test_protocols_fit_their_scene(scene):
         names = {"base_position", "base_orientation", "joints"}
     assert protocol.cases and protocol.horizons
     assert list(protocol.horizons) == sorted(set(protocol.horizons))
-    assert all(task.scene is scene for task in protocol.cases.values())
+    assert all(scene_of(source) is scene for source in protocol.cases.values())
+    assert set(protocol.random_actions) <= set(protocol.cases)
+    assert protocol_of(scene).cases.keys() == protocol.cases.keys()
     for (case, horizon, quantity), figure in protocol.published.items():
         assert case in protocol.cases and horizon in protocol.horizons
         assert quantity in names and 0.0 < figure < 1.0
@@ -83,3 +87,22 @@ def test_published_figures_of_the_ant():
 def test_arms_are_driven_and_no_other_robot_is():
     driven = {name for name in PROTOCOLS if PROTOCOLS[name]().random_actions}
     assert driven == {"franka", "franka_gravity"}
+
+
+@pytest.mark.parametrize(
+    ("name", "cases"),
+    [
+        ("dm_control/cheetah-run", ["passive", "random"]),
+        ("dm_control/walker-walk", ["passive", "random"]),
+        ("gymnasium/Swimmer-v5", ["passive", "random"]),
+    ],
+)
+def test_robots_of_others_start_within_their_own_ranges(name, cases, seed):
+    scene = load_scene(name)
+    protocol, recipe = protocol_of(scene), recipe_of(name)
+    assert list(protocol.cases) == cases and not protocol.published
+    assert protocol.random_actions == ("random",)
+    assert recipe.source(scene) is scene and recipe.train.network in NETWORKS
+    start = initial_states(scene, 20, seed)
+    expected, _ = scene.sample_initial(20, torch.Generator().manual_seed(seed))
+    assert all(torch.equal(start[key], value) for key, value in expected.items())

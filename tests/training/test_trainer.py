@@ -54,7 +54,7 @@ def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
     before = loss_of(trainer, seed)
     model = trainer.run()
     assert loss_of(trainer, seed) < 0.9 * before
-    start = initial_states(trainer.task, 5, seed)
+    start = initial_states(trainer.source, 5, seed)
     expected = open_loop(NeRDDynamics(model), start, 20)
     for name in ("last", "best"):
         loaded = load_checkpoint(tmp_path / name)

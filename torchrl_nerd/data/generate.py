@@ -7,14 +7,16 @@ JSON card beside it.
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 import mujoco
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Generator
+from torch import Generator, Tensor
 from tqdm import tqdm
 
 from torchrl_nerd import __version__
@@ -22,13 +24,16 @@ from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.sampling import sample_torque
+from torchrl_nerd.scenes.sampling import sample_torques
 from torchrl_nerd.settings import expect_at_least
 
 CHUNK = 2048  # trajectories stepped together; also what a kill can lose
 SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
 LARGEST = 1e5  # reference code: a trajectory beyond this is broken
 CARD = "data.json"
+
+Draw = Callable[[int, int, Generator], TensorDict]
+"""``(rows, steps, generator) -> trajectories [rows, steps]``, broken ones included."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +63,38 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
     states, torques = [state[:, None]], []
-    for done in range(0, steps, 1 if scene.sampling.drive else SEGMENT):
-        last = cast(TensorDict, states[-1][:, -1])
-        if scene.sampling.drive is None:
-            count = min(SEGMENT, steps - done)
-            held = sample_torque(scene.sampling, scale, count, generator)
-        else:
+    if scene.sampling.drive is None:
+        drawn = sample_torques(
+            scene.sampling, scale, steps, scene.control_step, generator
+        )
+        for held in drawn.split(SEGMENT, 1):
+            last = cast(TensorDict, states[-1][:, -1])
+            torques.append(held)
+            states.append(dynamics.rollout(last, held, terrain))
+    else:
+        for _ in range(steps):
+            last = cast(TensorDict, states[-1][:, -1])
             torque = scene.sampling.drive(last[QPOS], last[QVEL], scale, generator)
-            held = torque[:, None]
-        torques.append(held)
-        states.append(dynamics.rollout(last, held, terrain))
+            torques.append(torque[:, None])
+            states.append(dynamics.rollout(last, torques[-1], terrain))
+    return as_transitions(states, torques, terrain)
+
+
+def as_transitions(
+    states: list[TensorDictBase], torques: list[Tensor], terrain: Tensor | None
+) -> TensorDict:
+    """A data set ``[rows, steps]`` in TorchRL's layout.
+
+    Args:
+        states: parts of trajectories, ``[rows, *]``, in order: steps + 1 states in all.
+        torques: of the steps between them, parts of ``(rows, *, num_actuated)``.
+        terrain: ``(rows, terrain.size)`` where the ground varies.
+    """
     path = cast(TensorDict, TensorDict.cat(states, 1))
     data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))
     data["next"] = after.set("joint_torque", torch.cat(torques, 1))
     if terrain is not None:
+        steps = data.batch_size[1]
         data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
     return data
 
@@ -83,7 +106,11 @@ def is_sound(data: TensorDictBase) -> torch.Tensor:
 
 
 def generate(
-    scene: Scene, config: DataConfig, folder: Path, quiet: bool = False
+    scene: Scene,
+    config: DataConfig,
+    folder: Path,
+    quiet: bool = False,
+    strategy: tuple[str, Draw] | None = None,
 ) -> Path:
     """Write a data set, or go on with one that was cut short.
 
@@ -92,12 +119,15 @@ def generate(
         config: what to draw.
         folder: where; a finished data set of the same card is left as it is.
         quiet: no progress bar.
+        strategy: another way to draw trajectories than `simulate`, and its name, by
+            which the card knows it.
 
     Raises:
         ValueError: the folder cannot be written or holds data of another card.
     """
-    card = _open_card(scene, config, writable_folder(folder))
-    store = _open_store(scene, config, folder)
+    name, draw = strategy or (None, partial(simulate, scene))
+    card = _open_card(scene, config, writable_folder(folder), name)
+    store = _open_store(draw, config, folder)
     chunks = -(-config.trajectories // CHUNK)
     bar = tqdm(
         total=config.trajectories * config.steps,
@@ -110,7 +140,7 @@ def generate(
     for chunk in range(card["chunks_done"], chunks):
         rows = min(CHUNK, config.trajectories - chunk * CHUNK)
         generator = Generator().manual_seed((config.seed << 24) + chunk)
-        data = simulate(scene, rows, config.steps, generator)
+        data = draw(rows, config.steps, generator)
         sound = is_sound(data)
         kept, first = data[sound], card["trajectories"]
         store[first : first + len(kept)] = kept
@@ -144,12 +174,15 @@ def load_data(scene: Scene, folder: Path) -> TensorDict:
     return TensorDict.load_memmap(folder)[: card["trajectories"]]
 
 
-def _open_card(scene: Scene, config: DataConfig, folder: Path) -> dict:
+def _open_card(
+    scene: Scene, config: DataConfig, folder: Path, strategy: str | None
+) -> dict:
     fresh = {
         "scene": scene.name,
         "scene_hash": scene.hash,
         "config": asdict(config),
-        "ranges": {k: v for k, v in asdict(scene.sampling).items() if not callable(v)},
+        "strategy": strategy,
+        "ranges": scene.sampling.ranges(),
         "mujoco": mujoco.__version__,
         "torchrl_nerd": __version__,
         "trajectories": 0,
@@ -162,7 +195,10 @@ def _open_card(scene: Scene, config: DataConfig, folder: Path) -> dict:
         write_json(path, fresh)  # before any data: they never outlive their card
         return fresh
     card = read_json(path)
-    for key in ("scene_hash", "config", "ranges"):
+    # older cards also list what is not set
+    ranges = {k: v for k, v in card.get("ranges", {}).items() if v is not None}
+    card["ranges"] = ranges
+    for key in ("scene_hash", "config", "strategy", "ranges"):
         if card.get(key) != fresh[key]:
             raise ValueError(
                 f"{folder} already holds data with {key} {card.get(key)}, asked for "
@@ -171,10 +207,10 @@ def _open_card(scene: Scene, config: DataConfig, folder: Path) -> dict:
     return card
 
 
-def _open_store(scene: Scene, config: DataConfig, folder: Path) -> TensorDictBase:
+def _open_store(draw: Draw, config: DataConfig, folder: Path) -> TensorDictBase:
     """The memory-mapped tensordict, created where it is not there yet."""
     if (folder / "meta.json").exists():
         return TensorDict.load_memmap(folder)
-    example = simulate(scene, 1, 1, Generator().manual_seed(0))
+    example = draw(1, 1, Generator().manual_seed(0))
     shape = [config.trajectories, config.steps]
     return example.expand(*shape).memmap_like(str(folder))

@@ -1,8 +1,10 @@
 """Which rollouts measure a scene: the paper's tests, with the figures it published."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from torchrl_nerd.tasks import Task
+from torchrl_nerd.evaluation.rollout_error import Source
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks.ant import AntRun
 from torchrl_nerd.tasks.anymal import AnymalForward
 from torchrl_nerd.tasks.cartpole import CartpoleSwingup
@@ -20,16 +22,16 @@ class Protocol:
 
     | field | meaning |
     |---|---|
-    | ``cases`` | name -> task whose reset distribution gives the starts |
+    | ``cases`` | name -> task or scene whose resets or ranges give the starts |
     | ``horizons`` | control steps over which errors are averaged |
     | ``published`` | (case, horizon, quantity) -> the paper's mean error, m or rad |
-    | ``random_actions`` | uniform in [-1, 1] at every step in place of zero |
+    | ``random_actions`` | cases with uniform actions in [-1, 1] in place of zero |
     """
 
-    cases: dict[str, Task]
+    cases: Mapping[str, Source]
     horizons: tuple[int, ...]
     published: dict[tuple[str, int, str], float]
-    random_actions: bool = False
+    random_actions: tuple[str, ...] = ()
 
 
 def cartpole() -> Protocol:
@@ -47,7 +49,7 @@ def cartpole() -> Protocol:
 
 def double_pendulum() -> Protocol:
     """Paper, appendix C.2: no ground in reach (0) and grounds 1 to 6."""
-    cases: dict[str, Task] = {
+    cases = {
         f"ground {number}": DoublePendulumPassive(number)
         for number in range(len(GROUNDS))
     }
@@ -75,13 +77,14 @@ def franka() -> Protocol:
 
     Passive, the arm would stay where it is: it starts at rest and knows no gravity.
     """
-    return Protocol({"random": FrankaReachTorque()}, (128,), {}, random_actions=True)
+    cases = {"random": FrankaReachTorque()}
+    return Protocol(cases, (128,), {}, random_actions=("random",))
 
 
 def franka_gravity() -> Protocol:
     """As `franka`."""
-    task = FrankaGravityReachTorque()
-    return Protocol({"random": task}, (128,), {}, random_actions=True)
+    cases = {"random": FrankaGravityReachTorque()}
+    return Protocol(cases, (128,), {}, random_actions=("random",))
 
 
 def anymal() -> Protocol:
@@ -109,3 +112,15 @@ PROTOCOLS = {
     "cube": cube,
     "cube_real": cube_real,
 }
+
+
+def protocol_of(scene: Scene) -> Protocol:
+    """That of a registered scene; of any other robot, starts within its own ranges.
+
+    These are sent once with a zero action and once with random ones, where it has motors.
+    """
+    if scene.name in PROTOCOLS:
+        return PROTOCOLS[scene.name]()
+    names = ("passive", "random") if scene.actuated else ("passive",)
+    cases: dict[str, Source] = {name: scene for name in names}
+    return Protocol(cases, (20, 100), {}, random_actions=names[1:])

@@ -22,6 +22,14 @@ from torchrl_nerd.tasks import Task
 Drive = Callable[[int, TensorDictBase], Tensor]
 """``(step, state [rows]) -> joint torque (rows, num_actuated)``."""
 
+Source = Task | Scene
+"""Whose starts and controller a test has: a task's, or a scene's own sampling ranges."""
+
+
+def scene_of(source: Source) -> Scene:
+    """The robot and its ground."""
+    return source if isinstance(source, Scene) else source.scene
+
 
 @dataclass(frozen=True)
 class ErrorSummary:
@@ -43,29 +51,31 @@ class ErrorSummary:
     p95: float
 
 
-def initial_states(task: Task, rows: int, seed: int) -> TensorDict:
-    """Starts of the task's reset distribution, ``[rows]``, from a seed of their own."""
+def initial_states(source: Source, rows: int, seed: int) -> TensorDict:
+    """Starts ``[rows]`` of a task's resets or a scene's ranges, from their own seed."""
     generator = Generator().manual_seed(seed)
-    u = torch.rand(rows, task.num_uniforms, dtype=torch.float64, generator=generator)
-    return TensorDict(task.initial_state(u), batch_size=[rows])
+    if isinstance(source, Scene):
+        return TensorDict(source.sample_initial(rows, generator)[0], batch_size=[rows])
+    u = torch.rand(rows, source.num_uniforms, dtype=torch.float64, generator=generator)
+    return TensorDict(source.initial_state(u), batch_size=[rows])
 
 
 def action_drive(
-    task: Task, rows: int, steps: int, seed: int, random_actions: bool = False
+    source: Source, rows: int, steps: int, seed: int, random_actions: bool = False
 ) -> Drive:
-    """The task's controller on actions that do not look at the state.
+    """The source's controller on actions that do not look at the state.
 
     Actions are zero, or uniform in [-1, 1] at every step. The controller sees the state
     that the dynamics it drives has led to.
     """
     generator = Generator().manual_seed(seed)
-    shape = (steps, rows, task.controller.num_actions)
+    shape = (steps, rows, source.controller.num_actions)
     draw = torch.rand(shape, dtype=torch.float64, generator=generator)
     actions = 2.0 * draw - 1.0 if random_actions else torch.zeros_like(draw)
 
     def drive(step: int, state: TensorDictBase) -> Tensor:
         qpos, qvel = state[QPOS], state[QVEL]
-        return task.controller(actions[step].to(qpos.device), qpos, qvel)
+        return source.controller(actions[step].to(qpos.device), qpos, qvel)
 
     return drive
 
@@ -159,7 +169,7 @@ def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary
 
 
 def passive_errors(
-    task: Task,
+    source: Source,
     learned: Dynamics,
     truth: Dynamics,
     horizons: list[int],
@@ -170,16 +180,16 @@ def passive_errors(
 ) -> dict[int, dict[str, ErrorSummary]]:
     """Open-loop errors at every horizon, from one rollout of the longest.
 
-    Passive where the task's controller makes no torque of a zero action; see
+    Passive where the source's controller makes no torque of a zero action; see
     `action_drive`.
     """
-    start = initial_states(task, rows, seed).to(device)
+    start, scene = initial_states(source, rows, seed).to(device), scene_of(source)
     steps = max(horizons)
-    drive = action_drive(task, rows, steps, seed, random_actions)
+    drive = action_drive(source, rows, steps, seed, random_actions)
     true_path = open_loop(truth, start, steps, drive)
     learned_path = open_loop(learned, start, steps, drive)
-    errors = position_errors(task.scene, true_path, learned_path)
+    errors = position_errors(scene, true_path, learned_path)
     return {
-        horizon: summarize(task.scene, {k: e[:, :horizon] for k, e in errors.items()})
+        horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
         for horizon in horizons
     }

@@ -19,7 +19,6 @@ from torchrl_nerd.evaluation.protocols import Protocol
 from torchrl_nerd.keys import TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.double_pendulum import double_pendulum_over
-from torchrl_nerd.tasks import Task
 from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
 
 
@@ -92,7 +91,7 @@ def _add_field(spec: mujoco.MjSpec, heights: np.ndarray, base: float) -> None:
 def double_pendulum() -> Protocol:
     """Four grounds, 100 passive steps; the paper has none of them."""
     grounds = (two_planes, box_edge, height_field, flat_field)
-    cases: dict[str, Task] = {
+    cases = {
         ground.__name__.replace("_", " "): DoublePendulumOver(ground)
         for ground in grounds
     }

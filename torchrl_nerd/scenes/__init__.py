@@ -25,6 +25,11 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 
+def is_import(name: str) -> bool:
+    """Whether a name is of the form of a robot of others; see `load_scene`."""
+    return name.startswith(("dm_control/", "gymnasium/")) or name.endswith(".xml")
+
+
 @cache
 def load_scene(name: str) -> Scene:
     """The scene of that name; the same object at every call.
@@ -52,4 +57,4 @@ def load_scene(name: str) -> Scene:
     )
 
 
-__all__ = ["SCENES", "Scene", "load_scene"]
+__all__ = ["SCENES", "Scene", "is_import", "load_scene"]

@@ -1,7 +1,9 @@
 """Where training trajectories start and what drives them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from math import log
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
@@ -13,6 +15,9 @@ GroundSampler = Callable[[Tensor, Generator], Tensor]
 
 Drive = Callable[[Tensor, Tensor, Tensor, Generator], Tensor]
 """``(qpos, qvel, scale (n, 1), generator) -> joint_torque (n, num_actuated)``."""
+
+Starts = Callable[[int, Generator], dict[str, Tensor]]
+"""``(rows, generator) -> qpos (rows, nq), qvel (rows, nv)``, perhaps ``terrain``."""
 
 Triple = tuple[float, float, float]
 
@@ -72,6 +77,15 @@ class Sampling:
     | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
     | ``passive_share`` | share of trajectories with no torque at all |
     | ``quiet_share`` | share whose torque and velocity are scaled down by U(0, 1) |
+    | ``starts`` | draws the initial states, in place of the ranges |
+    | ``least_scale`` | torque scales of the other rows log-uniform from this to 1, not 1 |
+    | ``correlation`` | lowest and highest time, s, that a row's torques keep |
+
+    Without a ``correlation`` torques are drawn anew at every step.
+
+    Raises:
+        ValueError: a scale or times that are not positive and in order, or a correlation
+            beside a ``drive``, whose torques follow the state.
     """
 
     qpos_low: tuple[float, ...]
@@ -85,6 +99,34 @@ class Sampling:
     clearance: float | None = None
     passive_share: float = 0.25
     quiet_share: float = 0.25
+    starts: Starts | None = None
+    least_scale: float | None = None
+    correlation: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.least_scale is not None and not 0.0 < self.least_scale <= 1.0:
+            raise ValueError(
+                f"expected a least_scale above 0 and up to 1, got {self.least_scale}"
+            )
+        if self.correlation is not None:
+            low, high = self.correlation
+            if not 0.0 < low <= high:
+                raise ValueError(
+                    f"expected two correlation times above 0 s, the lower first, got "
+                    f"{self.correlation}"
+                )
+            if self.drive is not None:
+                raise ValueError(
+                    "expected a correlation time or a drive, got both: a drive's torques "
+                    "follow the state"
+                )
+
+    def ranges(self) -> dict[str, Any]:
+        """What cards say: every field that is set, but for functions."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.base is not None:
+            found["base"] = vars(self.base).copy()
+        return {k: v for k, v in found.items() if v is not None and not callable(v)}
 
 
 def uniform(
@@ -106,17 +148,52 @@ def sample_torque(
     return scale[:, None] * torque.unflatten(0, (steps, rows)).transpose(0, 1)
 
 
+def sample_torques(
+    sampling: Sampling,
+    scale: Tensor,
+    steps: int,
+    control_step: float,
+    generator: Generator,
+) -> Tensor:
+    """Torques of trajectories ``(rows, steps, num_actuated)``, correlated where asked.
+
+    An Ornstein-Uhlenbeck process of each row's correlation time, put through its own
+    distribution function: at every single step a torque is as uniform as without.
+    """
+    if sampling.correlation is None:
+        return sample_torque(sampling, scale, steps, generator)
+    time = log_uniform(*sampling.correlation, len(scale), generator)
+    keep = torch.exp(-control_step / time)
+    size = (steps, len(scale), len(sampling.torque))
+    noise = torch.randn(size, dtype=torch.float64, generator=generator)
+    walk = [noise[0]]
+    for kick in noise[1:]:
+        walk.append(keep * walk[-1] + (1.0 - keep**2).sqrt() * kick)
+    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)
+    return scale[:, None] * share * share.new_tensor(sampling.torque)
+
+
+def log_uniform(low: float, high: float, rows: int, generator: Generator) -> Tensor:
+    """Numbers ``(rows, 1)`` that are as likely in each octave, float64."""
+    u = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
+    return low * torch.exp(u * log(high / low))
+
+
 def sample_scale(
     sampling: Sampling, rows: int, generator: Generator
 ) -> tuple[Tensor, Tensor]:
     """How violent each trajectory is: scales of torque and velocity ``(rows, 1)``.
 
-    Both 1 for most rows; torque 0 for the passive share; both U(0, 1) for the quiet one.
+    Both 1 for most rows (torque log-uniform from ``least_scale`` to 1, if that is set);
+    torque 0 for the passive share; both U(0, 1) for the quiet one.
     """
     draw = torch.rand(2, rows, 1, dtype=torch.float64, generator=generator)
     one = torch.ones_like(draw[0])
     is_passive = draw[0] < sampling.passive_share
     is_quiet = draw[0] > 1.0 - sampling.quiet_share
     speed = torch.where(is_quiet | is_passive, draw[1], one)
-    torque = torch.where(is_passive, 0.0 * one, torch.where(is_quiet, draw[1], one))
+    loud = one
+    if sampling.least_scale is not None:
+        loud = log_uniform(sampling.least_scale, 1.0, rows, generator)
+    torque = torch.where(is_passive, 0.0 * one, torch.where(is_quiet, draw[1], loud))
     return torque, speed

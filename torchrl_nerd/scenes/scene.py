@@ -217,11 +217,15 @@ class Scene:
             ``terrain (rows, terrain.size)``, all float64.
         """
         ranges = self.sampling
-        qpos, qvel = self._draw(rows, generator)
-        torque_scale, speed_scale = sample_scale(ranges, rows, generator)
-        state = {"qpos": qpos, "qvel": speed_scale * qvel}
-        if ranges.ground is not None:
-            state["terrain"] = ranges.ground(qpos, generator)
+        if ranges.starts is not None:
+            state = dict(ranges.starts(rows, generator))
+            torque_scale, _ = sample_scale(ranges, rows, generator)
+        else:
+            qpos, qvel = self._draw(rows, generator)
+            torque_scale, speed_scale = sample_scale(ranges, rows, generator)
+            state = {"qpos": qpos, "qvel": speed_scale * qvel}
+        if ranges.ground is not None and "terrain" not in state:
+            state["terrain"] = ranges.ground(state["qpos"], generator)
         return state, torque_scale
 
     def _draw(

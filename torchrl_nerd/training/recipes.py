@@ -1,22 +1,35 @@
-"""How the shipped model of each scene is made: ``nerd train SCENE`` with its defaults."""
+"""How a model of each scene is made: ``nerd train SCENE`` with its defaults."""
 
 from dataclasses import dataclass
 
 from torchrl_nerd.data.generate import DataConfig
+from torchrl_nerd.evaluation.rollout_error import Source
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.trainer import TrainConfig
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Data and training of one scene, and the task that validates it."""
+    """Data and training of one scene, and what validates it.
+
+    | field | meaning |
+    |---|---|
+    | ``data``, ``train`` | how much, and how |
+    | ``task`` | its resets start the validation; None: the scene's sampling ranges do |
+    """
 
     data: DataConfig
     train: TrainConfig
-    task: str
+    task: str | None
+
+    def source(self, scene: Scene) -> Source:
+        """Whose starts validate."""
+        return scene if self.task is None else make_task(self.task)
 
 
 def _mlp(
-    task: str,
+    task: str | None,
     trajectories: int,
     network: str,
     steps: int,
@@ -52,3 +65,11 @@ RECIPES: dict[str, Recipe] = {
     "cube": _mlp("cube/toss", 10_000, "mlp", 10_000, 1_000, softening=0.1),
     "cube_real": _mlp("cube_real/toss", 10_000, "mlp", 10_000, 1_000, softening=0.1),
 }
+
+# Of robots that nobody has tuned one for, such as imported ones.
+ANY_ROBOT = _mlp(None, 10_000, "mlp-large", 10_000, 500, softening=0.02)
+
+
+def recipe_of(name: str) -> Recipe:
+    """The recipe of the scene of that name, or the one of any robot."""
+    return RECIPES.get(name, ANY_ROBOT)

@@ -13,12 +13,15 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
+from torchrl_nerd.evaluation.rollout_error import (
+    ErrorSummary,
+    Source,
+    passive_errors,
+)
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import Task
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
@@ -98,12 +101,12 @@ class Trainer:
     Args:
         scene: the robot.
         data: from `load_data`.
-        task: its reset distribution starts the validation rollouts.
+        source: a task or the scene; its resets or ranges start the validation rollouts.
         config: how.
         folder: where.
         device: of model and data; bf16 autocast on CUDA, float32 on the CPU.
         horizons: control steps of the validation rollouts.
-        random_actions: validate under random actions in place of none.
+        random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
 
     Raises:
@@ -114,7 +117,7 @@ class Trainer:
         self,
         scene: Scene,
         data: TensorDict,
-        task: Task,
+        source: Source,
         config: TrainConfig,
         folder: Path,
         device: torch.device | str = "cpu",
@@ -122,7 +125,7 @@ class Trainer:
         random_actions: bool = False,
         quiet: bool = False,
     ) -> None:
-        self.scene, self.task, self.config = scene, task, config
+        self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.horizons, self.random_actions = horizons, random_actions
         self.quiet = quiet
@@ -255,7 +258,7 @@ class Trainer:
         The starts (their seed) are of no test: choices are made on them.
         """
         summaries = passive_errors(
-            self.task,
+            self.source,
             NeRDDynamics(self.averaged_model()),
             MujocoDynamics(self.scene),
             list(self.horizons),

@@ -81,8 +81,7 @@ def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
         contender_errors(rows[f"MuJoCo x{n}"], ground)["hinge"].mean for n in (2, 8)
     )
     assert 3.0 < coarse / fine < 6.0
-    task = ground[0].task
-    again = ground[0].errors(truth(task.scene, 1))
+    again = ground[0].errors(truth(ground[0].scene, 1))
     assert all(not error.any() for error in again.values())
 
 

@@ -13,15 +13,17 @@ from torchrl_nerd.evaluation.protocols import Protocol
 from torchrl_nerd.evaluation.rollout_error import (
     Drive,
     ErrorSummary,
+    Source,
     action_drive,
     initial_states,
     open_loop,
     position_errors,
+    scene_of,
     summarize,
 )
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import QPOS
-from torchrl_nerd.tasks import Task
+from torchrl_nerd.scenes import Scene
 
 Errors = dict[str, ErrorSummary]
 PERTURBATIONS = (1e-6, 1e-4, 1e-2)  # m and rad, of every coordinate at the start
@@ -31,7 +33,7 @@ PERTURBATIONS = (1e-6, 1e-4, 1e-2)  # m and rad, of every coordinate at the star
 class Course:
     """Starts, actions and what the truth makes of them, in one case of a protocol."""
 
-    task: Task
+    source: Source
     start: TensorDict
     drive: Drive
     steps: int
@@ -39,23 +41,34 @@ class Course:
 
     @classmethod
     def of(
-        cls, task: Task, rows: int, steps: int, seed: int, random: bool, threads: int
+        cls,
+        source: Source,
+        rows: int,
+        steps: int,
+        seed: int,
+        random: bool,
+        threads: int,
     ) -> "Course":
         """Step the truth."""
-        start = initial_states(task, rows, seed)
-        drive = action_drive(task, rows, steps, seed, random)
-        path = open_loop(truth(task.scene, threads), start, steps, drive)
-        return cls(task, start, drive, steps, path)
+        start = initial_states(source, rows, seed)
+        drive = action_drive(source, rows, steps, seed, random)
+        path = open_loop(truth(scene_of(source), threads), start, steps, drive)
+        return cls(source, start, drive, steps, path)
+
+    @property
+    def scene(self) -> Scene:
+        """The robot and its ground."""
+        return scene_of(self.source)
 
     def errors(self, dynamics: Dynamics, start: TensorDict | None = None) -> Mapping:
         """Error of every quantity at every step, ``(rows, steps)``."""
         start = self.start if start is None else start
         path = open_loop(dynamics, start, self.steps, self.drive)
-        return position_errors(self.task.scene, self.path, path)
+        return position_errors(self.scene, self.path, path)
 
     def perturbed(self, size: float, seed: int) -> TensorDict:
         """The starts, every coordinate moved by ``size`` (m, rad) times a normal number."""
-        layout, start = self.task.scene.layout, self.start.clone()
+        layout, start = self.scene.layout, self.start.clone()
         shape, generator = (len(start), layout.nv), Generator().manual_seed(seed)
         noise = torch.randn(shape, dtype=torch.float64, generator=generator)
         start[QPOS] = integrate_pos(layout, start[QPOS], size * noise)
@@ -69,14 +82,14 @@ def courses(
     published = {horizon for _, horizon, _ in protocol.published}
     steps = steps or max(published or protocol.horizons)
     return [
-        Course.of(task, rows, steps, seed, protocol.random_actions, threads)
-        for task in protocol.cases.values()
+        Course.of(source, rows, steps, seed, case in protocol.random_actions, threads)
+        for case, source in protocol.cases.items()
     ]
 
 
 def contender_errors(contender: Contender, courses: list[Course]) -> Errors:
     """Summary over all rows of all courses."""
-    parts = [course.errors(contender.make(course.task.scene)) for course in courses]
+    parts = [course.errors(contender.make(course.scene)) for course in courses]
     return _merge(courses, parts)
 
 
@@ -85,9 +98,7 @@ def chaos_floor(courses: list[Course], threads: int, seed: int) -> dict[str, Err
     floors = {}
     for size in PERTURBATIONS:
         parts = [
-            course.errors(
-                truth(course.task.scene, threads), course.perturbed(size, seed)
-            )
+            course.errors(truth(course.scene, threads), course.perturbed(size, seed))
             for course in courses
         ]
         floors[f"truth, starts off by {size:.0e}"] = _merge(courses, parts)
@@ -96,4 +107,4 @@ def chaos_floor(courses: list[Course], threads: int, seed: int) -> dict[str, Err
 
 def _merge(courses: list[Course], parts: list[Mapping]) -> Errors:
     merged = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return summarize(courses[0].task.scene, merged)
+    return summarize(courses[0].scene, merged)

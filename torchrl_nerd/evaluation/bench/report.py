@@ -20,6 +20,7 @@ from torchrl_nerd.evaluation.bench.rates import Rate, rates
 from torchrl_nerd.evaluation.protocols import PROTOCOLS, Protocol
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.tasks import Task
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def bench(
     ground = courses(protocol, rows, seed, threads, steps)
     errors = {who.name: contender_errors(who, ground) for who in everyone}
     floors = chaos_floor(ground, threads, seed)
-    tasks = list(protocol.cases.values())
+    tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
     speeds = {
         batch: rates(everyone, tasks[-1], batch, rounds, seed) for batch in batches
     }

@@ -1,0 +1,228 @@
+"""Which training data make the better model: strategies of `data/strategies.py` compared.
+
+    python benchmarks/sampling_study.py --scene cartpole --json docs/figures/sampling.json
+
+Each strategy draws as many transitions, the same network gets as many updates, and each
+model meets the same tests: open-loop error, passive and under random actions, and the
+return of one and the same policy. What is done is kept under `--out`: a killed run goes on.
+"""
+
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd.data.generate import CARD, DataConfig, Draw, generate, load_data
+from torchrl_nerd.data.strategies import strategies
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.envs import make_env
+from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
+from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
+from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.tasks import make_task
+from torchrl_nerd.tasks.ppo import PPO_CONFIGS
+from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+
+TEST_SEED = 500  # of starts and episodes; never one of training or validation
+PPO = Path(__file__).parents[1] / "examples" / "ppo.py"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare, and how much to spend on it."""
+
+    scene: str = "cartpole"
+    """A scene with a recipe."""
+    only: tuple[str, ...] = ()
+    """Names of strategies; all that the scene has by default."""
+    task: str | None = None
+    """What the policies do; the task of the scene's recipe by default."""
+    transitions: int = 200_000
+    """Of each data set, at 100 steps a trajectory."""
+    network: str = "mlp"
+    updates: int = 4_000
+    """On 1,024 single states each."""
+    seeds: tuple[int, ...] = (0,)
+    """Of data, weights and batches: one model each."""
+    rows: int = 512
+    """Trajectories of each test."""
+    horizon: int = 100
+    """Control steps of the open-loop tests."""
+    policy: Path | None = None
+    """Folder of the policy that is measured; learned in MuJoCo by default."""
+    explorer: Path | None = None
+    """Folder of the policy that makes data; another seed of the same by default."""
+    policy_frames: int = 2_000_000
+    """Actions that these two learn from; 0: only policies that are given are used."""
+    learn_frames: int = 0
+    """Actions that a policy learns from in each model, then run in MuJoCo; 0: none."""
+    episodes: int = 256
+    """Of each return."""
+    threads: int | None = None
+    """Of torch; its own choice by default."""
+    out: Path = Path("runs/sampling_study")
+    json: Path | None = None
+    """Write the figures to this file."""
+
+
+def learned_policy(
+    folder: Path, task: str, dynamics: str, seed: int, frames: int
+) -> Path:
+    """The policy in ``folder``, learned first where there is none."""
+    if not (folder / WEIGHTS).exists():
+        settings = {"task": task, "dynamics": dynamics, "seed": seed, "out": folder}
+        settings |= {"total-frames": frames, "episodes": 64, "evaluate-every": 10**6}
+        flags = [str(x) for k, v in settings.items() for x in (f"--{k}", v)]
+        subprocess.run([sys.executable, str(PPO), *flags], check=True)
+    return folder
+
+
+@dataclass(frozen=True)
+class Study:
+    """Tests and policies that all strategies share."""
+
+    options: Options
+    folder: Path
+    task_id: str
+    policy: Path | None
+
+    def model(self, name: str, draw: Draw, seed: int) -> Path:
+        """Checkpoint of a strategy's model, made as far as it is not there."""
+        options, scene = self.options, make_task(self.task_id).scene
+        folder = self.folder / name / str(seed)
+        config = DataConfig(trajectories=options.transitions // 100, seed=seed)
+        generate(scene, config, folder / "data", strategy=(name, draw))
+        train = TrainConfig(
+            network=options.network,
+            steps=options.updates,
+            rollout_steps=0,
+            single_share=1.0,
+            softening=RECIPES[options.scene].train.softening,
+            validate_every=options.updates,
+            seed=seed,
+        )
+        data, task = load_data(scene, folder / "data"), make_task(self.task_id)
+        horizons = (options.horizon,)
+        Trainer(scene, data, task, train, folder / "run", horizons=horizons).run()
+        return folder / "run" / "last"
+
+    def returns(self, policy: Path, dynamics: str | Path) -> torch.Tensor:
+        """Of one episode from each of the same starts."""
+        episodes = self.options.episodes
+        env = make_env(self.task_id, dynamics, episodes, seed=TEST_SEED)
+        return policy_returns(env, make_actor(load_policy(policy, env.task)))
+
+    def measure(self, model: Path, name: str, seed: int) -> dict[str, Any]:
+        """Errors by test, and returns."""
+        options, task = self.options, make_task(self.task_id)
+        figures: dict[str, Any] = {"strategy": name, "seed": seed}
+        card = read_json(model.parents[1] / "data" / CARD)
+        figures |= {"trajectories": card["trajectories"], "dropped": card["dropped"]}
+        for test, is_random in (("passive", False), ("random", True)):
+            learned = NeRDDynamics(load_checkpoint(model, task.scene))
+            truth = MujocoDynamics(task.scene)
+            sizes = ([options.horizon], options.rows, TEST_SEED)
+            errors = passive_errors(
+                task, learned, truth, *sizes, random_actions=is_random
+            )[options.horizon]
+            figures[test] = {k: asdict(v) for k, v in errors.items()}
+        if self.policy is not None:
+            truth = self.returns(self.policy, "mujoco")
+            transfer = summarize(self.returns(self.policy, model), truth)
+            figures["transfer"] = asdict(transfer)
+        if options.learn_frames:
+            where = (self.task_id, str(model), seed, options.learn_frames)
+            learned_there = learned_policy(model.parent / "policy", *where)
+            there, truth = (self.returns(learned_there, d) for d in (model, "mujoco"))
+            figures["learned_there"] = asdict(summarize(there, truth)) | {
+                "true_mean": float(truth.mean())
+            }
+        return figures
+
+
+def run(options: Options) -> Iterator[dict[str, Any]]:
+    """Figures of every strategy and seed; those already measured are read."""
+    if options.scene not in RECIPES:
+        known = ", ".join(RECIPES)
+        raise ValueError(f"expected a scene of {known}, got '{options.scene}'")
+    task_id = str(options.task or RECIPES[options.scene].task)
+    task, folder = make_task(task_id), options.out / options.scene
+    policy, explorer = options.policy, options.explorer
+    if task_id in PPO_CONFIGS and options.policy_frames:
+        where = (task_id, "mujoco")
+        sizes = options.policy_frames
+        policy = policy or learned_policy(folder / "measured", *where, 0, sizes)
+        explorer = explorer or learned_policy(folder / "explorer", *where, 1, sizes)
+    actor = make_actor(load_policy(explorer, task)) if explorer else None
+    known = strategies(task.scene, task, actor)
+    for name in options.only or known:
+        if name not in known:
+            raise ValueError(f"expected a strategy of {', '.join(known)}, got '{name}'")
+    study = Study(options, folder, task_id, policy)
+    for name in options.only or known:
+        for seed in options.seeds:
+            path = folder / name / str(seed) / "figures.json"
+            settings = _settings(replace(options, policy=policy, explorer=explorer))
+            if not path.exists() or read_json(path)["settings"] != settings:
+                model = study.model(name, known[name], seed)
+                figures = study.measure(model, name, seed)
+                write_json(path, figures | {"settings": settings})
+            yield {k: v for k, v in read_json(path).items() if k != "settings"}
+
+
+def _settings(options: Options) -> dict[str, Any]:
+    """What figures depend on, as JSON knows it."""
+    aside = ("only", "seeds", "threads", "out", "json")
+    found = {k: v for k, v in asdict(options).items() if k not in aside}
+    return {k: str(v) if isinstance(v, Path) else v for k, v in found.items()}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: one line for each model, ``mean / final / p95`` of each quantity."""
+    tests = [(t, q) for t in ("passive", "random") for q in rows[0][t]]
+    heads = [f"{t}, {q}, {rows[0][t][q]['unit']}" for t, q in tests]
+    heads = ["strategy", "seed", *heads, "transfer gap", "learned there, true return"]
+    lines = [" | ".join(heads), " | ".join(["---"] * len(heads))]
+    for row in rows:
+        cells = [row["strategy"], str(row["seed"])]
+        for test, quantity in tests:
+            errors = (row[test][quantity][key] for key in ("mean", "final", "p95"))
+            cells.append(" / ".join(_number(error) for error in errors))
+        gap, own = row.get("transfer"), row.get("learned_there")
+        cells.append(f"{gap['gap']:+.3%} ± {gap['gap_interval']:.3%}" if gap else "-")
+        cells.append(f"{own['true_mean']:.0f}" if own else "not measured")
+        lines.append(" | ".join(cells))
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+def _number(error: float | None) -> str:
+    return "not finite" if error is None else f"{error:.4f}"
+
+
+def main(options: Options) -> None:
+    """Print a table and write the figures."""
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    rows = []
+    for figures in run(options):
+        rows.append(figures)
+        if options.json is not None:
+            machine = {"processor": platform.machine(), **_settings(options)}
+            write_json(options.json, {"options": machine, "models": rows})
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options))
+    except ValueError as error:
+        sys.exit(f"sampling_study: {error}")

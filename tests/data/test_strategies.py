@@ -1,0 +1,268 @@
+"""Ways to draw training data: what each promises, on every robot, and true physics."""
+
+import json
+import math
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Generator
+
+from torchrl_nerd.checkpoint import make_card
+from torchrl_nerd.data.generate import (
+    CARD,
+    SEGMENT,
+    DataConfig,
+    generate,
+    is_sound,
+    load_data,
+    simulate,
+)
+from torchrl_nerd.data.policy_data import policy_data
+from torchrl_nerd.data.starts import Fallen, Standing
+from torchrl_nerd.data.strategies import mix, resample, strategies
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.envs import GroundTruthEnv
+from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
+from torchrl_nerd.tasks import Task, make_task
+from torchrl_nerd.training.recipes import RECIPES
+
+STATE = ("qpos", "qvel")
+
+
+class Linear:
+    """A policy: squashed sums of what it sees."""
+
+    def __init__(self, task: Task, seed: int) -> None:
+        generator = Generator().manual_seed(seed)
+        size = (task.observation_size, task.controller.num_actions)
+        self.weight = 0.3 * torch.randn(size, generator=generator)
+
+    def __call__(self, td: TensorDict) -> TensorDict:
+        return td.set("action", torch.tanh(td["observation"] @ self.weight))
+
+
+def task_of(scene) -> Task:
+    return make_task(RECIPES[scene.name].task)
+
+
+def seeded(seed: int) -> Generator:
+    return Generator().manual_seed(seed)
+
+
+def assert_equal(data: TensorDict, expected: TensorDict) -> None:
+    assert data.batch_size == expected.batch_size
+    assert set(data.keys(True, True)) == set(expected.keys(True, True))
+    for key in expected.keys(True, True):
+        assert torch.equal(data[key], expected[key]), key
+
+
+def test_the_default_draws_are_those_of_shipped_models(scene, seed):
+    """Independent uniform torques, segment by segment, after the starts."""
+    if scene.sampling.drive is not None:
+        return
+    rows, steps = 5, 2 * SEGMENT + 3
+    data, generator = simulate(scene, rows, steps, seeded(seed)), seeded(seed)
+    start, scale = scene.sample_initial(rows, generator)
+    counts = (SEGMENT, SEGMENT, 3)
+    parts = [sample_torque(scene.sampling, scale, n, generator) for n in counts]
+    assert torch.equal(data["next", "joint_torque"], torch.cat(parts, 1))
+    for key, value in start.items():
+        assert torch.equal(data[key][:, 0], value)
+
+
+def test_every_strategy_gives_sound_data_of_the_same_layout(scene, seed):
+    task, expected = task_of(scene), simulate(scene, 7, 5, seeded(seed))
+    found = strategies(scene, task, Linear(task, seed))
+    assert set(found) >= {"uniform", "shares", "scales", "starts", "policy", "mixed"}
+    assert ("correlated" in found) == (scene.sampling.drive is None)
+    assert set(strategies(scene, task)) == set(found) - {"policy"}
+    for name, draw in found.items():
+        data = draw(7, 5, seeded(seed))
+        assert is_sound(data).all(), name
+        assert {k: (data[k].shape, data[k].dtype) for k in data.keys(True, True)} == {
+            k: (expected[k].shape, expected[k].dtype) for k in expected.keys(True, True)
+        }
+        for key in STATE:
+            assert torch.equal(data["next", key][:, :-1], data[key][:, 1:])
+        assert_equal(draw(7, 5, seeded(seed)), data)
+        other = draw(7, 5, seeded(seed + 1))
+        assert not torch.equal(other["qpos"], data["qpos"]), name
+        one = draw(1, 1, seeded(seed))
+        assert one.batch_size == (1, 1)
+
+
+def test_torques_keep_as_long_as_asked_and_stay_uniform(scene, generator):
+    """The process before its distribution function has correlation exp(-t / tau)."""
+    if scene.sampling.drive is not None or not scene.actuated:
+        return
+    dt, rows, steps = scene.control_step, 1500, 60
+    tau = dt * float(torch.empty(()).uniform_(2.0, 12.0, generator=generator))
+    sampling = replace(scene.sampling, correlation=(tau, tau))
+    one = torch.ones(rows, 1, dtype=torch.float64)
+    torque = sample_torques(sampling, one, steps, dt, generator)
+    share = (torque / torch.tensor(sampling.torque))[..., 0]
+    assert share.abs().max() <= 1.0
+    for time in (0, steps - 1):  # stationary: uniform at the start as at the end
+        ordered = share[:, time].sort().values
+        uniform = torch.linspace(-1.0, 1.0, rows, dtype=torch.float64)
+        assert (ordered - uniform).abs().max() < 0.15
+    for lag in (1, 3, 8, 20):
+        rho = 6.0 / math.pi * math.asin(0.5 * math.exp(-lag * dt / tau))
+        found = 3.0 * (share[:, lag:] * share[:, :-lag]).mean()
+        assert abs(found - rho) < 0.08
+
+
+def test_each_row_has_a_correlation_time_of_its_own(generator):
+    scene = load_scene("cartpole")
+    sampling = replace(scene.sampling, correlation=(1e-3, 1e3))
+    one = torch.ones(2000, 1, dtype=torch.float64)
+    torque = sample_torques(sampling, one, 40, scene.control_step, generator)[..., 0]
+    turns = (torque.diff(dim=1).abs() / sampling.torque[0]).mean(1)
+    assert 0.2 < (turns < 0.05).double().mean() < 0.6  # kept
+    assert 0.1 < (turns > 0.5).double().mean() < 0.4  # drawn anew at every step
+
+
+def test_scales_are_as_likely_in_each_octave(generator):
+    shares = {"passive_share": 0.2, "quiet_share": 0.0, "least_scale": 1e-3}
+    sampling = replace(load_scene("cartpole").sampling, **shares)
+    scale, speed = (x[:, 0] for x in sample_scale(sampling, 5000, generator))
+    assert abs((scale == 0.0).double().mean() - 0.2) < 0.03
+    assert (speed[scale > 0.0] == 1.0).all()
+    octaves = scale[scale > 0.0].log().sort().values / math.log(1e-3)
+    expected = torch.linspace(1.0, 0.0, len(octaves), dtype=torch.float64)
+    assert (octaves - expected).abs().max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"least_scale": 0.0}, "least_scale above 0 and up to 1, got 0.0"),
+        ({"least_scale": 2.0}, "least_scale above 0 and up to 1, got 2.0"),
+        ({"correlation": (0.0, 1.0)}, r"above 0 s, the lower first, got \(0.0, 1.0\)"),
+        ({"correlation": (2.0, 1.0)}, "the lower first"),
+        ({"correlation": (1.0, 2.0), "drive": torch.add}, "a drive, got both"),
+    ],
+)
+def test_impossible_sampling_is_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        resample(load_scene("cartpole"), **change)
+
+
+def test_standing_starts_are_the_tasks_over_the_scenes_ground(scene, seed):
+    task = task_of(scene)
+    standing = resample(scene, starts=Standing(task))
+    start, _ = standing.sample_initial(40, seeded(seed))
+    size = (40, task.num_uniforms)
+    u = torch.rand(size, dtype=torch.float64, generator=seeded(seed))
+    for key in STATE:
+        assert torch.equal(start[key], task.initial_state(u)[key])
+    if "terrain" in start:  # never the task's, on which models are tested
+        assert len(start["terrain"].unique(dim=0)) == 40
+
+
+def test_fallen_starts_end_passive_trajectories(scene, seed):
+    seconds, rows = 0.25, 6
+    end = Fallen(scene, seconds)(rows, seeded(seed))
+    state, _ = scene.sample_initial(rows, seeded(seed))
+    terrain = state.pop("terrain", None)
+    steps = round(seconds / scene.control_step)
+    idle = torch.zeros(rows, steps, len(scene.actuated), dtype=torch.float64)
+    dynamics = MujocoDynamics(scene)
+    path = dynamics.rollout(TensorDict(state, [rows]), idle, terrain)
+    for key in STATE:
+        torch.testing.assert_close(end[key], path[key][:, -1], rtol=1e-6, atol=1e-6)
+    if terrain is not None:
+        assert torch.equal(end["terrain"], terrain)
+
+
+def test_the_ant_has_fallen_and_lies_still(generator):
+    scene = load_scene("ant")
+    start, _ = scene.sample_initial(24, generator)
+    end = Fallen(scene)(24, generator)
+    assert (end["qpos"][:, 2] < start["qpos"][:, 2].min()).all()
+    fast, slow = (x["qvel"].square().mean().sqrt() for x in (start, end))
+    assert slow < 0.2 * fast
+
+
+def test_policy_data_is_what_the_env_does(task_id, seed):
+    task, rows, steps = make_task(task_id), 4, 6
+    actor = Linear(task, seed)
+    data = policy_data(task, actor, rows, steps, seeded(seed), noise=0.0)
+    size = (rows, task.num_uniforms)
+    u = torch.rand(size, dtype=torch.float64, generator=seeded(seed))
+    env = GroundTruthEnv(task, num_envs=rows)
+    td = env.reset(TensorDict(task.initial_state(u), [rows]), set_state=True)
+    every = task.steps_per_action
+    for step in range(every - 1, steps, every):
+        td = env.step(actor(td))["next"]
+        for key in (*STATE, "joint_torque"):
+            assert torch.equal(data["next", key][:, step], td[key])
+
+
+def test_exploring_policies_stray_by_their_noise(seed):
+    task = make_task("cartpole/swingup")
+    actor, gain = Linear(task, seed), task.scene.sampling.torque[0]
+    data = policy_data(task, actor, 300, 40, seeded(seed), noise=0.2)
+    seen = task.observation(data).float()
+    mean = actor(TensorDict({"observation": seen}, data.batch_size))["action"]
+    stray = (data["next", "joint_torque"] / gain - mean)[..., 0]
+    inside = mean[..., 0].abs() < 0.3  # where nothing is clipped
+    spread = (stray[inside]).square().mean().sqrt()
+    assert abs(spread - 0.2 / 3.0**0.5) < 0.02  # U(0, 0.2) has this root mean square
+    again = MujocoDynamics(task.scene).rollout(
+        data[:, 0].select(*STATE), data["next", "joint_torque"]
+    )
+    for key in STATE:
+        torch.testing.assert_close(again[key], data["next", key], rtol=0, atol=1e-9)
+
+
+def test_a_mixture_has_equal_shares_in_order(generator):
+    scene = load_scene("cartpole")
+    seen = []
+
+    def part(rows: int, steps: int, generator: Generator) -> TensorDict:
+        seen.append(rows)
+        return simulate(scene, rows, steps, generator)
+
+    for rows, counts in ((10, [3, 3, 4]), (2, [1, 1]), (1, [1])):
+        seen.clear()
+        assert mix(part, part, part)(rows, 2, generator).batch_size == (rows, 2)
+        assert seen == counts
+
+
+def test_a_folder_holds_one_strategy(tmp_path, seed):
+    scene, config = load_scene("cartpole"), DataConfig(9, 4, seed)
+    calm = partial(simulate, resample(scene, passive_share=1.0))
+    generate(scene, config, tmp_path, quiet=True, strategy=("calm", calm))
+    data = load_data(scene, tmp_path)
+    assert_equal(TensorDict(dict(data.items()), [9, 4]), calm(9, 4, seeded(seed << 24)))
+    for other in (None, ("wild", partial(simulate, scene))):
+        with pytest.raises(ValueError, match=f"{tmp_path} already holds.*strategy"):
+            generate(scene, config, tmp_path, quiet=True, strategy=other)
+    generate(scene, config, tmp_path, quiet=True, strategy=("calm", calm))
+
+
+def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
+    config, ranges = DataConfig(3, 2, seed), scene.sampling.ranges()
+    generate(scene, config, tmp_path, quiet=True)
+    card, expected = read_json(tmp_path / CARD), json.loads(json.dumps(ranges))
+    model = make_card(NeRD(scene, NETWORKS["mlp"]))
+    assert (
+        card["ranges"] == json.loads(json.dumps(model["training_ranges"])) == expected
+    )
+    assert {"torque", "passive_share"} <= set(ranges)
+    assert not {"ground", "drive", "starts"} & set(ranges)
+    card["ranges"] |= {
+        "ground": None,
+        "drive": None,
+        "clearance": ranges.get("clearance"),
+    }
+    del card["strategy"]
+    write_json(tmp_path / CARD, card)
+    generate(scene, config, tmp_path, quiet=True)  # as it was written by older versions

@@ -1,0 +1,61 @@
+"""Training data along the way of a policy that explores."""
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_nerd.data.generate import as_transitions
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.policy_transfer import Actor
+from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
+from torchrl_nerd.tasks import Task
+
+
+@torch.no_grad()
+def policy_data(
+    task: Task,
+    actor: Actor,
+    rows: int,
+    steps: int,
+    generator: Generator,
+    noise: float = 0.5,
+) -> TensorDict:
+    """Trajectories ``[rows, steps]`` of a policy in true dynamics, broken ones included.
+
+    They start as episodes do and go on where an episode would end: a fallen robot is as
+    good a sample as a walking one. Actions are the policy's mean plus normal noise, whose
+    standard deviation is U(0, ``noise``) for each row, clipped to [-1, 1]: some rows show
+    what the policy does, others what lies beside it.
+
+    Args:
+        task: its starts, observations and controller.
+        actor: any TorchRL policy.
+        rows: trajectories.
+        steps: control steps of each.
+        generator: of starts and noise.
+        noise: largest standard deviation of the noise, in units of the action.
+    """
+    scene, controller = task.scene, task.controller
+    size = (rows, task.num_uniforms)
+    u = torch.rand(size, dtype=torch.float64, generator=generator)
+    spread = noise * torch.rand(rows, 1, dtype=torch.float64, generator=generator)
+    row = TensorDict(task.initial_state(u), [rows])
+    terrain = row.get(TERRAIN, None)
+    dynamics = MujocoDynamics(scene)
+    dynamics.reset(row)
+    state: TensorDictBase = row.select(QPOS, QVEL)
+    action = torch.zeros(rows, controller.num_actions, dtype=torch.float64)
+    states, torques = [state[:, None]], []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for step in range(steps):
+            if step % task.steps_per_action == 0:
+                seen = task.observation(row.update(state)).float()
+                mean = actor(TensorDict({OBSERVATION: seen}, [rows]))[ACTION].double()
+                kick = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
+                action = (mean + spread * kick).clamp(-1.0, 1.0)
+            torque = controller(action, state[QPOS], state[QVEL])
+            state = dynamics.step(state, torque, terrain)
+            states.append(state[:, None])
+            torques.append(torque[:, None])
+    return as_transitions(states, torques, terrain)

@@ -1,0 +1,60 @@
+"""Starts for training beside those of the scene's ranges: standing and fallen robots."""
+
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tasks import Task
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Starts of a task's episodes: on their feet, where there are any.
+
+    Without the task's grounds, which may be those that a model is tested on: where the
+    ground varies, the scene's sampling draws it.
+    """
+
+    task: Task
+
+    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+        """See `Starts`."""
+        size = (rows, self.task.num_uniforms)
+        u = torch.rand(size, dtype=torch.float64, generator=generator)
+        state = self.task.initial_state(u)
+        return {QPOS: state[QPOS], QVEL: state[QVEL]}
+
+
+@dataclass(frozen=True)
+class Fallen:
+    """Where a robot left alone comes to rest: the ends of passive trajectories.
+
+    | field | meaning |
+    |---|---|
+    | ``scene`` | the robot; its sampling says where the trajectories start |
+    | ``seconds`` | how long they are |
+    """
+
+    scene: Scene
+    seconds: float = 3.0
+
+    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+        """See `Starts`; rows that the solver gives up on keep their first state."""
+        start, _ = self.scene.sample_initial(rows, generator)
+        terrain = start.pop(TERRAIN, None)
+        first = TensorDict(start, [rows])
+        dynamics = MujocoDynamics(self.scene)
+        idle = torch.zeros(rows, len(self.scene.actuated), dtype=torch.float64)
+        dynamics.reset(first)
+        state = first
+        for _ in range(round(self.seconds / self.scene.control_step)):
+            state = cast(TensorDict, dynamics.step(state, idle, terrain))
+        is_fine = torch.cat((state[QPOS], state[QVEL]), -1).isfinite().all(-1)[:, None]
+        end = {k: torch.where(is_fine, state[k], first[k]) for k in (QPOS, QVEL)}
+        return end if terrain is None else end | {TERRAIN: terrain}
