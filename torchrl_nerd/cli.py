@@ -1,4 +1,4 @@
-"""The ``nerd`` command: data, train, eval, transfer, explain."""
+"""The ``nerd`` command: data, train, eval, transfer, explain, bench."""
 
 import io
 import sys
@@ -15,6 +15,9 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.bench.plot import plot_race
+from torchrl_nerd.evaluation.bench.report import bench
+from torchrl_nerd.evaluation.bench.table import bench_table
 from torchrl_nerd.evaluation.explain.report import explain
 from torchrl_nerd.evaluation.explain.table import report_table
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
@@ -101,6 +104,7 @@ class Train:
             generate(scene, recipe.data, folder, self.quiet)
         if self.threads:
             torch.set_num_threads(self.threads)
+        protocol = protocol_of(scene)
         trainer = Trainer(
             scene,
             load_data(scene, folder),
@@ -108,9 +112,9 @@ class Train:
             self.config,
             out,
             self.device,
-            horizons=protocol_of(scene).horizons[:2],
+            horizons=protocol.horizons[:2],
+            random_actions=bool(protocol.random_actions),
             quiet=self.quiet,
-            random_actions=recipe.random_actions,
         )
         trainer.run()
         card = read_json(out / "best" / "card.json")
@@ -251,12 +255,64 @@ class Explain:
         return asdict(report) | {"unused": report.unused, "derived": report.derived}
 
 
+@dataclass(frozen=True)
+class Bench:
+    """Speed against error: the shipped models and MuJoCo, coarse and fine, in one race.
+
+    Example: nerd bench cartpole --json results/bench.json --plot results/bench.png
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    batches: tuple[int, ...] = (1, 64, 512, 4096)
+    """Rows stepped together."""
+    rows: int = 256
+    """Trajectories per case, for the errors."""
+    rounds: int = 5
+    """Turns of each contender."""
+    seed: int = 500
+    """Of the starts."""
+    steps: int | None = None
+    """Horizon of the errors; the paper's by default."""
+    compile: bool = True
+    """Have compiled rows."""
+    threads: int | None = None
+    """Processor threads; torch's own choice by default."""
+    budget: tuple[float, ...] = ()
+    """Largest mean errors, in the table's order: names the fastest row within them."""
+    plot: Path | None = None
+    """Draw the race to this PNG."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print the tables and return their figures."""
+        report = bench(
+            load_scene(self.scene),
+            self.batches,
+            self.rows,
+            self.rounds,
+            self.seed,
+            self.steps,
+            self.compile,
+            self.threads,
+        )
+        print(bench_table(report))
+        for batch in self.batches if self.budget else ():
+            choice = report.choice(batch, self.budget) or "none"
+            print(f"fastest within {self.budget}, {batch} rows: {choice}")
+        if self.plot is not None:
+            plot_race(report, self.plot)
+        return report.figures()
+
+
 COMMANDS = {
     "data": Data,
     "train": Train,
     "eval": Eval,
     "transfer": Transfer,
     "explain": Explain,
+    "bench": Bench,
 }
 
 

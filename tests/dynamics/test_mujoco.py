@@ -108,3 +108,12 @@ def test_a_row_that_breaks_on_the_way_is_sound_until_then(scene, generator):
         assert torch.equal(broken[key][others], clean[key][others])
         assert torch.equal(broken[key][3, :4], clean[key][3, :4])
         assert broken[key][3, 4:].isnan().all()
+
+
+def test_no_rows_at_all_stay_none(scene, generator):
+    start, torques, terrain = random_drive(scene, 2, 3, generator)
+    start, torque = start[:0], torques.transpose(0, 1)[:0]
+    terrain = None if terrain is None else terrain[:0]
+    path = MujocoDynamics(scene).rollout(start, torque, terrain)
+    assert path.batch_size == (0, 3) and path["qpos"].shape == (0, 3, scene.layout.nq)
+    assert len(MujocoDynamics(scene).step(start, torque[:, 0], terrain)) == 0

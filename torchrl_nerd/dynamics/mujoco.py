@@ -138,6 +138,8 @@ class MujocoDynamics:
         """The state after every substep, ``(rows, T * substeps, state)``."""
         rows = len(qpos)
         size = mujoco.mj_stateSize(self._model, STATE.mjSTATE_FULLPHYSICS)
+        if not rows:  # MuJoCo itself would crash
+            return np.zeros((0, control.shape[1] * self.scene.substeps, size))
         start = np.zeros((rows, size))
         start[:, 1 : 1 + qpos.shape[1]] = qpos
         start[:, 1 + qpos.shape[1] : 1 + qpos.shape[1] + qvel.shape[1]] = qvel

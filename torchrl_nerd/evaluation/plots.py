@@ -38,7 +38,7 @@ def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> Non
             it was measured in.
         path: of the PNG; the table's name ends in ``.csv`` instead.
     """
-    figure, (axes,) = _figure(1, height=4.0)
+    figure, (axes,) = make_figure(1, height=4.0)
     millions = [point["frames"] / 1e6 for point in curve]
     names = list(curve[0])
     for number, name in enumerate(names[1:]):
@@ -46,7 +46,7 @@ def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> Non
         axes.plot(millions, returns, STYLES[number], color=COLORS[number], label=name)
     axes.set(xlabel="environment steps (millions)", ylabel="mean return")
     axes.legend(frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
     rows = [names, *([str(point[name]) for name in names] for point in curve)]
     text = "".join(",".join(row) + "\n" for row in rows)
     write_atomically(
@@ -66,7 +66,7 @@ def plot_states(
         path: of the PNG.
     """
     labels = [*_qpos_names(scene), "reward"]
-    figure, panels = _figure(len(labels), height=PANEL[1] * len(labels))
+    figure, panels = make_figure(len(labels), height=PANEL[1] * len(labels))
     for number, (name, steps) in enumerate(episodes.items()):
         values = torch.cat((steps["qpos"], steps["reward"]), -1)
         seconds = scene.control_step * torch.arange(1, len(values) + 1)
@@ -76,7 +76,7 @@ def plot_states(
         axes.set_ylabel(label)
     panels[-1].set_xlabel("time (s)")
     panels[0].legend(frameon=False, ncols=len(episodes))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _qpos_names(scene: Scene) -> list[str]:
@@ -88,8 +88,10 @@ def _qpos_names(scene: Scene) -> list[str]:
     return names
 
 
-def _figure(panels: int, height: float) -> "tuple[Figure, list[Axes]]":
-    """Stacked panels that share the horizontal axis; no display is needed."""
+def make_figure(
+    panels: int, height: float, share_x: bool = True
+) -> "tuple[Figure, list[Axes]]":
+    """Stacked panels ``height`` inches high together; no display is needed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -99,12 +101,13 @@ def _figure(panels: int, height: float) -> "tuple[Figure, list[Axes]]":
         ) from None
     figure = Figure(figsize=(PANEL[0], height), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
+    axes = figure.subplots(panels, 1, sharex=share_x, squeeze=False)[:, 0]
     for panel in axes:
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.3)
     return figure, list(axes)
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a PNG, whole or not at all."""
     write_atomically(path, lambda aside: figure.savefig(aside, format="png", dpi=150))

@@ -6,6 +6,7 @@ free joints carry a quaternion. Same definitions as ``mj_integratePos`` and
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import torch
@@ -53,6 +54,21 @@ class JointLayout:
                 linear.append((q, v))
         return cls(model.nq, model.nv, tuple(linear), tuple(rotations))
 
+    @cached_property
+    def runs(self) -> tuple[tuple[slice, slice], ...]:
+        """``linear`` as slices of qpos and qvel, each as long as it gets."""
+        found: list[list[int]] = []
+        for q, v in self.linear:
+            if (
+                found
+                and found[-1][0] + found[-1][2] == q
+                and found[-1][1] + found[-1][2] == v
+            ):
+                found[-1][2] += 1
+            else:
+                found.append([q, v, 1])
+        return tuple((slice(q, q + n), slice(v, v + n)) for q, v, n in found)
+
     @property
     def is_vector_space(self) -> bool:
         """True where positions are plain numbers in the order of the velocities."""
@@ -68,7 +84,7 @@ def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
     if layout.is_vector_space:
         return qpos + tangent
     moved = torch.empty_like(qpos)
-    for q, v in layout.linear:
+    for q, v in layout.runs:
         moved[..., q] = qpos[..., q] + tangent[..., v]
     for q, v in layout.rotations:
         turn = quat_exp(tangent[..., v : v + 3])
@@ -83,7 +99,7 @@ def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor
     if layout.is_vector_space:
         return end - start
     tangent = start.new_empty((*start.shape[:-1], layout.nv))
-    for q, v in layout.linear:
+    for q, v in layout.runs:
         tangent[..., v] = end[..., q] - start[..., q]
     for q, v in layout.rotations:
         turn = quat_multiply(quat_conjugate(start[..., q : q + 4]), end[..., q : q + 4])

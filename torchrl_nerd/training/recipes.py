@@ -1,6 +1,6 @@
 """How a model of each scene is made: ``nerd train SCENE`` with its defaults."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torchrl_nerd.data.generate import DataConfig
 from torchrl_nerd.evaluation.rollout_error import Source
@@ -17,13 +17,11 @@ class Recipe:
     |---|---|
     | ``data``, ``train`` | how much, and how |
     | ``task`` | its resets start the validation; None: the scene's sampling ranges do |
-    | ``random_actions`` | validated under random actions in place of zero ones |
     """
 
     data: DataConfig
     train: TrainConfig
     task: str | None
-    random_actions: bool = False
 
     def source(self, scene: Scene) -> Source:
         """Whose starts validate."""
@@ -69,9 +67,7 @@ RECIPES: dict[str, Recipe] = {
 }
 
 # Of robots that nobody has tuned one for, such as imported ones.
-ANY_ROBOT = replace(
-    _mlp(None, 10_000, "mlp-large", 10_000, 500, softening=0.02), random_actions=True
-)
+ANY_ROBOT = _mlp(None, 10_000, "mlp-large", 10_000, 500, softening=0.02)
 
 
 def recipe_of(name: str) -> Recipe:

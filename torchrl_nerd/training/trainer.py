@@ -106,8 +106,8 @@ class Trainer:
         folder: where.
         device: of model and data; bf16 autocast on CUDA, float32 on the CPU.
         horizons: control steps of the validation rollouts.
+        random_actions: validate under random actions in place of none.
         quiet: no progress bar.
-        random_actions: validate under random actions in place of zero ones.
 
     Raises:
         ValueError: the folder cannot be written or holds a run of another configuration.
@@ -122,13 +122,13 @@ class Trainer:
         folder: Path,
         device: torch.device | str = "cpu",
         horizons: tuple[int, ...] = (100, 500),
-        quiet: bool = False,
         random_actions: bool = False,
+        quiet: bool = False,
     ) -> None:
         self.scene, self.source, self.config = scene, source, config
-        self.random_actions = random_actions
         self.folder, self.device = writable_folder(folder), torch.device(device)
-        self.horizons, self.quiet = horizons, quiet
+        self.horizons, self.random_actions = horizons, random_actions
+        self.quiet = quiet
         longest = max(
             config.length, config.rollout_length if config.rollout_steps else 1
         )

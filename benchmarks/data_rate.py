@@ -1,0 +1,99 @@
+"""How fast training data are made, against bare `mujoco.rollout` on the same threads.
+
+    python benchmarks/data_rate.py cartpole
+
+The same starts, grounds and torques; both in turns, so that a busy machine slows both.
+"""
+
+import os
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import tyro
+from torch import Generator
+from tyro.conf import Positional
+
+from torchrl_nerd.data.generate import DataConfig, generate
+from torchrl_nerd.dynamics.mujoco import CONTROL, torque_model
+from torchrl_nerd.files import write_json
+from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes.sampling import sample_torque
+
+
+@dataclass
+class Options:
+    """What to generate, and how often."""
+
+    scene: Positional[str] = "cartpole"
+    rows: int = 2048
+    steps: int = 50
+    rounds: int = 7
+    """The first is not counted."""
+    seed: int = 0
+    json: Path | None = None
+    """Write the figures to this file."""
+
+
+def seconds_of_rollout(
+    scene: Scene, rows: int, steps: int, seed: int, threads: int
+) -> float:
+    """One bare call of MuJoCo."""
+    generator = Generator().manual_seed(seed)
+    start, scale = scene.sample_initial(rows, generator)
+    model = torque_model(scene)
+    data = [mujoco.MjData(model) for _ in range(threads)]
+    state = np.concatenate(
+        (np.zeros((rows, 1)), start["qpos"].numpy(), start["qvel"].numpy()), -1
+    )
+    torque = sample_torque(scene.sampling, scale, steps, generator)
+    control = np.zeros((rows, steps, mujoco.mj_stateSize(model, CONTROL)))
+    control[:, :, scene.actuated] = torque.numpy()
+    if scene.terrain is not None and "terrain" in start:
+        pose = scene.terrain.mocap_pose(start["terrain"]).numpy()
+        control[:, :, model.nv :] = pose[:, None]
+    control = np.repeat(control, scene.substeps, 1)
+    with mujoco.rollout.Rollout(nthread=threads) as pool:
+        began = time.perf_counter()
+        pool.rollout(model, data, state, control, control_spec=CONTROL)
+        return time.perf_counter() - began
+
+
+def seconds_of_generate(scene: Scene, rows: int, steps: int, seed: int) -> float:
+    """What `nerd data` does, on disk."""
+    config = DataConfig(trajectories=rows, steps=steps, seed=seed)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        generate(scene, config, Path(folder), quiet=True)
+        return time.perf_counter() - began
+
+
+def main(options: Options) -> float:
+    """Print both rates and return their ratio, the median over rounds."""
+    scene, threads = load_scene(options.scene), os.cpu_count() or 1
+    bare, whole = [], []
+    for index in range(options.rounds):
+        draw = options.rows, options.steps, options.seed + index
+        bare.append(seconds_of_rollout(scene, *draw, threads))
+        whole.append(seconds_of_generate(scene, *draw))
+    count = options.rows * options.steps
+    rates = [count / median(seconds[1:]) for seconds in (bare, whole)]
+    ratio = rates[1] / rates[0]
+    print(
+        f"{scene.name}, {threads} threads, transitions/s: mujoco.rollout {rates[0]:.0f}, "
+        f"nerd data {rates[1]:.0f}, {ratio:.0%}"
+    )
+    if options.json is not None:
+        names = ("rollout_per_s", "data_per_s", "ratio")
+        figures = dict(zip(names, (*rates, ratio), strict=True))
+        write_json(options.json, {"scene": scene.name, "threads": threads, **figures})
+    return ratio
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

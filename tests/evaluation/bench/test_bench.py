@@ -1,0 +1,132 @@
+"""The race: a truth that is one, honest rows, a front that nobody beats."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.bench.contenders import (
+    contenders,
+    mujoco_contenders,
+    truth,
+    with_substeps,
+)
+from torchrl_nerd.evaluation.bench.errors import (
+    PERTURBATIONS,
+    chaos_floor,
+    contender_errors,
+    courses,
+)
+from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
+from torchrl_nerd.evaluation.bench.plot import plot_race
+from torchrl_nerd.evaluation.bench.rates import states_on_the_way
+from torchrl_nerd.evaluation.bench.report import bench
+from torchrl_nerd.evaluation.bench.table import bench_table
+from torchrl_nerd.evaluation.protocols import PROTOCOLS
+from torchrl_nerd.evaluation.rollout_error import open_loop
+from torchrl_nerd.scenes import load_scene
+
+
+@pytest.fixture(params=list(PROTOCOLS))
+def name(request) -> str:
+    """Each scene with a protocol."""
+    return request.param
+
+
+def test_a_whole_race(name, tmp_path):
+    scene = load_scene(name)
+    report = bench(
+        scene, (1, 3), rows=4, rounds=1, steps=3, is_compiling=False, threads=1
+    )
+    expected = {who.name for who in contenders(scene, 1, is_compiling=False)}
+    assert set(report.errors) == expected
+    shipped = [m for m in shipped_models() if m.split("-")[0] == name]
+    assert set(shipped) <= expected
+    for by_name in report.rates.values():
+        assert set(by_name) == expected
+        for rate in by_name.values():
+            assert min(rate.steps_per_s, rate.envs_per_s, rate.warm_up_s) > 0.0
+    for errors in report.errors.values():
+        assert all(math.isfinite(error.mean) for error in errors.values())
+    text = bench_table(report)
+    assert all(row in text for row in expected)
+    json.dumps(report.figures())
+    plot_race(report, tmp_path / "race.png")
+    assert (tmp_path / "race.png").read_bytes().startswith(b"\x89PNG")
+    for quantity in report.quantities:
+        assert report.front(3, quantity)
+
+
+def test_another_number_of_substeps_is_the_same_control_step(name, generator):
+    scene = load_scene(name)
+    for substeps in (1, 3, 16):
+        other = with_substeps(scene, substeps)
+        assert other.control_step == pytest.approx(scene.control_step, rel=1e-12)
+        assert other.substeps == substeps
+    same = with_substeps(scene, scene.substeps)
+    task = next(iter(PROTOCOLS[name]().cases.values()))
+    start = states_on_the_way(task, 5, 1)
+    paths = [open_loop(MujocoDynamics(s), start, 3) for s in (task.scene, same)]
+    torch.testing.assert_close(paths[0], paths[1], rtol=0, atol=1e-9)
+
+
+def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
+    """Without contact Euler's error is of first order."""
+    ground = courses(PROTOCOLS["cartpole"](), 16, seed, 1, steps=30)
+    rows = {who.name: who for who in mujoco_contenders(1)}
+    coarse, fine = (
+        contender_errors(rows[f"MuJoCo x{n}"], ground)["hinge"].mean for n in (2, 8)
+    )
+    assert 3.0 < coarse / fine < 6.0
+    task = ground[0].task
+    again = ground[0].errors(truth(task.scene, 1))
+    assert all(not error.any() for error in again.values())
+
+
+def test_the_chaos_floor_is_as_high_as_the_push(seed):
+    ground = courses(PROTOCOLS["cartpole"](), 64, seed, 1, steps=2)
+    floors = chaos_floor(ground, 1, seed).values()
+    for size, errors in zip(PERTURBATIONS, floors, strict=True):
+        for error in errors.values():  # mean of |N(0, 1)| is 0.8
+            assert 0.4 * size < error.mean < 2.0 * size
+
+
+def test_nobody_beats_the_front(generator):
+    draw = torch.rand(40, 2, generator=generator).tolist()
+    points = {str(i): (error, rate) for i, (error, rate) in enumerate(draw)}
+    points["blown up"] = (float("nan"), 9.0)
+    points["also"] = (float("inf"), 9.0)
+    front = pareto_front(points)
+    for name, (error, rate) in points.items():
+        beaten = any(
+            e <= error and r >= rate and (e, r) != (error, rate)
+            for e, r in points.values()
+        )
+        if math.isfinite(error):
+            assert (name in front) != beaten
+        else:
+            assert name not in front
+
+
+def test_the_choice_is_the_fastest_within_the_budget():
+    errors = {"a": (1.0, 1.0), "b": (2.0, 1.0), "c": (0.5, 3.0)}
+    rates = {"a": 1.0, "b": 2.0, "c": 3.0}
+    assert best_within(errors, rates, (2.0, 2.0)) == "b"
+    assert best_within(errors, rates, (1.0, 9.0)) == "c"
+    assert best_within(errors, rates, (0.1, 0.1)) is None
+    with pytest.raises(ValueError, match="expected a budget of 2 numbers, got 1"):
+        best_within(errors, rates, (1.0,))
+
+
+def test_bad_requests_are_refused_in_a_sentence():
+    scene = load_scene("cartpole")
+    with pytest.raises(ValueError, match="rounds"):
+        bench(scene, rounds=0)
+    with pytest.raises(ValueError, match="batch 0"):
+        bench(scene, (0,))
+    other = load_scene("dm_control/cheetah-run")
+    with pytest.raises(ValueError, match="no protocol for 'dm_control/cheetah-run'"):
+        bench(other)

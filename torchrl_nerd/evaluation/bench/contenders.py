@@ -1,0 +1,109 @@
+"""Who takes part: MuJoCo, coarse and fine, and learned models in several ways to run."""
+
+import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+
+import mujoco
+import torch
+
+from torchrl_nerd.checkpoint import from_pretrained, shipped_models
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics.base import Dynamics
+from torchrl_nerd.modules.baselines import MLPConfig
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.scenes import Scene
+
+SUBSTEPS = (1, 2, 4, 8, 16, 32)
+INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+FINEST = 64  # substeps of the truth, or four times the scene's own
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One way to step a scene.
+
+    | field | meaning |
+    |---|---|
+    | ``name`` | of its row |
+    | ``is_learned`` | True for a NeRD |
+    | ``make`` | its dynamics over a scene's ground |
+    """
+
+    name: str
+    is_learned: bool
+    make: Callable[[Scene], Dynamics]
+
+
+def contenders(
+    scene: Scene, threads: int, is_compiling: bool = True
+) -> list[Contender]:
+    """Everyone who takes part in a scene's race.
+
+    Args:
+        scene: the robot.
+        threads: of MuJoCo's pool.
+        is_compiling: let learned models also run compiled.
+    """
+    return [*mujoco_contenders(threads), *learned_contenders(scene, is_compiling)]
+
+
+def mujoco_contenders(threads: int) -> Iterator[Contender]:
+    """MuJoCo with few substeps to many, and with its other integrators."""
+
+    def row(name: str, substeps: int, integrator: int | None = None) -> Contender:
+        return Contender(
+            name,
+            False,
+            lambda scene: MujocoDynamics(
+                with_substeps(scene, substeps, integrator), num_threads=threads
+            ),
+        )
+
+    for substeps in SUBSTEPS:
+        yield row(f"MuJoCo x{substeps}", substeps)
+    for name, integrator in INTEGRATORS.items():
+        for substeps in (1, 4):
+            yield row(f"MuJoCo {name} x{substeps}", substeps, int(integrator))
+
+
+def learned_contenders(scene: Scene, is_compiling: bool) -> Iterator[Contender]:
+    """The scene's shipped models, streaming and otherwise."""
+    for name in shipped_models():
+        if name != scene.name and not name.startswith(f"{scene.name}-"):
+            continue
+        model = from_pretrained(name, scene)
+        yield _learned(name, model)
+        if is_compiling:
+            yield _learned(f"{name}, compiled", model, compile=True)
+        if not isinstance(model.config, MLPConfig):  # an MLP has no window to recompute
+            yield _learned(f"{name}, window", model, inference="window")
+        yield _learned(f"{name}, bf16", copy.deepcopy(model).to(torch.bfloat16))
+
+
+def _learned(name: str, model: NeRD, **how: object) -> Contender:
+    def make(scene: Scene) -> NeRDDynamics:
+        here = model if scene is model.scene else model.over(scene)
+        return NeRDDynamics(here, **how)  # pyright: ignore
+
+    return Contender(name, True, make)
+
+
+@cache
+def with_substeps(scene: Scene, substeps: int, integrator: int | None = None) -> Scene:
+    """The same scene, its control step cut into another number of substeps."""
+    model = copy.copy(scene.model)
+    model.opt.timestep = scene.control_step / substeps
+    if integrator is not None:
+        model.opt.integrator = integrator
+    return replace(scene, model=model, substeps=substeps)
+
+
+def truth(scene: Scene, threads: int) -> MujocoDynamics:
+    """MuJoCo at so many substeps that the rest of the error no longer counts."""
+    substeps = max(FINEST, 4 * scene.substeps)
+    return MujocoDynamics(with_substeps(scene, substeps), num_threads=threads)

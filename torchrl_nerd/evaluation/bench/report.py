@@ -1,0 +1,159 @@
+"""The race of a scene: rows of error and rate, their front, and whom to ship."""
+
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import mujoco
+import torch
+
+from torchrl_nerd.evaluation.bench.contenders import contenders
+from torchrl_nerd.evaluation.bench.errors import (
+    Errors,
+    chaos_floor,
+    contender_errors,
+    courses,
+)
+from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
+from torchrl_nerd.evaluation.bench.rates import Rate, rates
+from torchrl_nerd.evaluation.protocols import PROTOCOLS, Protocol
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.tasks import Task
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """What `bench` found.
+
+    | field | meaning |
+    |---|---|
+    | ``scene``, ``steps``, ``rows`` | whose rollouts, how long, how many a case |
+    | ``errors`` | row -> quantity -> summary, against the finest truth |
+    | ``floors`` | the same of the truth itself from starts a little off |
+    | ``rates`` | batch -> row -> speed |
+    | ``published`` | quantity -> the paper's mean error over cases, where there is one |
+    | ``machine`` | processor, threads, versions |
+    """
+
+    scene: str
+    steps: int
+    rows: int
+    errors: dict[str, Errors]
+    floors: dict[str, Errors]
+    rates: dict[int, dict[str, Rate]]
+    published: dict[str, float]
+    machine: dict[str, Any]
+
+    @property
+    def quantities(self) -> list[str]:
+        """Names of what errs."""
+        return list(next(iter(self.errors.values())))
+
+    def front(self, batch: int, quantity: str) -> list[str]:
+        """Rows that no other beats in both error and rate, the most exact first."""
+        found = self.rates[batch]
+        return pareto_front(
+            {
+                name: (errors[quantity].mean, found[name].steps_per_s)
+                for name, errors in self.errors.items()
+            }
+        )
+
+    def choice(self, batch: int, budget: Sequence[float]) -> str | None:
+        """The fastest row within a budget of mean error, one number per quantity."""
+        means = {
+            name: [errors[quantity].mean for quantity in self.quantities]
+            for name, errors in self.errors.items()
+        }
+        speeds = {name: rate.steps_per_s for name, rate in self.rates[batch].items()}
+        return best_within(means, speeds, budget)
+
+    @property
+    def paper_budget(self) -> list[float] | None:
+        """The paper's errors as a budget, where it published all of them."""
+        found = [self.published.get(quantity) for quantity in self.quantities]
+        return None if None in found else [x for x in found if x is not None]
+
+    def figures(self) -> dict[str, Any]:
+        """Everything as JSON would have it, fronts and choice included."""
+        fronts = {
+            str(batch): {q: self.front(batch, q) for q in self.quantities}
+            for batch in self.rates
+        }
+        budget = self.paper_budget
+        choices = {
+            str(batch): self.choice(batch, budget) if budget else None
+            for batch in self.rates
+        }
+        return asdict(self) | {"fronts": fronts, "within_paper": choices}
+
+
+def bench(
+    scene: Scene,
+    batches: Sequence[int] = (1, 64, 512, 4096),
+    rows: int = 256,
+    rounds: int = 5,
+    seed: int = 500,
+    steps: int | None = None,
+    is_compiling: bool = True,
+    threads: int | None = None,
+) -> BenchReport:
+    """Race MuJoCo and the shipped models of a scene on this machine.
+
+    Args:
+        scene: one with a protocol.
+        batches: rows stepped together, for the rates.
+        rows: trajectories of each case, for the errors.
+        rounds: turns of each contender.
+        seed: of the starts.
+        steps: horizon of the errors; the protocol's by default.
+        is_compiling: have compiled rows.
+        threads: processors to use; torch's own choice by default.
+
+    Raises:
+        ValueError: a scene without a protocol, or a setting out of range.
+    """
+    expect_at_least(1, rounds=rounds, **{f"batch {b}": b for b in batches})
+    expect_at_least(2, rows=rows)
+    if scene.name not in PROTOCOLS:
+        known = ", ".join(PROTOCOLS)
+        raise ValueError(f"no protocol for '{scene.name}', expected one of {known}")
+    if threads is not None:
+        torch.set_num_threads(threads)
+    threads = torch.get_num_threads()
+    protocol = PROTOCOLS[scene.name]()
+    everyone = contenders(scene, threads, is_compiling)
+    ground = courses(protocol, rows, seed, threads, steps)
+    errors = {who.name: contender_errors(who, ground) for who in everyone}
+    floors = chaos_floor(ground, threads, seed)
+    tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
+    speeds = {
+        batch: rates(everyone, tasks[-1], batch, rounds, seed) for batch in batches
+    }
+    horizon = ground[0].steps
+    return BenchReport(
+        scene=scene.name,
+        steps=horizon,
+        rows=rows,
+        errors=errors,
+        floors=floors,
+        rates=speeds,
+        published=_published(protocol, horizon),
+        machine={
+            "processor": platform.processor() or platform.machine(),
+            "threads": threads,
+            "torch": torch.__version__,
+            "mujoco": mujoco.__version__,
+        },
+    )
+
+
+def _published(protocol: Protocol, horizon: int) -> dict[str, float]:
+    """Means over the cases of what the paper published at this horizon."""
+    found: dict[str, list[float]] = {}
+    for (_, steps, quantity), error in protocol.published.items():
+        if steps == horizon:
+            found.setdefault(quantity, []).append(error)
+    return {quantity: sum(x) / len(x) for quantity, x in found.items()}
