@@ -183,3 +183,15 @@ def test_step_sizes_rise_and_fall_to_zero_in_both_phases(tmp_path):
     assert first[top:] == sorted(first[top:], reverse=True) and first[-1] < 0.05
     assert second[0] == pytest.approx(config.rollout_lr)
     assert second == sorted(second, reverse=True) and second[-1] < 0.02
+
+
+def test_rollouts_begin_anew_in_every_round(tmp_path):
+    config = replace(BRIEF, rollout_steps=6, rollout_rounds=3, rollout_lr=0.5)
+    trainer = make_trainer(SCENE, config, tmp_path)
+    rates = []
+    for trainer.step in range(config.total_steps):
+        rates.append(trainer._rate())
+    assert rates[config.steps :] == pytest.approx([0.5, 0.25] * 3)
+    assert rates[config.warmup : config.steps] == pytest.approx(
+        [1.0 - step / config.steps for step in range(config.warmup, config.steps)]
+    )

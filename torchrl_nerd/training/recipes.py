@@ -56,7 +56,20 @@ RECIPES: dict[str, Recipe] = {
     "double_pendulum": _mlp(
         "double_pendulum/passive", 40_000, "mlp-wide", 36_000, 4_000, softening=1.0
     ),
-    "ant": _mlp("ant/run", 20_000, "mlp-large", 26_000, 1_500, softening=0.02),
+    "ant": Recipe(
+        DataConfig(trajectories=20_000, steps=100),
+        TrainConfig(
+            network="mlp-large",
+            steps=30_000,
+            rollout_steps=9_000,
+            rollout_rounds=3,
+            single_share=1.0,
+            use_symmetry=True,
+            softening=0.02,
+            validate_every=1_000,
+        ),
+        "ant/run",
+    ),
     "anymal": _mlp("anymal/forward", 10_000, "mlp-large", 10_000, 500, softening=0.02),
     "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),
     "franka_gravity": _mlp(

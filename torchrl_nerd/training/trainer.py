@@ -31,7 +31,7 @@ VALIDATION_SEED = 1_000_003
 VALIDATION_ROWS = 256
 COUNTS = (
     *("rows", "length", "rollout_rows", "rollout_length"),
-    *("save_every", "validate_every"),
+    *("save_every", "validate_every", "rollout_rounds"),
 )
 
 
@@ -50,6 +50,7 @@ class TrainConfig:
     | ``rollout_rows``, ``rollout_length`` | the same for rollouts |
     | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
     | ``rollout_lr`` | share of the peak at which the rollout updates begin |
+    | ``rollout_rounds`` | how often, in equal parts of them, they begin there anew |
     | ``warmup`` | updates over which the step size rises from zero |
     | ``softening`` | of the relative loss; see `losses.relative_error` |
     | ``clip`` | largest norm of the gradient |
@@ -71,6 +72,7 @@ class TrainConfig:
     lr: float = 0.01
     lr_other: float = 3e-3
     rollout_lr: float = 0.1
+    rollout_rounds: int = 1
     warmup: int = 200
     softening: float = 0.01
     clip: float = 1.0
@@ -231,14 +233,14 @@ class Trainer:
         return self.sequences.one_step(rows, length, generator)
 
     def _rate(self) -> float:
-        """Share of the peak step size: up, then down to zero, in each of two phases."""
+        """Share of the peak step size: up, then down to zero; rollouts in rounds."""
         config, step = self.config, self.step
         if step < config.steps:
             return min(1.0, (step + 1) / max(config.warmup, 1)) * (
                 1 - step / config.steps
             )
-        left = 1.0 - (step - config.steps) / config.rollout_steps
-        return config.rollout_lr * left
+        done = config.rollout_rounds * (step - config.steps) / config.rollout_steps
+        return config.rollout_lr * (1.0 - done % 1.0)
 
     def _autocast(self) -> AbstractContextManager:
         if self.device.type == "cuda":
