@@ -97,6 +97,15 @@ class Tosses:
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
+    def select(self, numbers: Tensor) -> "Tosses":
+        """Some of the tosses, in that order."""
+        ends = self.offsets[1:]
+        rows = [torch.arange(int(self.offsets[i]), int(ends[i])) for i in numbers]
+        lengths = (ends - self.offsets[:-1])[numbers]
+        offsets = torch.cat((lengths.new_zeros(1), lengths.cumsum(0)))
+        index = torch.cat(rows)
+        return Tosses(self.qpos[index], self.qvel[index], offsets)
+
     def starts(self, length: int, tosses: Tensor | None = None) -> Tensor:
         """Row of the first of every ``length`` consecutive states, ``(windows,)``."""
         which = range(len(self)) if tosses is None else tosses.tolist()

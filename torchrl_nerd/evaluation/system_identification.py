@@ -25,6 +25,8 @@ PUBLISHED = {
     "damping": 50.0,  # N s/m
     "slip": 50.0,  # N s/m
 }
+# `python benchmarks/fit_mujoco.py` on the training tosses
+FITTED = dict(PUBLISHED)
 WIDTHS = np.array([0.01, 0.01, 0.1, 0.1, 0.4, 0.4, 0.4])  # log, of the first simplex
 POSITION, ORIENTATION = 0.01, 0.2  # m and rad that weigh alike
 SUBSTEPS = 10

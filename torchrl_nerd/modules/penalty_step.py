@@ -15,6 +15,9 @@ from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.scenes.scene import Scene
 
 PARAMETERS = ("gravity", "size", "inertia", "friction", "stiffness", "damping", "slip")
+# what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
+# move little, so that one step size suits all
+SHARE = (0.1, 0.1, 0.5, 0.3, 2.0, 2.0, 4.0)
 SLOWEST = 1e-4  # m/s: keeps the direction of slip defined at rest
 
 # rotation matrix, row by row, from the 16 products of a quaternion's entries
@@ -48,8 +51,8 @@ for _index, (_row, _sign) in enumerate(
 class PenaltyStep(nn.Module):
     """One control step of a single free body above the plane z = 0.
 
-    ``log_scale (7,)`` holds logarithms of what multiplies the scene's own `PARAMETERS`
-    and ``ground ()`` the height of the plane, m: all zero for the scene as it is.
+    ``raw (7,)`` times `SHARE` is the logarithm of what multiplies the scene's own
+    `PARAMETERS`: zero for the scene as it is.
 
     Args:
         scene: a single free body with point contacts that follow the penalty law.
@@ -94,24 +97,30 @@ class PenaltyStep(nn.Module):
             ("points", points.clone()),
             ("inertia", inertia.clone()),
             ("nominal", nominal),
+            ("share", torch.tensor(SHARE, dtype=torch.float64)),
             ("matrix", _MATRIX),
             ("spin", _SPIN),
         ):
             self.register_buffer(key, value.clone(), persistent=False)
-        zero = torch.zeros(len(PARAMETERS) + 1, dtype=torch.float64)
-        self.log_scale = nn.Parameter(zero[1:].clone())
-        self.ground = nn.Parameter(zero[0].clone())
+        self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
+
+    def scaled(self) -> Tensor:
+        """The `PARAMETERS` in SI units; size and inertia as multiples of the scene's."""
+        return self.nominal * (self.share * self.raw).exp()
 
     def values(self) -> dict[str, float]:
-        """The parameters in SI units; size and inertia as multiples of the scene's."""
-        scaled = self.nominal * self.log_scale.detach().exp()
-        named = dict(zip(PARAMETERS, scaled.tolist(), strict=True))
-        return {**named, "ground": float(self.ground.detach())}
+        """`scaled` by name."""
+        return dict(zip(PARAMETERS, self.scaled().tolist(), strict=True))
+
+    @torch.no_grad()
+    def set_values(self, values: dict[str, float]) -> None:
+        """Take over parameters as `values` gives them."""
+        wanted = self.nominal.new_tensor([values[key] for key in PARAMETERS])
+        self.raw.copy_((wanted / self.nominal).log() / self.share)
 
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """The state one control step later, ``(rows, 7), (rows, 6)``, float64."""
-        scaled = self.nominal * self.log_scale.exp()
-        gravity, size, heavier, mu, ke, kd, kf = scaled.unbind()
+        gravity, size, heavier, mu, ke, kd, kf = self.scaled().unbind()
         h, points = self.step_size, size * self.points
         inertia = heavier * self.inertia
         soften = 1.0 + h * (kd + h * ke) / self.lightest  # backward Euler at a point
@@ -130,7 +139,7 @@ class PenaltyStep(nn.Module):
             rotation = (products @ self.matrix).unflatten(1, (3, 3))
             up = rotation[:, 2]  # of the world, in body axes
             in_body = (linear[:, None] @ rotation)[:, 0]
-            depth = (self.ground - position[:, 2:]) - up @ points.mT
+            depth = -position[:, 2:] - up @ points.mT
             moving = (angular @ velocities).unflatten(1, (-1, 3)) + in_body[:, None]
             rising = (moving @ up[:, :, None])[..., 0]
             sliding = moving - rising[..., None] * up[:, None]

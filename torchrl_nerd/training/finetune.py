@@ -130,7 +130,7 @@ class FineTuner:
         groups = [{"params": chosen, "lr": config.lr}]
         if isinstance(model, ResidualNeRD):
             simulator = cast(ResidualNeRD, self.model).simulator
-            physics = [simulator.log_scale]
+            physics = [simulator.raw]
             groups.append({"params": physics, "lr": config.physics_lr})
         self.optimizer = torch.optim.Adam(groups)
         self.peaks = [group["lr"] for group in groups]
