@@ -7,7 +7,7 @@ class trains from scratch, for comparison, and on simulated tosses.
 import copy
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, cast
 
 import torch
@@ -17,9 +17,12 @@ from tqdm import tqdm
 
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.toss_error import STATES, toss_errors
+from torchrl_nerd.evaluation.rollout_error import open_loop
+from torchrl_nerd.evaluation.toss_error import STATES, path_errors, toss_errors
+from torchrl_nerd.geometry.frames import quat_exp, quat_multiply
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.pose_encoder import PoseEncoder
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.settings import SettingError, expect_at_least
 from torchrl_nerd.training.low_rank import add_low_rank, merge_low_rank
@@ -32,6 +35,7 @@ from torchrl_nerd.training.pose_loss import (
 from torchrl_nerd.training.symmetry import find_isometries
 
 Update = Literal["all", "head", "low-rank"]
+Observe = Literal["states", "poses"]
 VALIDATION_STRIDE = 5  # of the validation tosses' sub-trajectories, which overlap
 IMAGES = 8  # isometries per batch
 
@@ -55,6 +59,10 @@ class FinetuneConfig:
     | ``clip`` | largest norm of the network's gradient |
     | ``validate_every`` | updates between rollouts of the validation tosses |
     | ``patience`` | validations without progress before it stops |
+    | ``observe`` | whole states, or poses alone: a window encoder finds the start |
+    | ``every`` | control steps between observed poses |
+    | ``pose_noise`` | m, added to every observed pose: a worse camera |
+    | ``poses`` | in the encoder's window |
     | ``seed`` | of batches and fresh weights |
     """
 
@@ -71,6 +79,10 @@ class FinetuneConfig:
     clip: float = 0.3
     validate_every: int = 20
     patience: int = 4
+    observe: Observe = "states"
+    every: int = 1
+    pose_noise: float = 0.0
+    poses: int = 4
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -78,7 +90,13 @@ class FinetuneConfig:
             raise SettingError(
                 f"expected update 'all', 'head' or 'low-rank', got '{self.update}'"
             )
-        counts = ("rows", "length", "rank", "validate_every", "patience")
+        if self.observe not in ("states", "poses"):
+            raise SettingError(
+                f"expected observe 'states' or 'poses', got '{self.observe}'"
+            )
+        if self.observe == "states" and (self.every > 1 or self.pose_noise > 0.0):
+            raise SettingError("expected observe 'poses' with every or pose_noise")
+        counts = ("every", "rows", "length", "rank", "validate_every", "patience")
         expect_at_least(1, **{name: getattr(self, name) for name in counts})
         for name in ("epochs", "lr", "physics_lr", "noise", "clip", "short_share"):
             expect_at_least(0, **{name: getattr(self, name)})
@@ -108,8 +126,15 @@ class FineTuner:
         torch.manual_seed(config.seed)
         self.config, self.tosses, self.quiet = config, tosses, quiet
         self.model = copy.deepcopy(model)
-        self.starts = tosses.starts(config.length + 1, train)
-        self.checks = tosses.starts(STATES, validation)[::VALIDATION_STRIDE]
+        self.encoder: PoseEncoder | None = None
+        if config.observe == "poses":
+            self.encoder = PoseEncoder(model.scene, config.poses, config.every)
+            # what is seen: nothing else of the recordings is used below
+            tosses = replace(tosses, qpos=noisy_poses(tosses.qpos, config))
+        self.seen = tosses
+        before = self.encoder.span if self.encoder else 0
+        self.starts = tosses.starts(before + config.length + 1, train)
+        self.checks = tosses.starts(before + STATES, validation)[::VALIDATION_STRIDE]
         for name, found in (("training", self.starts), ("validation", self.checks)):
             if len(found) == 0:
                 raise ValueError(
@@ -132,6 +157,9 @@ class FineTuner:
             simulator = cast(ResidualNeRD, self.model).simulator
             physics = [simulator.raw]
             groups.append({"params": physics, "lr": config.physics_lr})
+        if self.encoder is not None:
+            weights = list(self.encoder.parameters())
+            groups.append({"params": weights, "lr": config.lr})
         self.optimizer = torch.optim.Adam(groups)
         self.peaks = [group["lr"] for group in groups]
         self.curve: list[dict[str, float]] = []
@@ -148,6 +176,7 @@ class FineTuner:
         generator = Generator().manual_seed(config.seed)
         began, order = time.monotonic(), torch.zeros(0, dtype=torch.long)
         best, best_score, waited = self._frozen(), self._validate(0, 0.0), 0
+        encoder = copy.deepcopy(self.encoder)
         epochs = tqdm(total=config.epochs, desc="epochs", disable=self.quiet)
         for update in range(1, total + 1):
             if len(order) == 0:
@@ -167,16 +196,19 @@ class FineTuner:
                 waited += 1
                 if score < best_score:
                     best, best_score, waited = self._frozen(), score, 0
+                    encoder = copy.deepcopy(self.encoder)
                 last = self.curve[-1]
                 epochs.set_postfix(m=last["position_m"], rad=last["orientation_rad"])
                 if waited >= config.patience and not is_short:
                     break
         epochs.close()
+        self.model, self.encoder = best, encoder
         return best
 
     def _batch(self, starts: Tensor, length: int, generator: Generator) -> TensorDict:
         """Windows ``[rows, length + 1]``, mirrored and with a little noise."""
-        window = self.tosses.windows(starts, length + 1)
+        before = self.encoder.span if self.encoder else 0
+        window = self.seen.windows(starts, before + length + 1)
         order = torch.randperm(len(self.isometries), generator=generator)[:IMAGES]
         parts = window.chunk(len(order))
         images = [
@@ -188,19 +220,19 @@ class FineTuner:
     def _update(self, window: TensorDict) -> float:
         """One step of the optimiser; its loss."""
         config = self.config
-        qpos, qvel = window[QPOS], window[QVEL]
-        start = qpos[:, 0].clone()
-        start[:, :3] += config.noise * torch.randn_like(start[:, :3])
         self.model.train()
         with torch.enable_grad():
-            path = rollout(self.model, start, qvel[:, 0], qpos.shape[1] - 1)
-            loss = pose_loss(path, qpos[:, 1:])
+            qpos, (start, qvel) = self._observed(window)
+            start = start + config.noise * torch.nn.functional.pad(
+                torch.randn_like(start[:, :3]), (0, 4)
+            )
+            path = rollout(self.model, start, qvel, qpos.shape[1])
+            step = torch.arange(1, qpos.shape[1] + 1)
+            loss = pose_loss(path, qpos, step % config.every == 0)
         self.optimizer.zero_grad()
         loss.backward()
-        for group, limit in zip(
-            self.optimizer.param_groups, (config.clip, 1.0), strict=False
-        ):
-            norm = nn.utils.clip_grad_norm_(group["params"], limit)
+        for group in self.optimizer.param_groups:
+            norm = nn.utils.clip_grad_norm_(group["params"], config.clip)
             if not norm.isfinite():
                 return float("nan")
         self.optimizer.step()
@@ -210,8 +242,7 @@ class FineTuner:
         self, update: int, seconds: float, loss: float = float("nan")
     ) -> float:
         """Error over validation tosses, by the scales of the loss; adds to the curve."""
-        dynamics = NeRDDynamics(self.model)
-        distance, angle = toss_errors(dynamics, self.tosses, self.checks)
+        distance, angle = self.errors(self.checks)
         figures = {
             "update": float(update),
             "epoch": update / self.updates_per_epoch,
@@ -225,6 +256,24 @@ class FineTuner:
         score += figures["orientation_rad"] / ORIENTATION_SCALE
         return score if score == score else float("inf")
 
+    @torch.no_grad()
+    def errors(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors of sub-trajectories against the recorded poses; see `toss_errors`.
+
+        Args:
+            rows: of the first state, or of the encoder's first pose: the 80 states
+                come after its window then.
+        """
+        dynamics = NeRDDynamics(self.model)
+        if self.encoder is None:
+            return toss_errors(dynamics, self.tosses, rows)
+        before = self.encoder.span
+        seen = self.seen.windows(rows, before + STATES)
+        _, (qpos, qvel) = self._observed(seen)
+        start = TensorDict({QPOS: qpos, QVEL: qvel}, [len(rows)])
+        measured = self.tosses.windows(rows + before, STATES)[QPOS][:, 1:]
+        return path_errors(open_loop(dynamics, start, STATES - 1), measured)
+
     def _frozen(self) -> NeRD:
         """A copy of the model as it is now, low-rank changes added to its weights."""
         model = copy.deepcopy(self.model)
@@ -234,6 +283,18 @@ class FineTuner:
     def card(self) -> dict[str, Any]:
         """Configuration, curve and convergence, for a checkpoint's card."""
         return {"finetuning": {**asdict(self.config), **converged(self.curve)}}
+
+
+def noisy_poses(qpos: Tensor, config: FinetuneConfig) -> Tensor:
+    """Poses ``(N, 7)`` of a worse camera: the same for the same seed.
+
+    A point 0.1 m from the centre is off by as much in its turn as in its place.
+    """
+    generator = Generator().manual_seed(config.seed)
+    shape = (2, len(qpos), 3)
+    noise = config.pose_noise * torch.randn(shape, generator=generator).to(qpos)
+    turned = quat_multiply(qpos[:, 3:7], quat_exp(noise[1] / 0.1))
+    return torch.cat((qpos[:, :3] + noise[0], turned), -1)
 
 
 def converged(
