@@ -46,7 +46,7 @@ def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> Non
         axes.plot(millions, returns, STYLES[number], color=COLORS[number], label=name)
     axes.set(xlabel="environment steps (millions)", ylabel="mean return")
     axes.legend(frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
     rows = [names, *([str(point[name]) for name in names] for point in curve)]
     text = "".join(",".join(row) + "\n" for row in rows)
     write_atomically(
@@ -76,7 +76,7 @@ def plot_states(
         axes.set_ylabel(label)
     panels[-1].set_xlabel("time (s)")
     panels[0].legend(frameon=False, ncols=len(episodes))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _qpos_names(scene: Scene) -> list[str]:
@@ -106,5 +106,6 @@ def _figure(panels: int, height: float) -> "tuple[Figure, list[Axes]]":
     return figure, list(axes)
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a PNG, whole or not at all."""
     write_atomically(path, lambda aside: figure.savefig(aside, format="png", dpi=150))

@@ -6,7 +6,7 @@ class trains from scratch, for comparison, and on simulated tosses.
 
 import copy
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, cast
 
@@ -38,6 +38,7 @@ Update = Literal["all", "head", "low-rank"]
 Observe = Literal["states", "poses"]
 VALIDATION_STRIDE = 5  # of the validation tosses' sub-trajectories, which overlap
 IMAGES = 8  # isometries per batch
+WARMUP = 10  # updates over which step sizes rise
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,7 @@ class FineTuner:
         validation: numbers of the tosses that choose the best model and when to stop.
         config: how.
         quiet: no progress bar.
+        keep: called with every model that is better than all before.
     """
 
     def __init__(
@@ -122,10 +124,11 @@ class FineTuner:
         validation: Tensor,
         config: FinetuneConfig,
         quiet: bool = False,
+        keep: Callable[[NeRD], object] | None = None,
     ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.tosses, self.quiet = config, tosses, quiet
-        self.model = copy.deepcopy(model)
+        self.model, self.keep = copy.deepcopy(model), keep
         self.encoder: PoseEncoder | None = None
         if config.observe == "poses":
             self.encoder = PoseEncoder(model.scene, config.poses, config.every)
@@ -184,12 +187,12 @@ class FineTuner:
             pick, order = order[: config.rows], order[config.rows :]
             is_short = update <= config.short_share * total
             length = max(1, config.length // 2) if is_short else config.length
-            loss = self._update(self._batch(self.starts[pick], length, generator))
-            rate = min(1.0, update / 10) * (1.0 - update / total)
+            rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
             for group, peak in zip(
                 self.optimizer.param_groups, self.peaks, strict=True
             ):
-                group["lr"] = peak * max(rate, 1e-3)
+                group["lr"] = peak * rate
+            loss = self._update(self._batch(self.starts[pick], length, generator))
             epochs.update(1 / self.updates_per_epoch)
             if update % config.validate_every == 0 or update == total:
                 score = self._validate(update, time.monotonic() - began, loss)
@@ -197,6 +200,8 @@ class FineTuner:
                 if score < best_score:
                     best, best_score, waited = self._frozen(), score, 0
                     encoder = copy.deepcopy(self.encoder)
+                    if self.keep is not None:
+                        self.keep(best)
                 last = self.curve[-1]
                 epochs.set_postfix(m=last["position_m"], rad=last["orientation_rad"])
                 if waited >= config.patience and not is_short:
@@ -237,6 +242,14 @@ class FineTuner:
                 return float("nan")
         self.optimizer.step()
         return float(loss.detach())
+
+    def _observed(self, window: TensorDict) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Poses after the start ``(rows, steps, 7)``, and the start's state."""
+        qpos = window[QPOS]
+        if self.encoder is None:
+            return qpos[:, 1:], (qpos[:, 0], window[QVEL][:, 0])
+        before, every = self.encoder.span, self.config.every
+        return qpos[:, before + 1 :], self.encoder(qpos[:, : before + 1 : every])
 
     def _validate(
         self, update: int, seconds: float, loss: float = float("nan")

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import save_file
 
 from torchrl_nerd.checkpoint import (
     CARD,
@@ -13,7 +14,8 @@ from torchrl_nerd.checkpoint import (
     shipped_models,
 )
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
-from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.files import read_json, write_atomically, write_json
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
 from torchrl_nerd.training.toss_models import from_scratch, pretrain
@@ -55,16 +57,22 @@ def finetune(
         save_checkpoint(model, out / "pretrained", card)
     else:
         model = from_pretrained(start or PRETRAINED_NAME, scene)
-    tuner = FineTuner(model, tosses, split["train"], split["validation"], config, quiet)
-    best = tuner.run()
     made = {
         "start": "fresh weights" if scratch else start or PRETRAINED_NAME,
-        **tuner.card()["finetuning"],
         "device": "cpu",
         "threads": torch.get_num_threads(),
         "tosses": {name: len(members) for name, members in split.items()},
     }
-    card = make_card(best, {"finetuning": made})
-    save_checkpoint(best, out, card)
-    write_json(out / "curve.json", {"curve": tuner.curve})
+
+    def keep(best: NeRD) -> None:
+        card = make_card(best, {"finetuning": {**made, **tuner.card()["finetuning"]}})
+        save_checkpoint(best, out, card)
+        write_json(out / "curve.json", {"curve": tuner.curve})
+
+    parts = split["train"], split["validation"]
+    tuner = FineTuner(model, tosses, *parts, config, quiet, keep)
+    keep(tuner.run())
+    if tuner.encoder is not None:
+        tensors = {k: v.contiguous() for k, v in tuner.encoder.state_dict().items()}
+        write_atomically(out / "encoder.safetensors", lambda p: save_file(tensors, p))
     return read_json(out / CARD)
