@@ -18,6 +18,7 @@ PARAMETERS = ("gravity", "size", "inertia", "friction", "stiffness", "damping", 
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
 # move little, so that one step size suits all
 SHARE = (0.1, 0.1, 0.5, 0.3, 2.0, 2.0, 4.0)
+GROUND_SHARE = 0.005  # m, the same for the ground's height
 SLOWEST = 1e-4  # m/s: keeps the direction of slip defined at rest
 
 # rotation matrix, row by row, from the 16 products of a quaternion's entries
@@ -51,8 +52,9 @@ for _index, (_row, _sign) in enumerate(
 class PenaltyStep(nn.Module):
     """One control step of a single free body above the plane z = 0.
 
-    ``raw (7,)`` times `SHARE` is the logarithm of what multiplies the scene's own
-    `PARAMETERS`: zero for the scene as it is.
+    ``raw (8,)`` times `SHARE` is the logarithm of what multiplies the scene's own
+    `PARAMETERS`; the last number times `GROUND_SHARE` is the height of the ground, m. All
+    zero for the scene as it is.
 
     Args:
         scene: a single free body with point contacts that follow the penalty law.
@@ -102,25 +104,32 @@ class PenaltyStep(nn.Module):
             ("spin", _SPIN),
         ):
             self.register_buffer(key, value.clone(), persistent=False)
-        self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
+        count = len(PARAMETERS) + 1
+        self.raw = nn.Parameter(torch.zeros(count, dtype=torch.float64))
 
     def scaled(self) -> Tensor:
-        """The `PARAMETERS` in SI units; size and inertia as multiples of the scene's."""
-        return self.nominal * (self.share * self.raw).exp()
+        """The `PARAMETERS` in SI units; size and inertia as multiples of the scene's.
+
+        The height of the ground (m) comes last.
+        """
+        factors = (self.share * self.raw[:-1]).exp()
+        return torch.cat((self.nominal * factors, GROUND_SHARE * self.raw[-1:]))
 
     def values(self) -> dict[str, float]:
         """`scaled` by name."""
-        return dict(zip(PARAMETERS, self.scaled().tolist(), strict=True))
+        names = (*PARAMETERS, "ground")
+        return dict(zip(names, self.scaled().tolist(), strict=True))
 
     @torch.no_grad()
     def set_values(self, values: dict[str, float]) -> None:
         """Take over parameters as `values` gives them."""
         wanted = self.nominal.new_tensor([values[key] for key in PARAMETERS])
-        self.raw.copy_((wanted / self.nominal).log() / self.share)
+        self.raw[:-1] = (wanted / self.nominal).log() / self.share
+        self.raw[-1] = values["ground"] / GROUND_SHARE
 
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """The state one control step later, ``(rows, 7), (rows, 6)``, float64."""
-        gravity, size, heavier, mu, ke, kd, kf = self.scaled().unbind()
+        gravity, size, heavier, mu, ke, kd, kf, ground = self.scaled().unbind()
         h, points = self.step_size, size * self.points
         inertia = heavier * self.inertia
         soften = 1.0 + h * (kd + h * ke) / self.lightest  # backward Euler at a point
@@ -139,7 +148,7 @@ class PenaltyStep(nn.Module):
             rotation = (products @ self.matrix).unflatten(1, (3, 3))
             up = rotation[:, 2]  # of the world, in body axes
             in_body = (linear[:, None] @ rotation)[:, 0]
-            depth = -position[:, 2:] - up @ points.mT
+            depth = ground - position[:, 2:] - up @ points.mT
             moving = (angular @ velocities).unflatten(1, (-1, 3)) + in_body[:, None]
             rising = (moving @ up[:, :, None])[..., 0]
             sliding = moving - rising[..., None] * up[:, None]

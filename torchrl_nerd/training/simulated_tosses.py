@@ -44,7 +44,8 @@ def simulate_tosses(
         draw = 2.0 * torch.rand(len(SPREAD), generator=generator).double() - 1.0
         factors = (draw * torch.tensor(list(SPREAD.values())).double()).exp().tolist()
         drawn = dict(zip(SPREAD, factors, strict=True))
-        cube = cube_with(scene, {key: PUBLISHED[key] * drawn[key] for key in PUBLISHED})
+        scaled = {key: PUBLISHED[key] * factor for key, factor in drawn.items()}
+        cube = cube_with(scene, {**PUBLISHED, **scaled})
         start = TensorDict(cube.sample_initial(tosses, generator)[0], [tosses])
         dynamics = MujocoDynamics(cube, num_threads=1)
         dynamics.reset(start)
