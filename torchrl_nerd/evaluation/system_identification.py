@@ -28,12 +28,14 @@ PUBLISHED = {
 }
 # `python benchmarks/fit_mujoco.py` on the training tosses
 FITTED = {
-    **PUBLISHED,
-    "gravity": 9.61,
-    "size": 0.0512,
-    "inertia": 0.00093,
-    "friction": 0.19,
-    "slip": 10.0,
+    "gravity": 9.610,
+    "size": 0.05092,
+    "inertia": 0.001027,
+    "friction": 0.1852,
+    "stiffness": 7282.0,
+    "damping": 55.48,
+    "slip": 12.99,
+    "ground": 0.000847,
 }
 WIDTHS = np.array([0.01, 0.01, 0.1, 0.1, 0.4, 0.4, 0.4, 0.5])  # of the first simplex
 GROUND = 0.002  # m that count as 1; of the others the logarithms are sought
