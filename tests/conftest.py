@@ -11,7 +11,9 @@ import secrets
 import numpy as np
 import pytest
 import torch
+from helpers import EXCERPT
 
+from torchrl_nerd.data.cube_tosses import Tosses, TossLog, make_tosses, read_log
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import TASKS
 
@@ -54,3 +56,21 @@ def scene(request: pytest.FixtureRequest) -> Scene:
 def task_id(request: pytest.FixtureRequest) -> str:
     """Each registered task."""
     return request.param
+
+
+@pytest.fixture
+def real_cube() -> Scene:
+    """The cube that was recorded."""
+    return load_scene("cube_real")
+
+
+@pytest.fixture
+def log() -> TossLog:
+    """A dozen of its tosses as they were recorded."""
+    return read_log(EXCERPT)
+
+
+@pytest.fixture
+def tosses(log: TossLog, real_cube: Scene) -> Tosses:
+    """The same as states."""
+    return make_tosses(log, real_cube)

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,6 +17,9 @@ from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling, sample_torque
+
+EXCERPT = Path(__file__).parent / "data" / "tosses_excerpt.npz"
+"""A dozen tosses of a real cube; source and licence are in the file beside it."""
 
 FLOATER = """
 <mujoco><option timestep="0.002" integrator="Euler" cone="elliptic"/><worldbody>

@@ -53,7 +53,7 @@ def test_help_names_every_command(argv, capsys):
     assert all(f"  {name}" in text for name in COMMANDS)
 
 
-@pytest.mark.parametrize("command", ["data", "train", "eval", "explain"])
+@pytest.mark.parametrize("command", ["data", "train", "eval", "finetune", "explain"])
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])

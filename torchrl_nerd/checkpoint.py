@@ -8,7 +8,7 @@ import platform
 import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import torch
@@ -19,6 +19,7 @@ from torchrl_nerd import __version__
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
+from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene, load_scene
 
@@ -30,7 +31,15 @@ KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
     "mlp": MLPConfig,
     "gru": GRUConfig,
+    "residual-mlp": ResidualConfig,
 }
+
+
+def make_model(scene: Scene, config: NetworkConfig | ResidualConfig) -> NeRD:
+    """A model of that configuration whose weights are yet to be loaded."""
+    if isinstance(config, ResidualConfig):
+        return ResidualNeRD(scene, config)
+    return NeRD(scene, config)
 
 
 def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -47,7 +56,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
         "scene": scene.name,
         "scene_hash": scene.hash,
         "control_step": scene.control_step,
-        "network": {"kind": kind, **asdict(config)},
+        "network": {"kind": kind, **asdict(cast(Any, config))},
         "training_ranges": scene.sampling.ranges(),
         "versions": {
             "torchrl_nerd": __version__,
@@ -91,7 +100,7 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
         devices=[]
     ):  # its first weights are drawn, then replaced
         try:
-            model = NeRD(scene, _network_config(card, folder))
+            model = make_model(scene, _network_config(card, folder))
         except ValueError as error:
             raise ValueError(
                 f"the network in {folder} cannot be built: {error}"
@@ -144,7 +153,9 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
         raise ValueError(f"the scene of the card in {folder}: {error}") from None
 
 
-def _network_config(card: dict[str, Any], folder: Path) -> NetworkConfig:
+def _network_config(
+    card: dict[str, Any], folder: Path
+) -> NetworkConfig | ResidualConfig:
     found = card.get("network")
     network = dict(found) if isinstance(found, dict) else {}
     kind = network.pop("kind", None)

@@ -1,4 +1,4 @@
-"""The ``nerd`` command: data, train, eval, transfer, explain, bench."""
+"""The ``nerd`` command: data, train, finetune, eval, transfer, explain, bench."""
 
 import io
 import sys
@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import tyro
 
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
+from torchrl_nerd.data.recorded import REAL, SHIPPED, load_tosses, write_tosses
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.nerd import Inference
 from torchrl_nerd.evaluation.bench.plot import plot_race
@@ -24,11 +25,15 @@ from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
+from torchrl_nerd.evaluation.toss_error import STATES
+from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
 from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
-from torchrl_nerd.scenes import is_import, load_scene
+from torchrl_nerd.scenes import Scene, is_import, load_scene
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.tasks import make_task
+from torchrl_nerd.training.finetune import FinetuneConfig
+from torchrl_nerd.training.finetune_run import finetune
 from torchrl_nerd.training.recipes import RECIPES, recipe_of
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
 
@@ -38,9 +43,10 @@ Flat = tyro.conf.OmitArgPrefixes
 
 @dataclass(frozen=True)
 class Data:
-    """Generate random trajectories of the true dynamics.
+    """Generate random trajectories of the true dynamics, or take over recorded ones.
 
     Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
+    Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
     """
 
     scene: Positional[str]
@@ -48,6 +54,8 @@ class Data:
     or an MJCF file."""
     out: Path | None = None
     """Folder of the data set; datasets/SCENE by default."""
+    recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
     json: Path | None = None
     """Write the figures to this file."""
@@ -56,6 +64,13 @@ class Data:
 
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
+        if self.recorded is not None:
+            scene = real_scene(self.scene)
+            out = self.out or Path("datasets") / f"{scene.name}_recorded"
+            card = write_tosses(self.recorded, scene, out)
+            print("\n".join(card["checks"]))
+            print(f"{card['trajectories']} recorded tosses in {out}: they fit physics")
+            return card
         scene = load_scene(self.scene)
         out = self.out or Path("datasets") / folder_name(self.scene)
         generate(scene, self.config, out, self.quiet)
@@ -130,6 +145,7 @@ class Eval:
 
     Robots of others start within their own sampling ranges, without and with actions.
     Example: nerd eval cartpole --json results/cartpole.json
+    Example: nerd eval cube --data cube_tosses.npz --split test --baselines
     """
 
     scene: Positional[str]
@@ -145,6 +161,13 @@ class Eval:
     """streaming, or window: the paper's recomputation."""
     unseen_terrain: bool = False
     """Over grounds of kinds that no training data have, in place of the paper's."""
+    data: Path | None = None
+    """Recorded cube tosses (npz or CSV) in place of true physics: every sub-trajectory of
+    80 states."""
+    split: str = "all"
+    """Of recorded tosses: all, train, validation or test, by the recommended seed."""
+    baselines: bool = False
+    """Beside it, on recorded tosses: MuJoCo, published and fitted, and no motion."""
     device: str = "cpu"
     """cpu or cuda."""
     json: Path | None = None
@@ -152,6 +175,8 @@ class Eval:
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows."""
+        if self.data is not None:
+            return self.run_recorded(self.data)
         scene = load_scene(self.scene)
         if self.rows < 2:
             raise ValueError(f"expected at least 2 rows, got {self.rows}")
@@ -191,6 +216,69 @@ class Eval:
                     print(f"{line}  {paper if paper is not None else '-'}")
         settings = {"rows": self.rows, "seed": self.seed, "inference": self.inference}
         return {"scene": self.scene, **settings, "errors": rows}
+
+    def run_recorded(self, path: Path) -> dict[str, Any]:
+        """The same for recorded tosses."""
+        scene = real_scene(self.scene)
+        model = from_pretrained(self.model or SHIPPED, scene).to(self.device)
+        tosses, split = load_tosses(path, scene)
+        if self.split != "all" and self.split not in split:
+            expected = ", ".join(("all", *split))
+            raise ValueError(f"expected split {expected}, got '{self.split}'")
+        chosen = None if self.split == "all" else split[self.split]
+        starts = tosses.starts(STATES, chosen)
+        if len(starts) == 0:
+            raise ValueError(
+                f"expected a toss of at least {STATES} states in {path}, got none"
+            )
+        models = {"model": NeRDDynamics(model, inference=self.inference)}
+        if self.baselines:
+            models = {**mujoco_baselines(scene), **models}
+        table = compare(models, tosses, starts)
+        print(toss_table(table))
+        shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
+        return {**shared, **table["model"], "others": table}
+
+
+@dataclass(frozen=True)
+class Finetune:
+    """Fine-tune on recorded tosses a model that was pretrained in MuJoCo.
+
+    Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
+    Example: nerd finetune cube --from cube_tosses.npz --scratch mlp --epochs 40
+    """
+
+    scene: Positional[str]
+    """cube_real; cube is short for it here."""
+    recorded: Annotated[Path, tyro.conf.arg(name="from")]
+    """Recorded tosses, npz or CSV."""
+    out: Path | None = None
+    """Folder of the run; runs/SCENE_finetuned by default."""
+    model: str | None = None
+    """Pretrained model to start from; the shipped one by default. `new` pretrains one."""
+    scratch: str | None = None
+    """Start from fresh weights instead: residual, or a network's name, such as mlp."""
+    config: Flat[FinetuneConfig] = field(default_factory=FinetuneConfig)
+    json: Path | None = None
+    """Write the figures to this file."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> dict[str, Any]:
+        """Train, save the best model on validation tosses and return its card."""
+        scene = real_scene(self.scene)
+        out = writable_folder(self.out or Path("runs") / f"{scene.name}_finetuned")
+        start = self.model if self.scratch is None else None
+        card = finetune(
+            scene, self.recorded, out, self.config, start, self.scratch, self.quiet
+        )
+        figures = card["finetuning"]
+        print(
+            f"best model in {out}: {figures['validation_position_m']:.4f} m, "
+            f"{figures['validation_orientation_rad']:.3f} rad on validation tosses, "
+            f"after {figures['converged_epoch']:.2f} epochs within 5% of it"
+        )
+        return card
 
 
 @dataclass(frozen=True)
@@ -306,10 +394,23 @@ class Bench:
         return report.figures()
 
 
+def real_scene(name: str) -> Scene:
+    """The scene that recorded tosses are of; ``cube`` is short for it.
+
+    Raises:
+        ValueError: another robot.
+    """
+    if name not in REAL:
+        expected = " or ".join(REAL)
+        raise ValueError(f"expected {expected} for recorded tosses, got '{name}'")
+    return load_scene(REAL[name])
+
+
 COMMANDS = {
     "data": Data,
     "train": Train,
     "eval": Eval,
+    "finetune": Finetune,
     "transfer": Transfer,
     "explain": Explain,
     "bench": Bench,

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -54,9 +54,10 @@ class NeRDDynamics:
         self.model = model.eval()
         self.compile = compile
         self.differentiable = differentiable
-        self.network: Network = model.network
+        network = cast(Network, model.network)
         if inference == "window":
-            self.network = WindowNetwork(model.network, window, model.tokens.size)
+            network = WindowNetwork(model.network, window, model.tokens.size)
+        self.network: Network = network
         self._memory: Memory | None = None
         self._rows = 0
         self._compiled: Callable | None = None

@@ -66,6 +66,14 @@ class Network(Protocol):
         ...
 
 
+class Config(Protocol):
+    """Size of a network, which it can build."""
+
+    def build(self, num_inputs: int, num_outputs: int) -> nn.Module:
+        """A freshly initialised network."""
+        ...
+
+
 class NeRD(nn.Module):
     """The learned solver of one robot: state, torque and ground in, change of state out.
 
@@ -79,7 +87,7 @@ class NeRD(nn.Module):
     def __init__(
         self,
         scene: Scene,
-        config: NetworkConfig,
+        config: Config,
         stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
         super().__init__()
@@ -118,7 +126,7 @@ class NeRD(nn.Module):
                 f"got another robot in '{scene.name}'"
             )
         with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
-            model = NeRD(scene, self.config)
+            model = type(self)(scene, self.config)
         mine, other = self.tokens.contact.sizes, model.tokens.contact.sizes
         if mine != other:
             raise ValueError(

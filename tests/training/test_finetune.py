@@ -1,0 +1,123 @@
+"""Fine-tuning on a dozen real tosses: what moves, what stays, and that it helps."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_nerd.modules.pose_encoder import PoseEncoder
+from torchrl_nerd.settings import SettingError
+from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner, converged
+from torchrl_nerd.training.pose_loss import pose_error, rollout
+from torchrl_nerd.training.toss_models import from_scratch
+
+QUICK = FinetuneConfig(epochs=0.2, rows=64, length=4, validate_every=100)
+NUMBERS = torch.arange(12)
+
+
+@pytest.fixture
+def model(real_cube, tosses):
+    return from_scratch(real_cube, tosses, "residual", seed=0)
+
+
+def tuner(model, tosses, **changes) -> FineTuner:
+    config = replace(QUICK, **changes)
+    return FineTuner(model, tosses, NUMBERS[2:], NUMBERS[:2], config, quiet=True)
+
+
+def weights(model) -> dict[str, torch.Tensor]:
+    return {k: v.clone() for k, v in model.state_dict().items()}
+
+
+def test_it_learns_from_real_tosses(model, tosses):
+    run = tuner(model, tosses, epochs=1.0, length=8, physics_lr=0.05)
+    run.run()
+    first, *_, last = [point for point in run.curve]
+    assert last["orientation_rad"] < first["orientation_rad"]
+
+
+def test_statistics_are_frozen_and_the_given_model_is_left_alone(model, tosses):
+    before = weights(model)
+    after = weights(tuner(model, tosses).run())
+    assert all(torch.equal(before[k], v) for k, v in weights(model).items())
+    frozen = [k for k in before if k.startswith("normalize")]
+    assert frozen and all(torch.equal(before[k], after[k]) for k in frozen)
+
+
+@pytest.mark.parametrize("update", ["all", "head", "low-rank"])
+def test_only_what_was_asked_for_changes(model, tosses, update, generator):
+    with torch.no_grad():
+        for weight in model.network.parameters():
+            weight += 0.01 * torch.randn(weight.shape, generator=generator)
+    run = tuner(model, tosses, update=update, rank=2)
+    run._update(run._batch(run.starts[:64], 4, generator))
+    after = run._frozen()
+    for name, old in model.network.named_parameters():
+        change = dict(after.network.named_parameters())[name] - old
+        if update == "head":
+            assert bool(change.any()) == ("head" in name)
+        elif update == "low-rank":
+            is_matrix = change.ndim == 2
+            assert is_matrix or not change.any()
+            if is_matrix:
+                assert torch.linalg.matrix_rank(change, atol=1e-7) <= 2
+
+
+def test_runs_of_one_seed_are_the_same(model, tosses):
+    first, second = (weights(tuner(model, tosses).run()) for _ in range(2))
+    assert all(torch.equal(first[k], second[k]) for k in first)
+
+
+def test_poses_at_any_rate_are_enough(model, tosses):
+    poses = replace(tosses, qvel=torch.full_like(tosses.qvel, float("nan")))
+    run = tuner(
+        model, poses, observe="poses", every=3, pose_noise=1e-4, length=6, noise=0.0
+    )
+    best = run.run()
+    assert all(weight.isfinite().all() for weight in best.parameters())
+    assert run.curve[-1]["position_m"] < 0.2
+
+
+def test_the_encoder_starts_with_the_slope_of_its_window(real_cube, generator):
+    every = int(torch.randint(1, 4, (), generator=generator))
+    encoder = PoseEncoder(real_cube, poses=5, every=every)
+    linear, angular = torch.randn(2, 8, 3, generator=generator).double()
+    from torchrl_nerd.geometry.manifold import integrate_pos
+
+    start, qvel = real_cube.sample_initial(8, generator)[0]["qpos"], None
+    qvel = torch.cat((linear, angular), 1)
+    time = real_cube.control_step * every * torch.arange(5).double()
+    window = torch.stack(
+        [integrate_pos(real_cube.layout, start, t * qvel) for t in time], 1
+    )
+    qpos, found = encoder(window)
+    torch.testing.assert_close(qpos, window[:, -1])
+    torch.testing.assert_close(found, qvel, atol=1e-9, rtol=0)
+
+
+def test_the_loss_is_smooth_where_nothing_is_wrong(model, tosses):
+    window = tosses.windows(tosses.starts(5)[:8], 5)
+    start = window["qpos"][:, 0].requires_grad_()
+    path = rollout(model, start, window["qvel"][:, 0], 4)
+    error = pose_error(path, path.detach())
+    error.sum().backward()
+    assert error.max() < 1e-3 and start.grad.isfinite().all()
+
+
+def test_convergence_is_the_first_point_near_the_best():
+    errors = (1.0, 0.5, 0.21, 0.2, 0.3)
+    curve = [
+        {"epoch": i, "seconds": 10 * i, "position_m": 0.0, "orientation_rad": e}
+        for i, e in enumerate(errors)
+    ]
+    found = converged(curve)
+    assert found["converged_epoch"] == 2 and found["validation_orientation_rad"] == 0.2
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"update": "some"}, {"rows": 0}, {"observe": "sound"}, {"every": 3}],
+)
+def test_settings_out_of_range_are_refused(changes):
+    with pytest.raises(SettingError, match="expected"):
+        replace(QUICK, **changes)

@@ -1,0 +1,78 @@
+"""One run of fine-tuning: from a file of tosses to a checkpoint."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from torchrl_nerd.checkpoint import (
+    CARD,
+    from_pretrained,
+    make_card,
+    save_checkpoint,
+    shipped_models,
+)
+from torchrl_nerd.data.recorded import SHIPPED, load_tosses
+from torchrl_nerd.files import read_json, write_atomically, write_json
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
+from torchrl_nerd.training.toss_models import from_scratch, pretrain
+
+PRETRAINED_NAME = f"{SHIPPED}-pretrained"
+"""The shipped model that has seen simulated tosses alone."""
+
+
+def finetune(
+    scene: Scene,
+    path: Path,
+    out: Path,
+    config: FinetuneConfig,
+    start: str | None = None,
+    scratch: str | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Train on the training tosses of a file; writes checkpoint and ``curve.json``.
+
+    Args:
+        scene: of the cube.
+        path: of the recorded tosses.
+        out: folder of the checkpoint.
+        config: how.
+        start: a shipped model's name or a checkpoint folder; ``"new"`` pretrains one;
+            the shipped pretrained model where None.
+        scratch: fresh weights instead; see `from_scratch`.
+        quiet: no progress bar.
+
+    Returns:
+        The card of the best model on the validation tosses.
+    """
+    tosses, split = load_tosses(path, scene)
+    if scratch is not None:
+        model = from_scratch(scene, tosses.select(split["train"]), scratch, config.seed)
+    elif start == "new" or (start is None and PRETRAINED_NAME not in shipped_models()):
+        model, tuner = pretrain(scene, quiet=quiet)
+        card = make_card(model, {"pretraining": tuner.card()["finetuning"]})
+        save_checkpoint(model, out / "pretrained", card)
+    else:
+        model = from_pretrained(start or PRETRAINED_NAME, scene)
+    made = {
+        "start": "fresh weights" if scratch else start or PRETRAINED_NAME,
+        "device": "cpu",
+        "threads": torch.get_num_threads(),
+        "tosses": {name: len(members) for name, members in split.items()},
+    }
+
+    def keep(best: NeRD) -> None:
+        card = make_card(best, {"finetuning": {**made, **tuner.card()["finetuning"]}})
+        save_checkpoint(best, out, card)
+        write_json(out / "curve.json", {"curve": tuner.curve})
+
+    parts = split["train"], split["validation"]
+    tuner = FineTuner(model, tosses, *parts, config, quiet, keep)
+    keep(tuner.run())
+    if tuner.encoder is not None:
+        tensors = {k: v.contiguous() for k, v in tuner.encoder.state_dict().items()}
+        write_atomically(out / "encoder.safetensors", lambda p: save_file(tensors, p))
+    return read_json(out / CARD)
