@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.modules.pose_encoder import PoseEncoder
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner, converged
@@ -82,9 +83,7 @@ def test_the_encoder_starts_with_the_slope_of_its_window(real_cube, generator):
     every = int(torch.randint(1, 4, (), generator=generator))
     encoder = PoseEncoder(real_cube, poses=5, every=every)
     linear, angular = torch.randn(2, 8, 3, generator=generator).double()
-    from torchrl_nerd.geometry.manifold import integrate_pos
-
-    start, qvel = real_cube.sample_initial(8, generator)[0]["qpos"], None
+    start = real_cube.sample_initial(8, generator)[0]["qpos"]
     qvel = torch.cat((linear, angular), 1)
     time = real_cube.control_step * every * torch.arange(5).double()
     window = torch.stack(
