@@ -64,6 +64,13 @@ class PenaltyStep(nn.Module):
         ValueError: another kind of robot or contact.
     """
 
+    points: Tensor
+    inertia: Tensor
+    nominal: Tensor
+    share: Tensor
+    matrix: Tensor
+    spin: Tensor
+
     def __init__(self, scene: Scene, substeps: int = 4) -> None:
         super().__init__()
         model, name = scene.model, scene.name

@@ -54,4 +54,5 @@ def simulate_tosses(
         for parts, key in ((qpos, QPOS), (qvel, QVEL)):
             parts.append(torch.cat((start[key][:, None], path[key]), 1))
     offsets = states * torch.arange(cubes * tosses + 1)
-    return Tosses(*(torch.cat(x).flatten(0, 1) for x in (qpos, qvel)), offsets)
+    positions, velocities = (torch.cat(x).flatten(0, 1) for x in (qpos, qvel))
+    return Tosses(positions, velocities, offsets)
