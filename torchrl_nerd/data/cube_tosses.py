@@ -18,6 +18,7 @@ physics.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -198,7 +199,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     try:
-        table = np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64)
+        table: Any = np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"expected a CSV table in {path}: {error}") from None
     names = table.dtype.names or ()
