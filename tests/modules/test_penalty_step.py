@@ -75,11 +75,12 @@ def test_it_comes_to_rest_on_the_ground_at_any_stiffness(real_cube, generator, h
     step.set_values({**values, "stiffness": stiffness, "damping": damping})
     qpos, qvel = falling(real_cube, generator, height=0.02)
     with torch.no_grad():
-        for _ in range(300):
+        for _ in range(700):
             qpos, qvel = step(qpos, qvel)
     assert qvel.abs().max() < 0.05
     lowest = real_cube.clearances(qpos).amin(-1)
-    assert lowest.max() < 1e-4 and lowest.min() > -0.002
+    # the softened spring, see `PenaltyStep.forward`, lets it sink deeper than its own
+    assert lowest.max() < 1e-4 and lowest.min() > -0.003
 
 
 def test_parameters_are_taken_over(real_cube, generator):

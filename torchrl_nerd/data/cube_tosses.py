@@ -110,10 +110,10 @@ class Tosses:
     def starts(self, length: int, tosses: Tensor | None = None) -> Tensor:
         """Row of the first of every ``length`` consecutive states, ``(windows,)``."""
         which = range(len(self)) if tosses is None else tosses.tolist()
-        found = [
-            torch.arange(int(self.offsets[i]), int(self.offsets[i + 1]) - length + 1)
-            for i in which
-        ]
+        found = []
+        for i in which:
+            first, end = int(self.offsets[i]), int(self.offsets[i + 1])
+            found.append(torch.arange(first, max(first, end - length + 1)))
         return torch.cat(found) if found else torch.zeros(0, dtype=torch.long)
 
     def toss_of(self, rows: Tensor) -> Tensor:

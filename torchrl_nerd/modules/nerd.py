@@ -69,8 +69,8 @@ class Network(Protocol):
 class Config(Protocol):
     """Size of a network, which it can build."""
 
-    def build(self, num_inputs: int, num_outputs: int) -> nn.Module:
-        """A freshly initialised network."""
+    def build(self, num_inputs: int, num_outputs: int) -> Any:
+        """A freshly initialised module that is a `Network`."""
         ...
 
 

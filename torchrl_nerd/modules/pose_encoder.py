@@ -59,7 +59,9 @@ class PoseEncoder(nn.Module):
         """``(rows, poses, 7)`` to the state at the last pose, ``(rows, 7), (rows, 6)``."""
         last = window[:, -1]
         quat = last[:, 3:7]
-        back = differentiate_pos(self.layout, last[:, None], window[:, :-1])
+        before = window[:, :-1]
+        here = last[:, None].expand_as(before)
+        back = differentiate_pos(self.layout, here, before)
         speeds = -back / self.lags[:, None]  # mean velocities up to the last pose
         linear = rotate_inverse(quat[:, None], speeds[..., :3])
         speeds = torch.cat((linear, speeds[..., 3:]), -1)
