@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_nerd.data.generate import as_transitions
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.policy_transfer import Actor
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 

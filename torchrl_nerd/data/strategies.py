@@ -10,7 +10,7 @@ from torch import Generator
 from torchrl_nerd.data.generate import Draw, simulate
 from torchrl_nerd.data.policy_data import policy_data
 from torchrl_nerd.data.starts import Fallen, Standing
-from torchrl_nerd.evaluation.policy_transfer import Actor
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 

@@ -4,7 +4,7 @@ Protocol of the paper's table 1: whole episodes from the task's reset distributi
 policy's mean action, the undiscounted sum of rewards; gap = (learned - true) / true.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +14,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_nerd.envs import make_env
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
-
-Actor = Callable[[TensorDictBase], TensorDictBase]
-"""Any TorchRL policy: reads ``observation``, writes ``action``."""
 
 TRUTH = "mujoco"
 NORMAL_95 = 1.96  # half width of a 95% interval, in standard errors
