@@ -24,8 +24,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     Source,
     action_drive,
     initial_states,
-    open_loop,
-    position_errors,
+    open_loop_errors,
     scene_of,
 )
 from torchrl_nerd.files import write_json
@@ -71,11 +70,8 @@ def error_curves(
     """Mean error over rows at every step, ``(steps,)``."""
     scene = scene_of(source)
     drive = action_drive(source, len(start), steps, 0, random)
-    paths = [
-        open_loop(dynamics, start, steps, drive)
-        for dynamics in (MujocoDynamics(scene), learned)
-    ]
-    return {k: e.mean(0) for k, e in position_errors(scene, *paths).items()}
+    errors = open_loop_errors(MujocoDynamics(scene), learned, start, steps, drive)
+    return {name: error.mean(0) for name, error in errors.items()}
 
 
 def main(options: Options) -> dict[str, float]:

@@ -143,6 +143,18 @@ def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, T
     return joints
 
 
+def open_loop_errors(
+    truth: Dynamics,
+    learned: Dynamics,
+    start: TensorDict,
+    steps: int,
+    joint_torque: Tensor | Drive | None = None,
+) -> dict[str, Tensor]:
+    """`position_errors` of two rollouts from the same start; see `open_loop`."""
+    paths = [open_loop(d, start, steps, joint_torque) for d in (truth, learned)]
+    return position_errors(truth.scene, *paths)
+
+
 def unit_of(scene: Scene, quantity: str) -> str:
     """M or rad."""
     if quantity == "base_position":
@@ -186,9 +198,7 @@ def passive_errors(
     start, scene = initial_states(source, rows, seed).to(device), scene_of(source)
     steps = max(horizons)
     drive = action_drive(source, rows, steps, seed, random_actions)
-    true_path = open_loop(truth, start, steps, drive)
-    learned_path = open_loop(learned, start, steps, drive)
-    errors = position_errors(scene, true_path, learned_path)
+    errors = open_loop_errors(truth, learned, start, steps, drive)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
         for horizon in horizons
