@@ -9,11 +9,9 @@ from helpers import (
     HANDMADE,
     every_scene,
     make_scene,
-    random_states,
     random_transitions,
     true_step,
 )
-from tensordict import TensorDict
 
 from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
@@ -142,18 +140,12 @@ def test_heading_matters_where_gravity_leans(rng):
     assert ignored == {"base x", "base y", "base z"}
 
 
-def test_looking_for_symmetries_leaves_the_model_alone(scene, rng):
-    qpos, qvel = random_states(scene.model, 5, rng)
-    torque = torch.zeros(5, len(scene.actuated), dtype=torch.float64)
-    state = TensorDict({QPOS: qpos, QVEL: qvel}, batch_size=[5])
-    if scene.terrain is not None and scene.terrain.is_per_row:
-        state["terrain"] = torch.from_numpy(scene.terrain.default).expand(5, -1)
-    before = true_step(scene, state, torque)
+def test_looking_for_symmetries_leaves_the_model_alone(scene, generator):
+    before = random_transitions(scene, 5, generator)
     flags = int(scene.model.opt.disableflags)
     scene.__dict__.pop("symmetries", None)
     assert scene.symmetries is not None
     assert scene.model.opt.disableflags == flags
     assert not flags & mujoco.mjtDisableBit.mjDSBL_LIMIT
-    assert torch.equal(
-        true_step(scene, state, torque)["next", QVEL], before["next", QVEL]
-    )
+    after = true_step(scene, before, before["next", "joint_torque"])
+    assert torch.equal(after["next", QVEL], before["next", QVEL])
