@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 from torch import Generator, Tensor, nn
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
@@ -20,10 +21,11 @@ from torchrl_nerd.dynamics import (
     NeRDDynamics,
 )
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.modules.nerd import NETWORKS, TARGET, TOKEN, NeRD, SceneTokens
+from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import make_task
-from torchrl_nerd.transforms import StateDelta, Stats
+from torchrl_nerd.training.sequences import cover, data_stats
+from torchrl_nerd.transforms import Stats
 
 LEARNED = ("streaming", "window")
 TRUE = ("mujoco", "dm_control")
@@ -49,21 +51,22 @@ def enliven(network: nn.Module, generator: Generator) -> nn.Module:
 
 
 @cache
-def scene_stats(scene: Scene) -> dict[str, Stats]:
-    """Statistics of a little true motion of the scene."""
+def little_data(scene: Scene) -> TensorDict:
+    """A little true motion of the scene."""
     data = simulate(scene, 64, 4, Generator().manual_seed(0))
-    data = data[is_sound(data)]
-    after = data["next"]
-    terrain = data.get("terrain", None)
-    now = data["qpos"], data["qvel"]
-    tokens = SceneTokens(scene)(*now, after["joint_torque"], terrain)
-    target = StateDelta(scene).delta(*now, after["qpos"], after["qvel"])
-    return {TOKEN: Stats.of(tokens), TARGET: Stats.of(target)}
+    return data[is_sound(data)]
+
+
+def scene_stats(scene: Scene) -> dict[NestedKey, Stats]:
+    """Statistics of it."""
+    return data_stats(scene, little_data(scene))
 
 
 def random_model(scene: Scene, generator: Generator, network: str = "tiny") -> NeRD:
     """A model of the right scale that has learned nothing."""
+    data = little_data(scene)
     model = NeRD(scene, NETWORKS[network], scene_stats(scene))
+    cover(model, data)
     enliven(model.network, generator)
     return model
 

@@ -26,6 +26,7 @@ from torchrl_nerd.scenes import Scene, load_scene
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
 LARGEST_SIZE = 2**14  # of any number in a network's configuration
+COVERAGE = "coverage."
 LFS_POINTER = b"version https://git-lfs"
 KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
@@ -106,6 +107,9 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
                 f"the network in {folder} cannot be built: {error}"
             ) from None
     tensors = _read_tensors(folder / WEIGHTS)
+    if not any(key.startswith(COVERAGE) for key in tensors):  # weights of before 0.2
+        state = model.state_dict()
+        tensors |= {k: v for k, v in state.items() if k.startswith(COVERAGE)}
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in tensors.items()}
     if expected != found:

@@ -26,7 +26,7 @@ each_precision = pytest.mark.parametrize(
 
 @each_precision
 def test_decode_inverts_the_normalised_target(scene, dtype, tolerance, generator):
-    model = random_model(scene, generator)
+    model = NeRD(scene, NETWORKS["tiny"], scene_stats(scene))
     model.network.to(dtype)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     after = MujocoDynamics(scene).step(state, torques[0], terrain)
@@ -42,7 +42,7 @@ def test_decode_inverts_the_normalised_target(scene, dtype, tolerance, generator
 
 @each_precision
 def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator):
-    model = random_model(scene, generator)
+    model = NeRD(scene, NETWORKS["tiny"], scene_stats(scene))
     model.network.to(dtype)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     token = model.encode(state["qpos"], state["qvel"], torques[0], terrain)

@@ -8,6 +8,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
+from torchrl_nerd.modules.coverage import Coverage
 from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.settings import SettingError
@@ -98,21 +99,33 @@ class NeRD(nn.Module):
         self.normalize = Normalize(
             stats or {TOKEN: unit_stats(num_inputs), TARGET: unit_stats(num_outputs)}
         )
+        self.coverage = Coverage(scene, num_inputs, num_outputs)
         self.network = config.build(num_inputs, num_outputs)
 
     def encode(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
     ) -> Tensor:
-        """Normalised float32 tokens ``(*batch, F)`` of float64 states and torques."""
+        """Normalised float32 tokens ``(*batch, F)`` of float64 states and torques.
+
+        What lies outside the training data is taken to their border, see `Coverage`.
+        """
+        token = self.features(qpos, qvel, joint_torque, terrain)
+        return self.coverage.clamp_token(token).to(self.dtype)
+
+    def features(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Tensor:
+        """Normalised tokens ``(*batch, F)`` as they are, float64."""
         raw = self.tokens(qpos, qvel, joint_torque, terrain)
-        return self.normalize.normalize(TOKEN, raw).to(self.dtype)
+        return self.normalize.normalize(TOKEN, raw)
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Next ``qpos`` and ``qvel`` from the network's normalised output."""
-        delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
-        return self.state_delta.integrate(qpos, qvel, delta)
+        change = self.coverage.clamp_target(output.to(qpos.dtype))
+        delta = self.normalize.denormalize(TARGET, change)
+        return self.state_delta.integrate(qpos, qvel, delta, self.coverage.limit_speed)
 
     def over(self, scene: Scene) -> "NeRD":
         """The same weights for the same robot over another ground.
@@ -139,7 +152,7 @@ class NeRD(nn.Module):
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
         """Move everything, but cast the network alone: constants stay float64."""
-        for part in (self.tokens, self.state_delta, self.normalize):
+        for part in (self.tokens, self.state_delta, self.normalize, self.coverage):
             for module in part.modules():
                 for name, buffer in module._buffers.items():
                     if buffer is not None:

@@ -106,6 +106,13 @@ class ResidualNeRD(NeRD):
         change = self.normalize.normalize(TARGET, change)
         return torch.cat((token, change.to(token.dtype), gate.to(token.dtype)), -1)
 
+    def decode(
+        self, qpos: Tensor, qvel: Tensor, output: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """As `NeRD`, but unbounded: the simulator knows what lies beyond the data."""
+        delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
+        return self.state_delta.integrate(qpos, qvel, delta)
+
     def _contact(self, qpos: Tensor, change: Tensor) -> Tensor:
         """Share of contact in the simulator's change, ``(*batch, 1)``."""
         gravity = self.simulator.scaled()[0].detach()

@@ -84,12 +84,7 @@ class Sequences:
         device: torch.device,
         symmetry: Symmetry | None = None,
     ) -> None:
-        tokens, targets = [], []
-        for part in data.split(PART):
-            token, target = raw_tokens(model.tokens, model.state_delta, part)
-            tokens.append(model.normalize.normalize(TOKEN, token).float())
-            targets.append(model.normalize.normalize(TARGET, target).float())
-        self.tokens, self.targets = (torch.cat(x).to(device) for x in (tokens, targets))
+        self.tokens, self.targets = (x.to(device) for x in normalised(model, data))
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
         self.steps = data.batch_size[1]
@@ -156,3 +151,24 @@ def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
             merged = merged.merge(other)
         stats[key] = merged
     return stats
+
+
+def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
+    """Tokens and targets of transitions, normalised, ``(trajectories, steps, D)``."""
+    tokens, targets = [], []
+    for part in data.split(PART):
+        token, target = raw_tokens(model.tokens, model.state_delta, part)
+        tokens.append(model.normalize.normalize(TOKEN, token).float())
+        targets.append(model.normalize.normalize(TARGET, target).float())
+    return torch.cat(tokens), torch.cat(targets)
+
+
+def cover(model: NeRD, data: TensorDict) -> None:
+    """Tell a model what it learns from, for its bounds and its trust.
+
+    Args:
+        model: whose `Coverage` is filled.
+        data: transitions, ``[trajectories, steps]``.
+    """
+    flat = (x.flatten(0, -2) for x in normalised(model, data))
+    model.coverage.fit(*flat, data[NEXT_QVEL].flatten(0, -2))

@@ -11,6 +11,7 @@ from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.cube import HALF
 from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
+from torchrl_nerd.training.sequences import cover
 from torchrl_nerd.training.simulated_tosses import simulate_tosses
 from torchrl_nerd.transforms import StateDelta, Stats
 
@@ -45,6 +46,7 @@ def pretrain(
     tosses = simulate_tosses(scene, CUBES, TOSSES, STATES, config.seed)
     torch.manual_seed(config.seed)
     model = ResidualNeRD(scene, ResidualConfig(), toss_stats(scene, tosses))
+    cover(model, tosses.transitions())
     published = {**PUBLISHED, "inertia": 1.0, "size": PUBLISHED["size"] / HALF}
     model.simulator.set_values(published)
     number = torch.arange(len(tosses))
@@ -65,5 +67,8 @@ def from_scratch(scene: Scene, tosses: Tosses, network: str, seed: int) -> NeRD:
     torch.manual_seed(seed)
     stats = toss_stats(scene, tosses)
     if network == "residual":
-        return ResidualNeRD(scene, ResidualConfig(), stats)
-    return NeRD(scene, network_config(network), stats)
+        model: NeRD = ResidualNeRD(scene, ResidualConfig(), stats)
+    else:
+        model = NeRD(scene, network_config(network), stats)
+    cover(model, tosses.transitions())
+    return model

@@ -19,6 +19,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     passive_errors,
 )
 from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.keys import NEXT_QVEL
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
@@ -146,6 +147,10 @@ class Trainer:
             stats = symmetry.complete(stats)
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
+        flat = (
+            x.flatten(0, -2) for x in (self.sequences.tokens, self.sequences.targets)
+        )
+        model.coverage.to(self.device).fit(*flat, data[NEXT_QVEL].flatten(0, -2))
         self.model = model.to(self.device)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {

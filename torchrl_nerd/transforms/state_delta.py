@@ -75,13 +75,25 @@ class StateDelta(Transform):
         return torch.cat((change, residual), -1)
 
     def integrate(
-        self, qpos: Tensor, qvel: Tensor, delta: Tensor
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        delta: Tensor,
+        limit: Callable[[Tensor], Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """The next ``qpos`` and ``qvel``: exact inverse of `delta`."""
+        """The next ``qpos`` and ``qvel``: exact inverse of `delta`.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+            delta: ``(*batch, 2 nv)``.
+            limit: what keeps the next velocities ``(*batch, nv)`` within bounds, and the
+                positions with them.
+        """
         change, residual = delta.split(self.layout.nv, -1)
         if self.base.is_floating:
             change, residual = (self._turn(qpos, x, rotate) for x in (change, residual))
-        after = qvel + change
+        after = qvel + change if limit is None else limit(qvel + change)
         moved = 0.5 * self.step_size * (qvel + after) + residual
         for _, v in self.layout.rotations:
             turn = quat_exp(moved[..., v : v + 3])

@@ -1,0 +1,82 @@
+"""Inside the training data nothing is touched; outside everything stays bounded."""
+
+import torch
+from dynamics_helpers import LEARNED, little_data, random_drive, random_model
+from safetensors.torch import load_file, save_file
+
+from torchrl_nerd.checkpoint import WEIGHTS, load_checkpoint, make_card, save_checkpoint
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.training.sequences import normalised
+
+ROWS = 16
+
+
+def test_training_data_are_left_as_they_are(scene, generator):
+    model, data = random_model(scene, generator), little_data(scene)
+    tokens, targets = normalised(model, data)
+    assert torch.equal(model.coverage.clamp_token(tokens), tokens)
+    assert torch.equal(model.coverage.clamp_target(targets), targets)
+    qvel = data["next", "qvel"]
+    assert torch.equal(model.coverage.limit_speed(qvel), qvel)
+
+
+def test_one_training_state_in_a_hundred_is_called_unfamiliar(scene, generator):
+    model = random_model(scene, generator)
+    tokens, _ = normalised(model, little_data(scene))
+    share = (model.coverage.distance(tokens.flatten(0, -2)) > 1.0).double().mean()
+    assert 0.005 < share < 0.015
+
+
+def test_whatever_comes_in_speeds_stay_bounded(scene, generator):
+    model = random_model(scene, generator)
+    state, torques, terrain = random_drive(scene, ROWS, 20, generator)
+    wild = 10.0 ** (6.0 * torch.rand(ROWS, 1, generator=generator).double())
+    state["qvel"] = wild * state["qvel"]
+    limit = model.coverage.speed * (1.0 + 1e-9)
+    for inference in LEARNED:
+        dynamics, now = NeRDDynamics(model, inference), state
+        for torque in wild * torques:
+            now = dynamics.step(now, torque, terrain)
+            assert now["qpos"].isfinite().all()
+            assert (model.coverage._sizes(now["qvel"]) <= limit).all()
+
+
+def test_beyond_the_box_is_beyond_trust(scene, generator):
+    model = random_model(scene, generator)
+    coverage = model.coverage
+    tokens, _ = normalised(model, little_data(scene))
+    tokens = tokens.flatten(0, -2)[:ROWS].double()
+    entry = torch.randint(tokens.shape[-1], (ROWS,), generator=generator)
+    step = 1e-6 + torch.rand(ROWS, generator=generator).double()
+    rows = torch.arange(ROWS)
+    tokens[rows, entry] = coverage.token_high[entry] + step
+    assert (coverage.distance(tokens) > 1.0).all()
+    assert torch.equal(
+        coverage.clamp_token(tokens)[rows, entry], coverage.token_high[entry]
+    )
+
+
+def test_gradients_are_finite_at_rest(scene, generator):
+    model = random_model(scene, generator)
+    state, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    qvel = torch.zeros_like(state["qvel"]).requires_grad_()
+    token = model.encode(state["qpos"], qvel, torques[0], terrain)
+    output = model.network.step(token, model.network.empty_memory(ROWS))
+    _, after = model.decode(state["qpos"], qvel, output)
+    after.square().sum().backward()
+    assert qvel.grad is not None and qvel.grad.isfinite().all()
+
+
+def test_weights_of_before_it_load_and_are_bounded_by_nothing(
+    scene, generator, tmp_path
+):
+    model = random_model(scene, generator)
+    save_checkpoint(model, tmp_path, make_card(model))
+    assert load_checkpoint(tmp_path, scene).coverage.is_fitted
+    tensors = load_file(tmp_path / WEIGHTS)
+    old = {k: v for k, v in tensors.items() if not k.startswith("coverage.")}
+    save_file(old, tmp_path / WEIGHTS)
+    loaded = load_checkpoint(tmp_path, scene).coverage
+    assert not loaded.is_fitted
+    wild = 1e9 * torch.randn(ROWS, loaded.token_low.numel(), generator=generator)
+    assert torch.equal(loaded.clamp_token(wild.double()), wild.double())

@@ -1,0 +1,129 @@
+"""What a model has seen in training: bounds on its outputs, and trust in its inputs.
+
+A network says something of any input, far from its training data too. Here inputs are
+taken back to the box that the data filled, changes of the state stay within the largest
+ones seen, and speeds within twice the largest: nothing inside the box is touched, and
+whatever is outside stays finite and bounded. How far an input lies outside is a number
+that can be looked at, see `Coverage.distance`.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.scenes.scene import Scene
+
+MARGIN = 0.1  # of a range's width, on either side
+SPEED_MARGIN = 2.0  # times the largest speed in the data
+UNLIMITED = 1e300  # m/s and rad/s: finite, so that a share of it is a number
+RIDGE = 1e-3  # variance added to every normalised feature before the inverse
+QUANTILE = 0.99  # of training inputs that are called familiar
+LARGEST_SAMPLE = 200_000  # tokens for covariance and quantile
+
+
+class Coverage(nn.Module):
+    """Box and spread of the training data; bounds nothing until `fit` has seen some.
+
+    Args:
+        scene: the robot.
+        num_inputs: width of normalised tokens.
+        num_outputs: width of normalised targets.
+    """
+
+    token_low: Tensor
+    token_high: Tensor
+    target_low: Tensor
+    target_high: Tensor
+    speed: Tensor
+    center: Tensor
+    whitening: Tensor
+    reach: Tensor
+
+    def __init__(self, scene: Scene, num_inputs: int, num_outputs: int) -> None:
+        super().__init__()
+        self.vectors = _vectors(scene)
+        one = torch.ones((), dtype=torch.float64)
+        for name, size in (("token", num_inputs), ("target", num_outputs)):
+            self.register_buffer(f"{name}_low", one.new_full((size,), -UNLIMITED))
+            self.register_buffer(f"{name}_high", one.new_full((size,), UNLIMITED))
+        self.register_buffer("speed", one.new_full((scene.model.nv,), UNLIMITED))
+        self.register_buffer("center", one.new_zeros(num_inputs))
+        self.register_buffer("whitening", one.new_zeros(num_inputs, num_inputs))
+        self.register_buffer("reach", one)
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the model knows what it was trained on."""
+        return bool((self.token_high < UNLIMITED).all())
+
+    @torch.no_grad()
+    def fit(self, tokens: Tensor, targets: Tensor, qvel: Tensor) -> None:
+        """Take in a data set, in place of any before.
+
+        Args:
+            tokens: normalised, ``(samples, F)``.
+            targets: normalised, ``(samples, D)``.
+            qvel: ``(samples, nv)``.
+        """
+        for name, x in (("token", tokens), ("target", targets)):
+            low, high = x.amin(0), x.amax(0)
+            margin = MARGIN * (high - low)
+            getattr(self, f"{name}_low").copy_(low - margin)
+            getattr(self, f"{name}_high").copy_(high + margin)
+        self.speed.copy_(SPEED_MARGIN * self._sizes(qvel).amax(0))
+        some = tokens[:: max(1, len(tokens) // LARGEST_SAMPLE)].double()
+        center = some.mean(0)
+        spread = (some - center).T @ (some - center) / len(some)
+        ridge = RIDGE * torch.eye(len(center), dtype=some.dtype, device=some.device)
+        values, axes = torch.linalg.eigh(spread + ridge)
+        self.center.copy_(center)
+        self.whitening.copy_((axes / values.sqrt()).T)
+        length = self.mahalanobis(some.to(tokens.dtype))
+        kept = length[:: max(1, len(length) // LARGEST_SAMPLE)]
+        self.reach.copy_(torch.quantile(kept, QUANTILE))
+
+    def clamp_token(self, token: Tensor) -> Tensor:
+        """Normalised tokens ``(*batch, F)``, each entry within the box; NaN stays."""
+        return token.clamp(self.token_low, self.token_high)
+
+    def clamp_target(self, target: Tensor) -> Tensor:
+        """Normalised changes of the state ``(*batch, D)`` within the box."""
+        return target.clamp(self.target_low, self.target_high)
+
+    def limit_speed(self, qvel: Tensor) -> Tensor:
+        """Velocities ``(*batch, nv)``, slowed to the limit where they are beyond it."""
+        return qvel * (self.speed / torch.maximum(self._sizes(qvel), self.speed))
+
+    def mahalanobis(self, token: Tensor) -> Tensor:
+        """Distance ``(*batch,)`` from the mean token in units of the data's spread."""
+        return torch.linalg.vector_norm(
+            (token - self.center) @ self.whitening.T, dim=-1
+        )
+
+    def excess(self, token: Tensor) -> Tensor:
+        """How far outside the box the farthest entry lies, in widths ``(*batch,)``."""
+        low, high = self.token_low, self.token_high
+        outside = torch.maximum(low - token, token - high).clamp(min=0.0)
+        return (outside / (high - low).clamp(min=RIDGE)).amax(-1)
+
+    def distance(self, token: Tensor) -> Tensor:
+        """How unfamiliar a token is ``(*batch,)``: up to 1 for 99% of training's.
+
+        Always above 1 outside the box. Chosen among the two parts and this sum of them:
+        it best predicts large one-step errors, see docs/stability.md.
+        """
+        spread, excess = self.mahalanobis(token) / self.reach, self.excess(token)
+        return torch.where(excess > 0.0, 1.0 + spread + excess.sqrt(), spread)
+
+    def _sizes(self, qvel: Tensor) -> Tensor:
+        """Magnitude of each velocity, of whole vectors for free and ball joints."""
+        sizes = qvel.abs()
+        for start in self.vectors:
+            norm = torch.linalg.vector_norm(qvel[..., start : start + 3], dim=-1)
+            sizes[..., start : start + 3] = norm[..., None]
+        return sizes
+
+
+def _vectors(scene: Scene) -> tuple[int, ...]:
+    """Where in ``qvel`` the three numbers of a vector begin."""
+    linear = [scene.base.dof_address] if scene.base.is_floating else []
+    return (*linear, *(v for _, v in scene.layout.rotations))
