@@ -61,3 +61,11 @@ margin. Only where it does not follow from gravity."""
 
 STATE_DELTA = "state_delta"
 """Change of the state over one control step in B_t ``(*batch, 2 nv)``; see StateDelta."""
+
+TRUST = "trust"
+"""How familiar the last step's input was to the model ``(*batch, 1)``, float32, in [0, 1];
+1: as 99% of its training data. Only in envs with a guard, see `GuardedDynamics`."""
+
+FAULT = "fault"
+"""Why a row ended that should not have ``(*batch, 1)``, int64, see `envs.faults`; 0: no
+fault."""

@@ -2,7 +2,15 @@
 
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.dynamics.dm_control import DMControlDynamics
+from torchrl_nerd.dynamics.guarded import GuardedDynamics, UntrustedError
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.dynamics.nerd import NeRDDynamics
 
-__all__ = ["DMControlDynamics", "Dynamics", "MujocoDynamics", "NeRDDynamics"]
+__all__ = [
+    "DMControlDynamics",
+    "Dynamics",
+    "GuardedDynamics",
+    "MujocoDynamics",
+    "NeRDDynamics",
+    "UntrustedError",
+]

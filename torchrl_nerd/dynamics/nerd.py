@@ -81,6 +81,20 @@ class NeRDDynamics:
         terrain: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`."""
+        return self.scored_step(state, joint_torque, terrain, is_scored=False)[0]
+
+    def scored_step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        is_scored: bool = True,
+    ) -> tuple[TensorDictBase, Tensor | None]:
+        """`step`, and how unfamiliar its input was, see `Coverage.distance`.
+
+        Returns:
+            The next state, and the distance ``(num_envs,)`` where it was asked for.
+        """
         check_step(self.scene, state, joint_torque, terrain)
         qpos, qvel = state[QPOS], state[QVEL]
         if self._memory is None or self._rows != len(qpos):
@@ -88,14 +102,15 @@ class NeRDDynamics:
             self._memory = self.network.empty_memory(self._rows)
         predict = self._run_compiled if self.compile else self._predict
         with torch.set_grad_enabled(self.differentiable):
-            next_qpos, next_qvel = predict(
-                qpos, qvel, joint_torque.to(qpos), terrain, self._memory
+            next_qpos, next_qvel, distance = predict(
+                qpos, qvel, joint_torque.to(qpos), terrain, self._memory, is_scored
             )
-        return TensorDict(
+        after = TensorDict(
             {QPOS: next_qpos, QVEL: next_qvel},
             batch_size=state.batch_size,
             device=state.device,
         )
+        return after, distance
 
     def _predict(
         self,
@@ -104,13 +119,18 @@ class NeRDDynamics:
         torque: Tensor,
         terrain: Tensor | None,
         memory: Memory,
-    ) -> tuple[Tensor, Tensor]:
-        """Next ``qpos`` and ``qvel``; advances ``memory``."""
-        token = self.model.encode(qpos, qvel, torque, terrain)
+        is_scored: bool,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Next ``qpos`` and ``qvel``, the input's distance; advances ``memory``."""
+        features = self.model.features(qpos, qvel, torque, terrain)
+        token = self.model.assemble(features, qpos, qvel)
         output = self.network.step(token, memory)
-        return self.model.decode(qpos, qvel, output)
+        distance = self.model.coverage.distance(features) if is_scored else None
+        return *self.model.decode(qpos, qvel, output), distance
 
-    def _run_compiled(self, *inputs: Tensor | Memory | None) -> tuple[Tensor, Tensor]:
+    def _run_compiled(
+        self, *inputs: Tensor | Memory | None | bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """`_predict` through the compiler; eager for good where there is none."""
         if self._compiled is None:
             self._compiled = torch.compile(self._predict)

@@ -1,16 +1,18 @@
 """A scene, a task and a dynamics joined into a batched TorchRL env."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_nerd.dynamics import Dynamics
+from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
+from torchrl_nerd.envs.faults import REASONS, FaultRecorder, find_faults
 from torchrl_nerd.envs.streams import row_uniforms
-from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, QPOS, QVEL, TERRAIN, TRUST
 from torchrl_nerd.tasks import Task
 
 MAX_SEED = 2**63
@@ -22,11 +24,13 @@ class SceneEnv(EnvBase):
     Per row: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
     the control step that led here (zero after a reset); where a task holds an action over
-    several control steps, over the last of them. A row whose action, state or next
-    state is not finite keeps its last state and ends as ``terminated``; no other row
-    notices. Random numbers are each row's own, so a row's episodes do not depend on how
-    many rows there are. ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel``
-    and parameters in ``td``.
+    several control steps, over the last of them. Random numbers are each row's own, so a
+    row's episodes do not depend on how many rows there are. ``reset(td, set_state=True)``
+    starts from the ``qpos``, ``qvel`` and parameters in ``td``.
+
+    A row whose action or next state is not finite, or that runs away, keeps its last state
+    and ends as ``terminated``; no other row notices. ``fault`` says why, see
+    `envs.faults`. With `GuardedDynamics` ``trust`` says how far a step may be believed.
 
     Args:
         task: reset distribution, observation, reward, end.
@@ -34,9 +38,11 @@ class SceneEnv(EnvBase):
         num_envs: rows.
         seed: of the resets.
         device: where states, observations and rewards live.
+        fault_folder: where faults leave dumps for `nerd replay`; none are written without.
 
     Raises:
-        ValueError: no rows, or a dynamics of another scene.
+        ValueError: no rows, a dynamics of another scene, or a folder that cannot be
+            written.
     """
 
     _supports_set_state = True
@@ -50,6 +56,7 @@ class SceneEnv(EnvBase):
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        fault_folder: Path | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"expected num_envs of at least 1, got {num_envs}")
@@ -60,6 +67,13 @@ class SceneEnv(EnvBase):
             )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
+        is_guarded = isinstance(dynamics, GuardedDynamics)
+        self.guard = dynamics.guard if is_guarded else None
+        self._least_trust = dynamics.least_trust if is_guarded else 0.0
+        self.recorder: FaultRecorder | None = None
+        if fault_folder is not None:
+            name = type(dynamics).__name__
+            self.recorder = FaultRecorder(fault_folder, self.scene.name, name)
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self.register_buffer("_episode", zeros)
@@ -77,12 +91,18 @@ class SceneEnv(EnvBase):
     def _make_specs(self) -> None:
         rows, device = self.batch_size, self.device
         sizes = {**self._state_sizes, "joint_torque": len(self.scene.actuated)}
-        state = {
+        state: dict[str, TensorSpec] = {
             key: Unbounded(
                 torch.Size((*rows, size)), dtype=torch.float64, device=device
             )
             for key, size in sizes.items()
         }
+        column = torch.Size((*rows, 1))
+        if self.guard:
+            state[TRUST] = Bounded(0.0, 1.0, column, dtype=torch.float32, device=device)
+        state[FAULT] = Categorical(
+            len(REASONS), shape=column, dtype=torch.int64, device=device
+        )
         width = self.task.observation_size
         state[OBSERVATION] = Unbounded(
             torch.Size((*rows, width)), dtype=torch.float32, device=device
@@ -96,7 +116,6 @@ class SceneEnv(EnvBase):
             dtype=torch.float32,
             device=device,
         )
-        column = torch.Size((*rows, 1))
         self.reward_spec = Unbounded(column, dtype=torch.float32, device=device)
         flags = {
             name: Categorical(2, shape=column, dtype=torch.bool, device=device)
@@ -152,7 +171,8 @@ class SceneEnv(EnvBase):
         state = self._state()
         self.dynamics.reset(state, rows)
         torque = state.get(QPOS).new_zeros(*self.batch_size, len(self.scene.actuated))
-        return self._output(state, torque)
+        trust = torch.ones(*self.batch_size, 1, device=self.device)
+        return self._output(state, torque, torch.zeros_like(trust).long(), trust)
 
     def _given_state(
         self, tensordict: TensorDictBase | None, rows: Tensor
@@ -185,23 +205,27 @@ class SceneEnv(EnvBase):
                 f"got {tuple(action.shape)}"
             )
         state = self._state()
-        is_fine = torch.all(action.isfinite(), -1, keepdim=True)
-        action = torch.where(is_fine, action, 0.0)
-        moved, torque = self._control_step(state, action, state)
+        given = torch.where(torch.all(action.isfinite(), -1, keepdim=True), action, 0.0)
+        moved, torque = self._control_step(state, given, state)
+        trust = moved.get(TRUST, None)
         for _ in range(self.task.steps_per_action - 1):
-            moved, torque = self._control_step(moved, action, state)
-        for key in (QPOS, QVEL):
-            is_fine = is_fine & torch.all(moved[key].isfinite(), -1, keepdim=True)
+            moved, torque = self._control_step(moved, given, state)
+            trust = None if trust is None else torch.minimum(trust, moved[TRUST])
+        fault = find_faults(action, moved)
+        if self.recorder is not None:
+            self.recorder.record(state, action, torque, fault)
         next_values = {
-            key: torch.where(is_fine, moved[key], state[key]) for key in (QPOS, QVEL)
+            key: torch.where(fault == 0, moved[key], state[key]) for key in (QPOS, QVEL)
         }
         self._set(next_values)
         self._age = self._age + 1
         next_state = self._state()
-        reward = self.task.reward(state, action, next_state)
-        terminated = self.task.terminated(next_state)[:, None] | ~is_fine
+        reward = self.task.reward(state, given, next_state)
+        terminated = self.task.terminated(next_state)[:, None] | (fault > 0)
         truncated = (self._age >= self.task.horizon)[:, None]
-        return self._output(next_state, torque).update(
+        if self.guard == "truncate" and trust is not None:
+            truncated = truncated | (trust < self._least_trust)
+        return self._output(next_state, torque, fault, trust).update(
             {
                 "reward": reward[:, None].to(torch.float32),
                 "done": terminated | truncated,
@@ -217,9 +241,14 @@ class SceneEnv(EnvBase):
         torque = self.task.controller(action, moving[QPOS], moving[QVEL])
         return self.dynamics.step(moving, torque, row.get(TERRAIN, None)), torque
 
-    def _output(self, state: TensorDict, torque: Tensor) -> TensorDict:
+    def _output(
+        self, state: TensorDict, torque: Tensor, fault: Tensor, trust: Tensor | None
+    ) -> TensorDict:
         """A tensordict that shares no memory with the env."""
         values = {key: value.clone() for key, value in state.items()}
+        values[FAULT] = fault
+        if self.guard and trust is not None:
+            values[TRUST] = trust
         values[OBSERVATION] = self.task.observation(state).to(torch.float32)
         values["joint_torque"] = torque
         return TensorDict._new_unsafe(

@@ -1,5 +1,6 @@
 """A task in true dynamics."""
 
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -20,6 +21,7 @@ class GroundTruthEnv(SceneEnv):
         num_envs: rows.
         seed: of the resets.
         device: where states, observations and rewards live; the physics runs on the CPU.
+        fault_folder: see `SceneEnv`.
 
     Raises:
         ValueError: an unknown engine.
@@ -37,6 +39,7 @@ class GroundTruthEnv(SceneEnv):
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        fault_folder: Path | None = None,
     ) -> None:
         engines = {"mujoco": MujocoDynamics, "dm_control": DMControlDynamics}
         if engine not in engines:
@@ -44,4 +47,5 @@ class GroundTruthEnv(SceneEnv):
                 f"unknown engine '{engine}', expected one of {', '.join(engines)}"
             )
         task = make_task(task) if isinstance(task, str) else task
-        super().__init__(task, engines[engine](task.scene), num_envs, seed, device)
+        dynamics = engines[engine](task.scene)
+        super().__init__(task, dynamics, num_envs, seed, device, fault_folder)

@@ -1,11 +1,13 @@
 """One argument switches between learned and true dynamics."""
 
 from pathlib import Path
+from typing import cast
 
 import torch
 
+from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.ground_truth import GroundTruthEnv
+from torchrl_nerd.envs.ground_truth import Engine, GroundTruthEnv
 from torchrl_nerd.envs.nerd import NeRDEnv
 from torchrl_nerd.tasks import Task
 
@@ -18,6 +20,8 @@ def make_env(
     num_envs: int = 1,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    guard: Guard | None = None,
+    fault_folder: Path | None = None,
 ) -> SceneEnv:
     """A batched env of a task in the dynamics of your choice.
 
@@ -28,17 +32,21 @@ def make_env(
         num_envs: rows.
         seed: of the resets.
         device: where all tensors live.
+        guard: what to do with steps that the model was not trained for, see
+            `GuardedDynamics`; true dynamics have nothing to guard against.
+        fault_folder: where the first fault of each kind leaves a dump for `nerd replay`.
 
     Raises:
         ValueError: unknown task or dynamics, named in one sentence.
     """
     if dynamics in GROUND_TRUTH:
-        return GroundTruthEnv(task, str(dynamics), num_envs, seed, device)  # pyright: ignore
-    if dynamics == "nerd":
-        return NeRDEnv(task, None, num_envs, seed, device)
-    if not Path(dynamics).is_dir():
+        engine = cast(Engine, dynamics)
+        return GroundTruthEnv(task, engine, num_envs, seed, device, fault_folder)
+    model = None if dynamics == "nerd" else dynamics
+    if model is not None and not Path(model).is_dir():
         raise ValueError(
             f"unknown dynamics '{dynamics}', expected nerd, "
             f"{', '.join(GROUND_TRUTH)} or a checkpoint folder"
         )
-    return NeRDEnv(task, dynamics, num_envs, seed, device)
+    more = {"guard": guard, "fault_folder": fault_folder}
+    return NeRDEnv(task, model, num_envs, seed, device, **more)

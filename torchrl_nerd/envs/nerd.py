@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.dynamics.guarded import Guard, GuardedDynamics
 from torchrl_nerd.dynamics.nerd import Inference, NeRDDynamics
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.modules.nerd import NeRD
@@ -22,6 +23,9 @@ class NeRDEnv(SceneEnv):
         device: where the model and all tensors live.
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
         compile: run through `torch.compile`.
+        guard: what to do with steps far from the training data, see `GuardedDynamics`;
+            None steps all alike.
+        fault_folder: see `SceneEnv`.
 
     Examples:
         >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
@@ -38,9 +42,12 @@ class NeRDEnv(SceneEnv):
         device: torch.device | str = "cpu",
         inference: Inference = "streaming",
         compile: bool = False,
+        guard: Guard | None = None,
+        fault_folder: Path | None = None,
     ) -> None:
         task = make_task(task) if isinstance(task, str) else task
         if not isinstance(model, NeRD):
             model = from_pretrained(model or task.scene.name, task.scene)
-        dynamics = NeRDDynamics(model.to(device), inference=inference, compile=compile)
-        super().__init__(task, dynamics, num_envs, seed, device)
+        learned = NeRDDynamics(model.to(device), inference=inference, compile=compile)
+        dynamics = learned if guard is None else GuardedDynamics(learned, guard)
+        super().__init__(task, dynamics, num_envs, seed, device, fault_folder)

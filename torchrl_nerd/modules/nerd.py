@@ -109,15 +109,19 @@ class NeRD(nn.Module):
 
         What lies outside the training data is taken to their border, see `Coverage`.
         """
-        token = self.features(qpos, qvel, joint_torque, terrain)
-        return self.coverage.clamp_token(token).to(self.dtype)
+        features = self.features(qpos, qvel, joint_torque, terrain)
+        return self.assemble(features, qpos, qvel)
 
     def features(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
     ) -> Tensor:
-        """Normalised tokens ``(*batch, F)`` as they are, float64."""
+        """Normalised features ``(*batch, F)`` as they are, float64."""
         raw = self.tokens(qpos, qvel, joint_torque, terrain)
         return self.normalize.normalize(TOKEN, raw)
+
+    def assemble(self, features: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
+        """The network's token, from the `features` of a state."""
+        return self.coverage.clamp_token(features).to(self.dtype)
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor

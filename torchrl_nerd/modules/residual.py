@@ -91,11 +91,9 @@ class ResidualNeRD(NeRD):
         super().__init__(scene, config, stats)
         self.simulator = PenaltyStep(scene, config.substeps)
 
-    def encode(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
-    ) -> Tensor:
+    def assemble(self, features: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Tokens ``(*batch, F + D + 1)``, the simulator's change among them."""
-        token = super().encode(qpos, qvel, joint_torque, terrain)
+        token = super().assemble(features, qpos, qvel)
         flat = qpos.reshape(-1, qpos.shape[-1]), qvel.reshape(-1, qvel.shape[-1])
         after = (
             x.view_as(y)

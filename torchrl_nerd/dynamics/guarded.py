@@ -1,0 +1,91 @@
+"""Learned dynamics that know where they were trained, and what to do elsewhere."""
+
+from typing import Literal, get_args
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.dynamics.mujoco import MujocoDynamics
+from torchrl_nerd.dynamics.nerd import NeRDDynamics
+from torchrl_nerd.keys import QPOS, QVEL, TRUST
+
+Guard = Literal["flag", "truncate", "raise", "fallback"]
+"""What to do with a row that is not trusted: say so under ``trust``; also end its episode
+as ``truncated``; refuse to go on; or let MuJoCo step it."""
+
+
+class UntrustedError(RuntimeError):
+    """An input too far from what the model was trained on."""
+
+
+class GuardedDynamics:
+    """A `NeRDDynamics` whose every step says how far its input may be trusted.
+
+    ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
+    the inverse of `Coverage.distance`: 0.5 is twice as far out. A row that is not finite
+    has trust 0. Rows below ``least_trust`` are untrusted. In ``"fallback"`` MuJoCo steps
+    them for as long as they stay so; the network sees their true states, so that it
+    takes over again with a true history.
+
+    Args:
+        learned: what steps the trusted rows.
+        guard: what to do with the others.
+        least_trust: in (0, 1]; 1 distrusts about one training state in a hundred.
+
+    Raises:
+        ValueError: an unknown guard, a least trust outside (0, 1], or a model that does
+            not know what it was trained on.
+    """
+
+    def __init__(
+        self, learned: NeRDDynamics, guard: Guard = "flag", least_trust: float = 1.0
+    ) -> None:
+        if guard not in get_args(Guard):
+            expected = ", ".join(get_args(Guard))
+            raise ValueError(f"expected a guard of {expected}, got '{guard}'")
+        if not 0.0 < least_trust <= 1.0:
+            raise ValueError(f"expected a least_trust in (0, 1], got {least_trust}")
+        if not learned.model.coverage.is_fitted:
+            raise ValueError(
+                "expected a model that knows what it was trained on, got weights of an "
+                "older version: train or fine-tune it again"
+            )
+        self.scene, self.learned = learned.scene, learned
+        self.guard, self.least_trust = guard, least_trust
+        self.truth = MujocoDynamics(self.scene) if guard == "fallback" else None
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """See `Dynamics.reset`."""
+        self.learned.reset(state, rows)
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`; the next state also holds ``trust (num_envs, 1)``.
+
+        Raises:
+            UntrustedError: with the guard ``"raise"``, naming the rows.
+        """
+        after, distance = self.learned.scored_step(state, joint_torque, terrain)
+        assert distance is not None  # for the type checker: it was asked for
+        trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
+        rows = trust < self.least_trust
+        if rows.any() and self.guard == "raise":
+            worst = float(trust.min())
+            raise UntrustedError(
+                f"expected inputs like those of training, got {int(rows.sum())} of "
+                f"{len(rows)} rows beyond them, first row {int(rows.nonzero()[0])}, "
+                f"least trust {worst:.2g}"
+            )
+        if self.truth is not None and rows.any():
+            ground = None if terrain is None else terrain[rows]
+            some = state.select(QPOS, QVEL)[rows]
+            self.truth.reset(some)  # no warm start of other rows
+            true = self.truth.step(some, joint_torque[rows], ground)
+            for key in (QPOS, QVEL):
+                after[key] = after[key].index_put((rows,), true[key])
+        return after.set(TRUST, trust[:, None].to(torch.float32))

@@ -1,0 +1,92 @@
+"""What can go wrong in a row, found row by row, and written down to be replayed.
+
+A fault ends its row as ``terminated`` at its last good state and leaves the others bitwise
+as they are. With a folder to write to, the first fault of each kind leaves a dump there:
+the last states, torques, actions and the ground of one such row.
+"""
+
+from collections import deque
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.files import writable_folder, write_atomically
+from torchrl_nerd.keys import QPOS, QVEL
+
+REASONS = ("none", "action", "diverged", "runaway")
+"""Meaning of ``fault``: no fault; an action that is not finite; a next state that is not;
+one that is faster than `LARGEST_SPEED` or farther away than `FARTHEST`."""
+
+LARGEST_SPEED = 1e4  # m/s and rad/s
+FARTHEST = 1e9  # m and rad
+HISTORY = 16  # control steps in a dump
+
+
+def find_faults(action: Tensor, moved: TensorDictBase) -> Tensor:
+    """The reason of each row's fault, an index of `REASONS`.
+
+    Args:
+        action: ``(num_envs, num_actions)``.
+        moved: next ``qpos (num_envs, nq)`` and ``qvel (num_envs, nv)``.
+
+    Returns:
+        ``(num_envs, 1)``, int64.
+    """
+    qpos, qvel = moved[QPOS], moved[QVEL]
+    is_fast, is_far = qvel.abs() > LARGEST_SPEED, qpos.abs() > FARTHEST
+    runs = torch.any(is_fast, -1) | torch.any(is_far, -1)
+    is_finite = torch.all(qpos.isfinite(), -1) & torch.all(qvel.isfinite(), -1)
+    fault = torch.where(is_finite, 3 * runs.long(), 2)
+    return torch.where(torch.all(action.isfinite(), -1), fault, 1)[:, None]
+
+
+class FaultRecorder:
+    """Dumps of the first fault of every kind, in safetensors files named by it.
+
+    Args:
+        folder: where; made if it is not there.
+        scene: name of the robot, for the replay.
+        dynamics: name of what stepped it.
+
+    Raises:
+        ValueError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, scene: str, dynamics: str) -> None:
+        self.folder = writable_folder(folder)
+        self.about = {"scene": scene, "dynamics": dynamics}
+        self._steps: deque[dict[str, Tensor]] = deque(maxlen=HISTORY)
+        self._written: set[int] = set()
+
+    def record(
+        self, state: TensorDictBase, action: Tensor, torque: Tensor, fault: Tensor
+    ) -> list[Path]:
+        """Remember a step; write what it broke for the first time.
+
+        Args:
+            state: before the step, ``[num_envs]``.
+            action: ``(num_envs, num_actions)``, as it was given.
+            torque: ``(num_envs, num_actuated)``.
+            fault: ``(num_envs, 1)`` from `find_faults`.
+        """
+        step = {key: value.detach().cpu().clone() for key, value in state.items()}
+        step |= {"action": action.detach().cpu().clone()}
+        step |= {"joint_torque": torque.detach().cpu().clone()}
+        self._steps.append(step)
+        found = []
+        for kind in fault.unique().tolist():
+            if kind and kind not in self._written:
+                self._written.add(kind)
+                found.append(self._write(kind, int((fault == kind).nonzero()[0, 0])))
+        return found
+
+    def _write(self, kind: int, row: int) -> Path:
+        keys = self._steps[0].keys()
+        tensors = {k: torch.stack([s[k][row] for s in self._steps]) for k in keys}
+        about = {**self.about, "reason": REASONS[kind], "row": str(row)}
+        path = self.folder / f"fault_{REASONS[kind]}.safetensors"
+        write_atomically(path, lambda aside: save_file(tensors, aside, about))
+        return path
