@@ -1,4 +1,4 @@
-"""Starts for training beside those of the scene's ranges: standing and fallen robots."""
+"""Starts for training beside those of the scene's ranges: standing, fallen, nudged."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -8,8 +8,10 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.sampling import log_uniform
 from torchrl_nerd.tasks import Task
 
 
@@ -58,3 +60,32 @@ class Fallen:
         is_fine = torch.cat((state[QPOS], state[QVEL]), -1).isfinite().all(-1)[:, None]
         end = {k: torch.where(is_fine, state[k], first[k]) for k in (QPOS, QVEL)}
         return end if terrain is None else end | {TERRAIN: terrain}
+
+
+@dataclass(frozen=True)
+class Nudged:
+    """Robots at rest, pushed a little: what a model must know to come to rest again.
+
+    Without them nothing near rest is in the data but rest itself, and whatever small
+    error a model makes there may grow. Sizes are log-uniform over four decades.
+
+    | field | meaning |
+    |---|---|
+    | ``fallen`` | where they rest |
+    | ``least`` | smallest push as a share of the largest: 1 m/s, 3 rad/s, 1 cm, 0.03 rad |
+    """
+
+    fallen: Fallen
+    least: float = 1e-4
+
+    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+        """See `Starts`."""
+        start, scene = self.fallen(rows, generator), self.fallen.scene
+        size = log_uniform(self.least, 1.0, rows, generator)
+        shape = (2, rows, scene.model.nv)
+        push = size * torch.randn(shape, dtype=torch.float64, generator=generator)
+        unit = torch.full((scene.model.nv,), 3.0, dtype=torch.float64)
+        if scene.base.is_floating:
+            unit[scene.base.dof_address : scene.base.dof_address + 3] = 1.0
+        moved = integrate_pos(scene.layout, start[QPOS], 0.01 * unit * push[0])
+        return start | {QPOS: moved, QVEL: start[QVEL] + unit * push[1]}

@@ -9,7 +9,7 @@ from torch import Generator
 
 from torchrl_nerd.data.generate import Draw, simulate
 from torchrl_nerd.data.policy_data import policy_data
-from torchrl_nerd.data.starts import Fallen, Standing
+from torchrl_nerd.data.starts import Fallen, Nudged, Standing
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
@@ -52,6 +52,7 @@ def strategies(
     | ``scales`` | torque scales log-uniform over two decades |
     | ``correlated`` | torques that keep for one control step to a second |
     | ``starts`` | equal parts of ``shares``, standing and fallen starts |
+    | ``resting`` | two parts of ``shares``, one of robots at rest pushed a little |
     | ``policy`` | the way of an exploring policy |
     | ``mixed`` | equal parts of ranges, standing, fallen and policy |
 
@@ -79,6 +80,7 @@ def strategies(
         "scales": along(**calm),
         "correlated": along(**held) if can_hold else None,
         "starts": mix(along(), along(**standing), along(**fallen)),
+        "resting": mix(along(), along(), along(starts=Nudged(Fallen(scene)))),
     }
     mixed = [along(**both), along(**both, **standing), along(**both, **fallen)]
     if explorer is not None:

@@ -1,0 +1,1 @@
+"""Numerical stability on hard cases, in true and in learned dynamics."""

@@ -1,0 +1,52 @@
+"""A row reset, or put elsewhere, in mid-flight is as new."""
+
+from typing import cast
+
+import torch
+from tensordict import TensorDict
+from torch import Generator
+
+from torchrl_nerd.evaluation.stability.case import Case, Figures
+from torchrl_nerd.evaluation.stability.world import (
+    World,
+    largest,
+    starts,
+    uniform_torque,
+)
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+
+ROWS, STEPS = 16, 12
+APART = "apart from a fresh start, share"
+
+
+def _run(world: World, generator: Generator, scale: float) -> Figures:
+    dynamics = getattr(world, "dynamics", None)
+    if dynamics is None:
+        return {APART: 0.0}  # envs have tests of their own
+    scene = world.scene
+    start, other = (starts(scene, ROWS, generator) for _ in range(2))
+    torque = uniform_torque(scene, ROWS, STEPS, generator)
+    rows = torch.rand(ROWS, generator=generator) < 0.5
+    flying = cast(TensorDict, world.roll(start, STEPS, torque)[:, -1])
+    state = torch.where(rows[:, None], other[QPOS], flying[QPOS])
+    speed = torch.where(rows[:, None], other[QVEL], flying[QVEL])
+    mixed = other.clone().set(QPOS, state).set(QVEL, speed)
+    if TERRAIN in start.keys():
+        mixed[TERRAIN] = torch.where(rows[:, None], other[TERRAIN], start[TERRAIN])
+    dynamics.reset(mixed, rows)
+    after, now = [], mixed.select(QPOS, QVEL)
+    for step in range(STEPS):
+        now = dynamics.step(now, torque[:, step], mixed.get(TERRAIN, None))
+        after.append(now[QVEL])
+    fresh = world.roll(mixed, STEPS, torque)[QVEL][rows, 1:]
+    size = 1.0 + fresh.abs().amax((1, 2), keepdim=True)
+    return {APART: largest(((torch.stack(after, 1)[rows] - fresh) / size).abs())}
+
+
+CASE = Case(
+    "history",
+    "nothing of a row's past outlives its reset",
+    _run,
+    true_lines={APART: 1e-6},
+    lines={APART: 1e-4},
+)

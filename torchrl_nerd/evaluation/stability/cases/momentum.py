@@ -1,0 +1,44 @@
+"""Momentum of a free robot in the air, whatever its joints do."""
+
+import numpy as np
+from torch import Generator
+
+from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
+from torchrl_nerd.evaluation.stability.world import (
+    World,
+    clear_of_ground,
+    largest,
+    mechanics,
+    starts,
+    uniform_torque,
+)
+
+ROWS, STEPS = 16, 30
+LINEAR, SPIN = "sideways momentum, share", "spin about the centre of mass, share"
+
+
+def _run(world: World, generator: Generator, scale: float) -> Figures:
+    scene = world.scene
+    start = clear_of_ground(scene, starts(scene, ROWS, generator))
+    path = world.roll(start, STEPS, uniform_torque(scene, ROWS, STEPS, generator))
+    found = mechanics(scene, path.flatten())
+    push, spin = (found[k].reshape(ROWS, -1, 3) for k in ("momentum", "spin"))
+    sideways = np.linalg.norm((push - push[:, :1])[..., :2], axis=-1)
+    turned = np.linalg.norm(spin - spin[:, :1], axis=-1)
+    mass, extent = scene.model.body_mass.sum(), scene.model.stat.extent
+    speed = 1.0  # m/s: what such a robot moves at
+    return {
+        LINEAR: largest(sideways.mean(0) / (mass * speed)),
+        SPIN: largest(turned.mean(0) / (mass * speed * extent)),
+    }
+
+
+CASE = Case(
+    "momentum",
+    "in the air only gravity acts from outside: sideways momentum and the spin about the "
+    "centre of mass stay, joints driven at random notwithstanding",
+    _run,
+    has_floating_base,
+    true_lines={LINEAR: 5e-4, SPIN: 0.02},
+    lines={LINEAR: 0.02, SPIN: 0.05},
+)

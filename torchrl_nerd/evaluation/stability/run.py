@@ -1,0 +1,106 @@
+"""All cases of a robot in true and in learned dynamics, as one table."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from zlib import crc32
+
+from torch import Generator
+
+from torchrl_nerd.evaluation.stability.case import Case, Figures
+from torchrl_nerd.evaluation.stability.cases import CASES
+from torchrl_nerd.evaluation.stability.world import World
+
+
+@dataclass(frozen=True)
+class Result:
+    """One case in both dynamics.
+
+    | field | meaning |
+    |---|---|
+    | ``case``, ``physics`` | what was tried |
+    | ``true``, ``learned`` | figures |
+    | ``true_passes``, ``passes`` | whether they keep their lines |
+    | ``lines`` | those of the learned dynamics |
+    | ``seconds`` | for both |
+    """
+
+    case: str
+    physics: str
+    true: Figures
+    learned: Figures
+    true_passes: bool
+    passes: bool
+    lines: Figures
+    seconds: float
+
+
+def choose_cases(names: list[str] | None) -> list[Case]:
+    """Cases by name, all where none is named.
+
+    Raises:
+        ValueError: no such case.
+    """
+    for name in names or []:
+        if name not in CASES:
+            known = ", ".join(CASES)
+            raise ValueError(f"unknown case '{name}', expected one of {known}")
+    return [CASES[name] for name in names or CASES]
+
+
+def run_cases(
+    truth: World, learned: World, cases: list[Case], seed: int = 0, scale: float = 1.0
+) -> Iterator[Result]:
+    """Every case that applies to the robot, one after the other.
+
+    Args:
+        truth: MuJoCo.
+        learned: the same robot's model.
+        cases: which.
+        seed: of starts and torques; each case has a stream of its own, the same in both.
+        scale: share of the long rollouts' steps and of large batches' rows, in (0, 1].
+    """
+    for case in cases:
+        if not case.applies(learned.scene):
+            continue
+        began, figures = time.monotonic(), []
+        for world in (truth, learned):
+            stream = Generator().manual_seed((seed << 32) + crc32(case.name.encode()))
+            figures.append(case.run(world, stream, scale))
+        true, mine = figures
+        yield Result(
+            case.name,
+            case.physics,
+            true,
+            mine,
+            case.passes(true, is_true=True),
+            case.passes(mine, is_true=False),
+            case.lines,
+            round(time.monotonic() - began, 1),
+        )
+
+
+def as_json(results: list[Result]) -> dict:
+    """Results by case."""
+    return {result.case: asdict(result) for result in results}
+
+
+def as_table(results: list[Result]) -> str:
+    """Markdown: a row for every figure."""
+    lines = [
+        "| case | figure | MuJoCo | learned | line | |",
+        "|---|---|---|---|---|---|",
+    ]
+    for result in results:
+        name = result.case
+        for figure, value in result.learned.items():
+            line = result.lines.get(figure)
+            kept = "" if line is None else ("met" if value <= line else "**not met**")
+            limit = "" if line is None else f"{line:g}"
+            true = result.true.get(figure)
+            shown = "" if true is None else f"{true:.2g}"
+            lines.append(
+                f"| {name} | {figure} | {shown} | {value:.2g} | {limit} | {kept} |"
+            )
+            name = ""
+    return "\n".join(lines) + "\n"
