@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_nerd.dynamics import Dynamics
 from torchrl_nerd.envs.streams import row_uniforms
-from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, SENSORDATA, TERRAIN
 from torchrl_nerd.tasks import Task
 
 MAX_SEED = 2**63
@@ -197,7 +197,9 @@ class SceneEnv(EnvBase):
         }
         self._set(next_values)
         self._age = self._age + 1
-        next_state = self._state()
+        next_state = self._state().set(ACTION, action)
+        if SENSORDATA in moved.keys():
+            next_state[SENSORDATA] = torch.where(is_fine, moved[SENSORDATA], 0.0)
         reward = self.task.reward(state, action, next_state)
         terminated = self.task.terminated(next_state)[:, None] | ~is_fine
         truncated = (self._age >= self.task.horizon)[:, None]
@@ -219,7 +221,7 @@ class SceneEnv(EnvBase):
 
     def _output(self, state: TensorDict, torque: Tensor) -> TensorDict:
         """A tensordict that shares no memory with the env."""
-        values = {key: value.clone() for key, value in state.items()}
+        values = {key: state[key].clone() for key in self._state_sizes}
         values[OBSERVATION] = self.task.observation(state).to(torch.float32)
         values["joint_torque"] = torque
         return TensorDict._new_unsafe(
