@@ -7,13 +7,22 @@ import numpy as np
 import pytest
 import torch
 from dm_control import suite
-from dynamics_helpers import act, act_all, random_actions, random_model, start_at
+from dynamics_helpers import (
+    act,
+    act_all,
+    assert_same_motion,
+    random_actions,
+    random_drive,
+    random_model,
+    start_at,
+)
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.envs.streams import row_uniforms
 from torchrl_nerd.tasks import make_task
+from torchrl_nerd.tasks.suite import SuiteTask
 
 SUITE = [
     *("acrobot-swingup", "cartpole-balance", "cartpole-swingup", "cheetah-run"),
@@ -135,6 +144,32 @@ def test_feet_feel_in_learned_dynamics_what_mujoco_says(generator):
         theirs.physics.set_control(action[-1, row].double().numpy())
         theirs.physics.forward()
         assert_same(seen[row], flat(theirs.task.get_observation(theirs.physics)))
+
+
+def test_mujoco_and_dm_control_feel_the_same(seed, generator):
+    envs = [
+        make_env("dm_control/hopper-stand", dynamics=engine, num_envs=4, seed=seed)
+        for engine in ("mujoco", TRUTH)
+    ]
+    states = [env.reset() for env in envs]
+    for torque in random_drive(envs[0].scene, 4, 10, generator)[1]:
+        pairs = zip(envs, states, strict=True)
+        states = [env.dynamics.step(state, torque) for env, state in pairs]
+        felt = [state["sensordata"] for state in states]
+        assert felt[0].shape == (4, envs[0].scene.model.nsensordata)
+        assert_same(felt[0][:, 3:], felt[1][:, 3:].numpy(), 1e-5)  # its two feet
+
+
+def test_a_held_action_is_the_same_action_again_and_again(seed, generator):
+    name = task_id("walker-walk")
+    held = make_env(SuiteTask(name, 3), dynamics=TRUTH, num_envs=2, seed=seed)
+    plain = make_env(name, dynamics=TRUTH, num_envs=2, seed=seed)
+    assert held.task.horizon == 334 and plain.task.horizon == 1000
+    for env in (held, plain):
+        env.reset()
+    for action in random_actions(held, 4, generator):
+        state, steps = act(held, action), [act(plain, action) for _ in range(3)]
+        assert_same_motion(state, steps[-1], 0.0)
 
 
 def test_a_model_of_one_task_serves_another_of_the_same_robot(generator, tmp_path):

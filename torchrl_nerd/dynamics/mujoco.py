@@ -148,6 +148,7 @@ class MujocoDynamics:
         """The state after every substep, ``(rows, T * substeps, state)``."""
         rows = len(qpos)
         size = mujoco.mj_stateSize(self._model, STATE.mjSTATE_FULLPHYSICS)
+        self._felt = np.zeros((rows, self._model.nsensordata))
         if not rows:  # MuJoCo itself would crash
             return np.zeros((0, control.shape[1] * self.scene.substeps, size))
         start = np.zeros((rows, size))

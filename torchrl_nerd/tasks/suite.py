@@ -1,6 +1,7 @@
 """Tasks of the dm_control suite in any dynamics: the suite's own code, rows of tensors."""
 
 from collections.abc import Callable
+from math import ceil
 
 import numpy as np
 import torch
@@ -23,6 +24,8 @@ class SuiteTask(Task):
 
     Args:
         name: such as ``"dm_control/cheetah-run"``.
+        steps_per_action: control steps over which an action is held; only the last of
+            them is judged.
 
     Raises:
         ValueError: in one sentence, no such task or something not supported.
@@ -35,12 +38,13 @@ class SuiteTask(Task):
 
     num_uniforms = 1
 
-    def __init__(self, name: str) -> None:
-        self.scene_name = name
+    def __init__(self, name: str, steps_per_action: int = 1) -> None:
+        self.scene_name, self.steps_per_action = name, steps_per_action
         domain, _, task = name.removeprefix("dm_control/").partition("-")
         model = self.scene.model  # refuses what is not supported
         judge = SuiteJudge(domain, task)
-        self.horizon, self.observation_size = judge.horizon, judge.observation_size
+        self.horizon = ceil(judge.horizon / steps_per_action)
+        self.observation_size = judge.observation_size
         width = 3 * len(judge.targets)
         self.parameters = {TARGET: width} if width else {}
         self._sizes = (model.nq, model.nv, width)

@@ -89,11 +89,13 @@ class SuiteJudge:
             Reward, whether the episode ends (0 or 1), observation.
         """
         model, data = self._model, self._data
-        sizes = model.nq, model.nv, 3 * len(self.targets), model.nu
-        *parts, felt = np.split(row, np.cumsum(sizes))
-        data.qpos, data.qvel, target, data.ctrl = parts
-        model.geom_pos[self.targets] = target.reshape(-1, 3)
-        if np.isnan(felt).any():
+        velocity = model.nq + model.nv
+        ctrl = velocity + 3 * len(self.targets)
+        data.qpos, data.qvel = row[: model.nq], row[model.nq : velocity]
+        data.ctrl, felt = row[ctrl : ctrl + model.nu], row[ctrl + model.nu :]
+        if len(self.targets):
+            model.geom_pos[self.targets] = row[velocity:ctrl].reshape(-1, 3)
+        if len(felt) and np.isnan(felt).any():
             data.qacc_warmstart = 0.0  # nothing is left of the row before
             mujoco.mj_forward(model, data)
         else:
