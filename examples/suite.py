@@ -35,6 +35,7 @@ class Config:
     trajectories: int = 4000  # random ones of 100 steps each
     updates: int = 3000  # of the model
     frames: int = 600_000  # actions of the policy
+    num_envs: int = 256  # rows that it learns from together
     hold: int = 4  # control steps per action
     episodes: int = 64  # of the report, in each dynamics
     seed: int = 0
@@ -51,7 +52,7 @@ def make_model(scene: Scene, cfg: Config, folder: Path) -> Path:
         rollout_steps=cfg.updates // 20,
         single_share=1.0,
         softening=0.02,
-        validate_every=max(1, cfg.updates // 3),
+        validate_every=max(500, cfg.updates // 3),
         seed=cfg.seed,
     )
     rows = load_data(scene, folder / "data")
@@ -64,8 +65,8 @@ def make_policy(task: SuiteTask, model: Path, cfg: Config) -> Policy:
     how = ppo.Run(
         dynamics=str(model),
         total_frames=cfg.frames,
-        num_envs=256,
-        minibatch=1024,
+        num_envs=cfg.num_envs,
+        minibatch=4 * cfg.num_envs,
         lr=1e-3,
         seed=cfg.seed,
         evaluate_every=10**9,  # at the end alone
@@ -106,11 +107,10 @@ def main(cfg: Config) -> None:
     where, actor = (str(model), "mujoco", "dm_control"), make_actor(policy)
     report = transfer(task, actor, where, cfg.episodes, seed=cfg.seed + 1)  # pyright: ignore
     print(transfer_table(report), f"(one reward per {cfg.hold} control steps)")
-    returns = suite_returns(policy, cfg.name, cfg.hold, episodes=10)
+    played = min(10, cfg.episodes)
+    returns = suite_returns(policy, cfg.name, cfg.hold, played)
     mean, std = float(returns.mean()), float(returns.std())
-    print(
-        f"dm_control's own environment: {mean:.1f} of 1000, std {std:.1f}, 10 episodes"
-    )
+    print(f"dm_control itself, {played} episodes: {mean:.1f} of 1000, std {std:.1f}")
     seconds = time.monotonic() - began
     print(f"{seconds:.0f} s in all")
     figures = {name: asdict(summary) for name, summary in report.items()}
