@@ -67,7 +67,8 @@ def make_policy(task: SuiteTask, model: Path, cfg: Config) -> Policy:
         total_frames=cfg.frames,
         num_envs=cfg.num_envs,
         minibatch=4 * cfg.num_envs,
-        lr=1e-3,
+        lr=2e-3,
+        gamma=0.98,
         seed=cfg.seed,
         evaluate_every=10**9,  # at the end alone
         episodes=cfg.episodes,
