@@ -35,7 +35,7 @@ from torchrl_nerd.evaluation.policy import (
     save_policy,
 )
 from torchrl_nerd.files import write_json
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.tasks import Task, make_task
 from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -92,11 +92,12 @@ def update(
             optimizer.step()
 
 
-def train(cfg: Run) -> tuple[Policy, list[dict[str, float]]]:
+def train(
+    cfg: Run, task: str | Task | None = None
+) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
-    env = make_env(
-        cfg.task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed
-    )
+    task = task or cfg.task
+    env = make_env(task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
@@ -117,7 +118,14 @@ def train(cfg: Run) -> tuple[Policy, list[dict[str, float]]]:
         progress.update(frames)
         if number % cfg.evaluate_every == 0 or number * frames == total:
             where, seed = [cfg.dynamics], cfg.seed + 1
-            returns = policy_transfer.transfer(cfg.task, actor, where, 256, seed=seed)
+            episodes = min(256, cfg.episodes)
+            returns = policy_transfer.transfer(
+                task,  # pyright: ignore
+                actor,
+                where,
+                episodes,
+                seed=seed,
+            )
             means = {name: summary.mean for name, summary in returns.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})

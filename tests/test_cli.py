@@ -214,7 +214,7 @@ def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, cap
     }
     assert len(rows) == 4 * load_scene(name).model.njnt
     capsys.readouterr()
-    assert "expected a shipped model" in refusal(capsys, "eval", name)
+    assert f"no model of '{name}' is shipped" in refusal(capsys, "eval", name)
 
 
 @pytest.mark.parametrize(

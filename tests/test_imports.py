@@ -19,7 +19,7 @@ LEVELS = (
     {"tasks"},
     {"envs"},
     {"data", "training", "evaluation"},
-    {"cli"},
+    {"cli", "gymnasium"},
 )
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 SOURCES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent != PACKAGE]

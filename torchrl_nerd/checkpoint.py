@@ -16,12 +16,18 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from torchrl_nerd import __version__
-from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.files import (
+    folder_name,
+    read_json,
+    writable_folder,
+    write_atomically,
+    write_json,
+)
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
 from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes import Scene, is_import, load_scene
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -131,14 +137,20 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> N
     Raises:
         ValueError: neither a shipped model nor a folder with a checkpoint.
     """
-    shipped = PRETRAINED / str(name_or_folder)
-    if str(name_or_folder) in shipped_models():
-        return load_checkpoint(shipped, scene)
+    asked = str(name_or_folder)
+    name = folder_name(asked) if is_import(asked) else asked
+    if name in shipped_models():
+        return load_checkpoint(PRETRAINED / name, scene)
     if Path(name_or_folder).is_dir():
         return load_checkpoint(Path(name_or_folder), scene)
+    if is_import(asked):
+        raise ValueError(
+            f"no model of '{asked}' is shipped: make one with `nerd data {asked}` and "
+            f"`nerd train {asked}`, then give its folder, runs/{name}/best"
+        )
     names = ", ".join(shipped_models())
     raise ValueError(
-        f"expected a shipped model ({names}) or a checkpoint folder, got '{name_or_folder}'"
+        f"expected a shipped model ({names}) or a checkpoint folder, got '{asked}'"
     )
 
 
@@ -176,8 +188,11 @@ def _network_config(
 
 
 def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
-    """Refuse another robot; warn of other physics or another MuJoCo."""
-    if card.get("scene") != scene.name:
+    """Refuse another robot; warn of other physics or another MuJoCo.
+
+    Tasks of the dm_control suite may share a robot: the same physics by another name.
+    """
+    if scene.name != card.get("scene") and scene.hash != card.get("scene_hash"):
         raise ValueError(
             f"the checkpoint in {folder} is for robot '{card.get('scene')}', "
             f"expected '{scene.name}'"

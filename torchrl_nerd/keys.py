@@ -23,6 +23,14 @@ GOAL = "goal"
 """Where the hand should go ``(*batch, 3)``, m, world frame, float64; a task's row
 parameter, drawn at each reset."""
 
+TARGET = "target"
+"""Where a task of the dm_control suite put its n targets ``(*batch, 3 n)``, m, in the
+frame of their bodies, float64; a task's row parameter, drawn at each reset."""
+
+SENSORDATA = "sensordata"
+"""What MuJoCo's sensors read during the last substep ``(*batch, nsensordata)``, float64.
+Only from true dynamics of a model that senses forces, and only on its way to the task."""
+
 ACTION = "action"
 """What the policy chose ``(*batch, num_actions)``, float32, in [-1, 1]."""
 

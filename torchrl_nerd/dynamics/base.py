@@ -32,7 +32,8 @@ class Dynamics(Protocol):
             terrain: ``(num_envs, terrain.size)`` where the ground varies.
 
         Returns:
-            A new tensordict; rows that the physics could not step are not finite.
+            A new tensordict; rows that the physics could not step are not finite. True
+            dynamics of a model that senses forces adds ``sensordata``.
         """
         ...
 

@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.dynamics.base import check_step
-from torchrl_nerd.dynamics.mujoco import torque_model
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
+from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -76,6 +76,7 @@ class DMControlDynamics:
         if terrain is not None and ground is not None and ground.is_per_row:
             pose = ground.mocap_pose(terrain.double().cpu()).numpy()
         next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
+        felt = np.empty((len(qpos), self.scene.model.nsensordata))
         for row, physics in enumerate(self._rows):
             self._place(
                 physics, qpos[row], qvel[row], None if pose is None else pose[row]
@@ -86,12 +87,13 @@ class DMControlDynamics:
             is_broken = physics.data.warning.number.any()
             next_qpos[row] = np.nan if is_broken else physics.data.qpos
             next_qvel[row] = np.nan if is_broken else physics.data.qvel
+            felt[row] = physics.data.sensordata
+        values = {QPOS: next_qpos, QVEL: next_qvel}
+        if feels_forces(self.scene):
+            values[SENSORDATA] = felt
         device = state[QPOS].device
         return TensorDict(
-            {
-                QPOS: torch.from_numpy(next_qpos).to(device),
-                QVEL: torch.from_numpy(next_qvel).to(device),
-            },
+            {key: torch.from_numpy(value).to(device) for key, value in values.items()},
             batch_size=[len(qpos)],
             device=state.device,
         )

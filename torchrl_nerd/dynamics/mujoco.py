@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.dynamics.base import check_step
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
 
 STATE: Any = mujoco.mjtState
@@ -31,6 +31,12 @@ def torque_model(scene: Scene) -> mujoco.MjModel:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
+
+
+def feels_forces(scene: Scene) -> bool:
+    """Whether the model has sensors that need forces, such as touch."""
+    stages = scene.model.sensor_needstage
+    return bool((stages == mujoco.mjtStage.mjSTAGE_ACC).any())
 
 
 class MujocoDynamics:
@@ -54,6 +60,7 @@ class MujocoDynamics:
         self._data = [mujoco.MjData(self._model) for _ in range(self.num_threads)]
         self._pool = mujoco.rollout.Rollout(nthread=self.num_threads)
         self._warmstart = np.zeros((0, self._model.nv))
+        self._felt = np.zeros((0, self._model.nsensordata))
 
     def __getstate__(self) -> dict:
         """Threads do not travel: a copy in another process starts its own."""
@@ -80,7 +87,10 @@ class MujocoDynamics:
         """See `Dynamics.step`. Rows that MuJoCo gave up on come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
         states = self.rollout(state, joint_torque[:, None], terrain)
-        return cast(TensorDictBase, states[:, 0])
+        last = cast(TensorDictBase, states[:, 0])
+        if feels_forces(self.scene):
+            last[SENSORDATA] = torch.from_numpy(self._felt).to(last.device)
+        return last
 
     def rollout(
         self,
@@ -138,6 +148,7 @@ class MujocoDynamics:
         """The state after every substep, ``(rows, T * substeps, state)``."""
         rows = len(qpos)
         size = mujoco.mj_stateSize(self._model, STATE.mjSTATE_FULLPHYSICS)
+        self._felt = np.zeros((rows, self._model.nsensordata))
         if not rows:  # MuJoCo itself would crash
             return np.zeros((0, control.shape[1] * self.scene.substeps, size))
         start = np.zeros((rows, size))
@@ -145,7 +156,7 @@ class MujocoDynamics:
         start[:, 1 + qpos.shape[1] : 1 + qpos.shape[1] + qvel.shape[1]] = qvel
         if len(self._warmstart) != rows:
             self._warmstart = np.zeros((rows, self._model.nv))
-        states, _ = self._pool.rollout(
+        states, felt = self._pool.rollout(
             self._model,
             self._data,
             start,
@@ -153,4 +164,5 @@ class MujocoDynamics:
             control_spec=CONTROL,
             initial_warmstart=self._warmstart,
         )
+        self._felt = felt[:, -1].copy()
         return states

@@ -12,7 +12,16 @@ from torchrl.envs import EnvBase
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder, find_faults
 from torchrl_nerd.envs.streams import row_uniforms
-from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, QPOS, QVEL, TERRAIN, TRUST
+from torchrl_nerd.keys import (
+    ACTION,
+    FAULT,
+    OBSERVATION,
+    QPOS,
+    QVEL,
+    SENSORDATA,
+    TERRAIN,
+    TRUST,
+)
 from torchrl_nerd.tasks import Task
 
 MAX_SEED = 2**63
@@ -219,7 +228,9 @@ class SceneEnv(EnvBase):
         }
         self._set(next_values)
         self._age = self._age + 1
-        next_state = self._state()
+        next_state = self._state().set(ACTION, given)
+        if SENSORDATA in moved.keys():
+            next_state[SENSORDATA] = torch.where(fault == 0, moved[SENSORDATA], 0.0)
         reward = self.task.reward(state, given, next_state)
         terminated = self.task.terminated(next_state)[:, None] | (fault > 0)
         truncated = (self._age >= self.task.horizon)[:, None]
@@ -245,7 +256,7 @@ class SceneEnv(EnvBase):
         self, state: TensorDict, torque: Tensor, fault: Tensor, trust: Tensor | None
     ) -> TensorDict:
         """A tensordict that shares no memory with the env."""
-        values = {key: value.clone() for key, value in state.items()}
+        values = {key: state[key].clone() for key in self._state_sizes}
         values[FAULT] = fault
         if self.guard and trust is not None:
             values[TRUST] = trust

@@ -97,6 +97,11 @@ class ActuatorController:
         )
         return not any(map(any, follows_state))
 
+    def ctrl(self, action: Tensor) -> Tensor:
+        """What MuJoCo's ``data.ctrl`` would be at an action, ``(*batch, A)``."""
+        low, high = action.new_tensor((self.ctrl_low, self.ctrl_high))
+        return torch.lerp(low, high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
+
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, D)``, in the dtype of qpos."""
         shape = (self.num_actions, len(self.dof_addresses))
@@ -107,9 +112,7 @@ class ActuatorController:
             qpos.new_tensor(x).reshape(self.num_actions, 3).unbind(-1)
             for x in (self.gain, self.bias)
         )
-        low, high = qpos.new_tensor((self.ctrl_low, self.ctrl_high))
-        share = 0.5 * (action.to(qpos.dtype).clamp(-1.0, 1.0) + 1.0)
-        ctrl = torch.lerp(low, high, share)
+        ctrl = self.ctrl(action.to(qpos.dtype))
         stretch = qpos[..., self.qpos_addresses] @ length.mT
         speed = qvel[..., self.dof_addresses] @ moment.mT
         force = (gain[0] + gain[1] * stretch + gain[2] * speed) * ctrl

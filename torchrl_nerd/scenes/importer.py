@@ -8,7 +8,7 @@ import os
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 
@@ -17,6 +17,9 @@ from torchrl_nerd.scenes.controllers import Controller
 from torchrl_nerd.scenes.ranges import default_sampling
 from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.support import check_supported
+
+if TYPE_CHECKING:
+    from dm_control.rl.control import Environment
 
 CONTROL_STEP = 0.02  # s, where nobody says
 
@@ -49,9 +52,20 @@ def import_mjcf(
 
 
 def import_dm_control(domain: str, task: str, **ranges: Any) -> Imported:
-    """See `Scene.from_dm_control`.
+    """See `Scene.from_dm_control`."""
+    env = load_suite(domain, task)
+    model = env.physics.model.ptr
+    substeps = round(env.control_timestep() / model.opt.timestep)
+    return read_model(f"dm_control/{domain}-{task}", model, substeps, ranges)
+
+
+def load_suite(domain: str, task: str) -> "Environment":
+    """The dm_control suite's own environment of a task.
 
     dm_control is imported here, on first use: it looks for a display and says so.
+
+    Raises:
+        ValueError: no such domain or task.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -63,10 +77,7 @@ def import_dm_control(domain: str, task: str, **ranges: Any) -> Imported:
             f"unknown {'task' if tasks else 'domain'} in 'dm_control/{domain}-{task}', "
             f"expected one of {', '.join(known)}"
         )
-    env = suite.load(domain, task, task_kwargs={"random": 0})
-    model = env.physics.model.ptr
-    substeps = round(env.control_timestep() / model.opt.timestep)
-    return read_model(f"dm_control/{domain}-{task}", model, substeps, ranges)
+    return suite.load(domain, task, task_kwargs={"random": 0})
 
 
 def import_gymnasium(env_id: str, **ranges: Any) -> Imported:

@@ -12,6 +12,7 @@ from torchrl_nerd.tasks.franka import (
     FrankaReach,
     FrankaReachTorque,
 )
+from torchrl_nerd.tasks.suite import SuiteTask
 from torchrl_nerd.tasks.task import Task
 
 TASKS: dict[str, Callable[[], Task]] = {
@@ -31,14 +32,19 @@ TASKS: dict[str, Callable[[], Task]] = {
 
 
 def make_task(name: str) -> Task:
-    """The registered task of that id.
+    """The task of that id: a registered one or ``dm_control/DOMAIN-TASK``.
 
     Raises:
-        ValueError: no such task.
+        ValueError: no such task, or one whose robot has something not supported (named).
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task '{name}', expected one of {', '.join(TASKS)}")
-    return TASKS[name]()
+    if name in TASKS:
+        return TASKS[name]()
+    if name.startswith("dm_control/"):
+        return SuiteTask(name)
+    raise ValueError(
+        f"unknown task '{name}', expected one of {', '.join(TASKS)} or "
+        "dm_control/DOMAIN-TASK"
+    )
 
 
 __all__ = ["TASKS", "Task", "make_task"]

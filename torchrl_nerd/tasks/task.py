@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar
 
 from torch import Tensor
 
@@ -10,14 +9,15 @@ from torchrl_nerd.scenes import Scene, load_scene
 from torchrl_nerd.scenes.controllers import Controller
 
 State = Mapping[str, Tensor]
-"""``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's row parameters; a
+"""``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's row parameters; after a step
+also the ``action`` that led there and, where the dynamics feels forces, ``sensordata``. A
 TensorDict is one."""
 
 
 class Task(ABC):
     """Pure functions of the state; the same ones for learned and true dynamics.
 
-    | class attribute | meaning |
+    | attribute | meaning |
     |---|---|
     | ``scene_name`` | the robot it is for |
     | ``horizon`` | control steps after which an episode is truncated |
@@ -27,12 +27,12 @@ class Task(ABC):
     | ``parameters`` | row parameters drawn at a reset and kept, key -> width |
     """
 
-    scene_name: ClassVar[str]
-    horizon: ClassVar[int]
-    num_uniforms: ClassVar[int]
-    observation_size: ClassVar[int]
-    steps_per_action: ClassVar[int] = 1
-    parameters: ClassVar[dict[str, int]] = {}
+    scene_name: str
+    horizon: int
+    num_uniforms: int
+    observation_size: int
+    steps_per_action: int = 1
+    parameters: Mapping[str, int] = {}
 
     @property
     def scene(self) -> Scene:

@@ -1,0 +1,125 @@
+"""From the name of a dm_control suite task to data, model, policy and transfer report.
+
+    python examples/suite.py cartpole-swingup
+    python examples/suite.py acrobot-swingup
+
+The policy is learned in the learned model alone and measured in dm_control's own
+environment. An action is held over a few control steps, as is usual on the suite.
+"""
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import ppo
+import torch
+import tyro
+
+from torchrl_nerd.data.generate import DataConfig, generate, load_data
+from torchrl_nerd.evaluation.policy import Policy, make_actor, save_policy
+from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
+from torchrl_nerd.files import write_json
+from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes.importer import load_suite
+from torchrl_nerd.tasks.suite import SuiteTask
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to do and for how long; the defaults are for minutes on two cores."""
+
+    name: Annotated[str, tyro.conf.Positional]  # DOMAIN-TASK, such as cartpole-swingup
+    trajectories: int = 4000  # random ones of 100 steps each
+    updates: int = 3000  # of the model
+    frames: int = 600_000  # actions of the policy
+    num_envs: int = 256  # rows that it learns from together
+    hold: int = 4  # control steps per action
+    episodes: int = 64  # of the report, in each dynamics
+    seed: int = 0
+    out: Path = Path("runs/suite")
+
+
+def make_model(scene: Scene, cfg: Config, folder: Path) -> Path:
+    """Random trajectories of the true robot, and a network that learns from them."""
+    data = DataConfig(trajectories=cfg.trajectories, steps=100, seed=cfg.seed)
+    generate(scene, data, folder / "data")
+    how = TrainConfig(
+        network="mlp",
+        steps=cfg.updates,
+        rollout_steps=cfg.updates // 20,
+        single_share=1.0,
+        softening=0.02,
+        validate_every=max(500, cfg.updates // 3),
+        seed=cfg.seed,
+    )
+    rows = load_data(scene, folder / "data")
+    Trainer(scene, rows, scene, how, folder / "model", horizons=(20, 100)).run()
+    return folder / "model" / "best"
+
+
+def make_policy(task: SuiteTask, model: Path, cfg: Config) -> Policy:
+    """PPO in learned dynamics; true ones are never met."""
+    how = ppo.Run(
+        dynamics=str(model),
+        total_frames=cfg.frames,
+        num_envs=cfg.num_envs,
+        minibatch=4 * cfg.num_envs,
+        lr=2e-3,
+        gamma=0.98,
+        seed=cfg.seed,
+        evaluate_every=10**9,  # at the end alone
+        episodes=cfg.episodes,
+    )
+    policy, _ = ppo.train(how, task)
+    return policy
+
+
+@torch.no_grad()
+def suite_returns(policy: Policy, name: str, hold: int, episodes: int) -> np.ndarray:
+    """Whole episodes of 1000 rewards in the suite's own environment, ``(episodes,)``."""
+    env, returns = load_suite(*name.split("-", 1)), np.zeros(episodes)
+    for episode in range(episodes):
+        step = env.reset()
+        while not step.last():
+            parts = [np.ravel(part) for part in step.observation.values()]
+            seen = torch.from_numpy(np.concatenate(parts)).float()
+            action = policy(seen)[0].tanh().double().numpy()
+            for _ in range(hold):
+                if not step.last():
+                    step = env.step(action)
+                    returns[episode] += step.reward
+    return returns
+
+
+def main(cfg: Config) -> None:
+    """Data, model, policy, report."""
+    torch.manual_seed(cfg.seed)
+    began = time.monotonic()
+    task = SuiteTask(f"dm_control/{cfg.name}", cfg.hold)
+    folder = cfg.out / cfg.name
+    model = make_model(load_scene(task.scene_name), cfg, folder)
+    print(f"model in {model} after {time.monotonic() - began:.0f} s")
+    policy = make_policy(task, model, cfg)
+    save_policy(policy, folder, {"task": task.scene_name, "dynamics": str(model)})
+    print(f"policy in {folder} after {time.monotonic() - began:.0f} s")
+    where, actor = (str(model), "mujoco", "dm_control"), make_actor(policy)
+    report = transfer(task, actor, where, cfg.episodes, seed=cfg.seed + 1)  # pyright: ignore
+    print(transfer_table(report), f"(one reward per {cfg.hold} control steps)")
+    played = min(10, cfg.episodes)
+    returns = suite_returns(policy, cfg.name, cfg.hold, played)
+    mean, std = float(returns.mean()), float(returns.std())
+    print(f"dm_control itself, {played} episodes: {mean:.1f} of 1000, std {std:.1f}")
+    seconds = time.monotonic() - began
+    print(f"{seconds:.0f} s in all")
+    figures = {name: asdict(summary) for name, summary in report.items()}
+    write_json(
+        folder / "report.json",
+        {"suite_mean": mean, "suite_std": std, "seconds": seconds, "returns": figures},
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,40 @@
+"""Examples with tiny budgets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from dm_control import suite as dm_suite
+
+from torchrl_nerd.evaluation.policy import load_policy
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def test_a_suite_task_from_its_name_to_a_report(monkeypatch, tmp_path, seed, capsys):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import suite
+
+    name, hold = "cartpole-balance", 20
+    cfg = suite.Config(name, 8, 4, 512, 16, hold, 2, seed % 1000, tmp_path)
+    suite.main(cfg)
+    report = json.loads((tmp_path / name / "report.json").read_text())
+    model = str(tmp_path / name / "model" / "best")
+    assert set(report["returns"]) == {model, "mujoco", "dm_control"}
+    assert report["returns"][model]["episodes"] == 2
+    assert 0.0 < report["suite_mean"] <= 1000.0
+    assert "dm_control itself, 2 episodes" in capsys.readouterr().out
+
+    policy = load_policy(tmp_path / name)
+    returns = suite.suite_returns(policy, name, hold, episodes=1)
+    env = dm_suite.load(*name.split("-"), task_kwargs={"random": 0})
+    step, rewards = env.reset(), []
+    while not step.last():
+        if len(rewards) % hold == 0:
+            seen = np.concatenate([np.ravel(x) for x in step.observation.values()])
+            with torch.no_grad():
+                action = policy(torch.tensor(seen).float())[0].tanh().numpy()
+        step = env.step(action)
+        rewards.append(step.reward)
+    np.testing.assert_allclose(returns, [sum(rewards)], rtol=1e-9)
