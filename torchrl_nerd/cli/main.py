@@ -13,6 +13,7 @@ from torchrl_nerd.cli.data import Data
 from torchrl_nerd.cli.eval import Eval
 from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
+from torchrl_nerd.cli.play import Play
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
 from torchrl_nerd.files import write_json
@@ -26,6 +27,7 @@ COMMANDS = {
     "eval": Eval,
     "finetune": Finetune,
     "transfer": Transfer,
+    "play": Play,
     "explain": Explain,
     "bench": Bench,
 }
