@@ -4,6 +4,7 @@ matplotlib is imported on first use: only `pip install torchrl-nerd[examples]` b
 """
 
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,13 +93,10 @@ def make_figure(
     panels: int, height: float, share_x: bool = True
 ) -> "tuple[Figure, list[Axes]]":
     """Stacked panels ``height`` inches high together; no display is needed."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "figures need matplotlib: pip install 'torchrl-nerd[examples]'"
-        ) from None
+    need_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(PANEL[0], height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(panels, 1, sharex=share_x, squeeze=False)[:, 0]
@@ -106,6 +104,18 @@ def make_figure(
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.3)
     return figure, list(axes)
+
+
+def need_matplotlib() -> None:
+    """Say in one sentence where matplotlib (and its pillow) is missing.
+
+    Raises:
+        ModuleNotFoundError: it is.
+    """
+    if find_spec("matplotlib") is None:
+        raise ModuleNotFoundError(
+            "figures need matplotlib: pip install 'torchrl-nerd[examples]'"
+        )
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

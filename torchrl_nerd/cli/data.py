@@ -1,0 +1,54 @@
+"""``nerd data``: random trajectories of the true dynamics, or recorded ones."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from torchrl_nerd.cli.options import Flat, Positional, real_scene
+from torchrl_nerd.data.generate import CARD, DataConfig, generate
+from torchrl_nerd.data.recorded import write_tosses
+from torchrl_nerd.files import folder_name, read_json
+from torchrl_nerd.scenes import load_scene
+
+
+@dataclass(frozen=True)
+class Data:
+    """Generate random trajectories of the true dynamics, or take over recorded ones.
+
+    Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
+
+    Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
+    out: Path | None = None
+    """Folder of the data set; datasets/SCENE by default."""
+    recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
+    config: Flat[DataConfig] = field(default_factory=DataConfig)
+    json: Path | None = None
+    """Write the figures to this file."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> dict[str, Any]:
+        """Write the data set and return its card."""
+        if self.recorded is not None:
+            scene = real_scene(self.scene)
+            out = self.out or Path("datasets") / f"{scene.name}_recorded"
+            card = write_tosses(self.recorded, scene, out)
+            print("\n".join(card["checks"]))
+            print(f"{card['trajectories']} recorded tosses in {out}: they fit physics")
+            return card
+        scene = load_scene(self.scene)
+        out = self.out or Path("datasets") / folder_name(self.scene)
+        generate(scene, self.config, out, self.quiet)
+        card = read_json(out / CARD)
+        print(
+            f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
+        )
+        return card

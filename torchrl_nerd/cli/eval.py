@@ -1,0 +1,120 @@
+"""``nerd eval``: open-loop error against true physics or recorded tosses."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.options import Positional, real_scene
+from torchrl_nerd.data.recorded import SHIPPED, load_tosses
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.protocols import protocol_of
+from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
+from torchrl_nerd.evaluation.toss_error import STATES
+from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
+from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
+from torchrl_nerd.scenes import load_scene
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Open-loop error of a model against true physics, beside the paper's figures.
+
+    Robots of others start within their own sampling ranges, without and with actions.
+
+    Example: nerd eval cartpole --json results/cartpole.json
+
+    Example: nerd eval cube --data cube_tosses.npz --split test --baselines
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
+    model: Path | None = None
+    """Checkpoint folder; the shipped model by default."""
+    rows: int = 2048
+    """Trajectories per case."""
+    seed: int = 500
+    """Of the starts; test seeds are never used in training or validation."""
+    inference: Inference = "streaming"
+    """streaming, or window: the paper's recomputation."""
+    unseen_terrain: bool = False
+    """Over grounds of kinds that no training data have, in place of the paper's."""
+    data: Path | None = None
+    """Recorded cube tosses (npz or CSV) in place of true physics: every sub-trajectory of
+    80 states."""
+    split: str = "all"
+    """Of recorded tosses: all, train, validation or test, by the recommended seed."""
+    baselines: bool = False
+    """Beside it, on recorded tosses: MuJoCo, published and fitted, and no motion."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print a table and return its rows."""
+        if self.data is not None:
+            return self.run_recorded(self.data)
+        scene = load_scene(self.scene)
+        if self.rows < 2:
+            raise ValueError(f"expected at least 2 rows, got {self.rows}")
+        protocol = protocol_of(scene)
+        if self.unseen_terrain:
+            if self.scene not in UNSEEN_TERRAIN:
+                known = ", ".join(UNSEEN_TERRAIN)
+                raise ValueError(
+                    f"no unseen terrain for '{self.scene}', expected one of {known}"
+                )
+            protocol = UNSEEN_TERRAIN[self.scene]()
+        model = from_pretrained(self.model or self.scene, scene).to(self.device)
+        rows = []
+        header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"
+        print(f"{header}{'final':>9}{'p95':>9}  paper")
+        for case, source in protocol.cases.items():
+            place = scene_of(source)
+            here = model if place is scene else model.over(place)
+            errors = passive_errors(
+                source,
+                NeRDDynamics(here, inference=self.inference),
+                MujocoDynamics(place),
+                list(protocol.horizons),
+                self.rows,
+                self.seed,
+                self.device,
+                case in protocol.random_actions,
+            )
+            for horizon, by_name in errors.items():
+                for name, error in by_name.items():
+                    paper = protocol.published.get((case, horizon, name))
+                    row = {"case": case, "steps": horizon, "quantity": name}
+                    rows.append({**row, **asdict(error), "paper": paper})
+                    figures = (error.mean, error.interval, error.final, error.p95)
+                    line = f"{case:<13}{horizon:>6} {name:<17}{error.unit:<3}"
+                    line += "".join(f"{figure:>9.5f}" for figure in figures)
+                    print(f"{line}  {paper if paper is not None else '-'}")
+        settings = {"rows": self.rows, "seed": self.seed, "inference": self.inference}
+        return {"scene": self.scene, **settings, "errors": rows}
+
+    def run_recorded(self, path: Path) -> dict[str, Any]:
+        """The same for recorded tosses."""
+        scene = real_scene(self.scene)
+        model = from_pretrained(self.model or SHIPPED, scene).to(self.device)
+        tosses, split = load_tosses(path, scene)
+        if self.split != "all" and self.split not in split:
+            expected = ", ".join(("all", *split))
+            raise ValueError(f"expected split {expected}, got '{self.split}'")
+        chosen = None if self.split == "all" else split[self.split]
+        starts = tosses.starts(STATES, chosen)
+        if len(starts) == 0:
+            raise ValueError(
+                f"expected a toss of at least {STATES} states in {path}, got none"
+            )
+        models = {"model": NeRDDynamics(model, inference=self.inference)}
+        if self.baselines:
+            models = {**mujoco_baselines(scene), **models}
+        table = compare(models, tosses, starts)
+        print(toss_table(table))
+        shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
+        return {**shared, **table["model"], "others": table}

@@ -1,0 +1,96 @@
+"""Picks a command, reads its options, runs it; bad input becomes one sentence."""
+
+import io
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stderr
+from typing import Any
+
+import tyro
+
+from torchrl_nerd.cli.bench import Bench
+from torchrl_nerd.cli.data import Data
+from torchrl_nerd.cli.eval import Eval
+from torchrl_nerd.cli.explain import Explain
+from torchrl_nerd.cli.finetune import Finetune
+from torchrl_nerd.cli.play import Play
+from torchrl_nerd.cli.train import Train
+from torchrl_nerd.cli.transfer import Transfer
+from torchrl_nerd.files import write_json
+from torchrl_nerd.scenes import is_import
+from torchrl_nerd.settings import SettingError
+from torchrl_nerd.training.recipes import RECIPES, recipe_of
+
+COMMANDS = {
+    "data": Data,
+    "train": Train,
+    "eval": Eval,
+    "finetune": Finetune,
+    "transfer": Transfer,
+    "play": Play,
+    "explain": Explain,
+    "bench": Bench,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; bad input is one sentence on stderr and exit status 2."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if not argv or argv[0] in ("-h", "--help"):
+        print("usage: nerd COMMAND ... (each with --help)\n")
+        for name, command in COMMANDS.items():
+            print(f"  {name:<10}{(command.__doc__ or '').splitlines()[0]}")
+        return 0
+    if argv[0] not in COMMANDS:
+        return _fail(f"unknown command '{argv[0]}', expected {', '.join(COMMANDS)}")
+    kind = COMMANDS[argv[0]]
+    try:
+        command = _parse(kind, argv)
+        figures = command.run()
+        if command.json is not None:
+            write_json(command.json, figures)
+    except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
+        return _fail(str(error).splitlines()[0])
+    return 0
+
+
+def _parse(kind: type, argv: list[str]) -> Any:
+    """The command with its settings; tyro's boxes point at what cannot be read.
+
+    Raises:
+        SettingError: a setting out of range, in its own words and without a box.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            default = _default(kind, argv[1:])
+            return tyro.cli(
+                kind, args=argv[1:], prog=f"nerd {argv[0]}", default=default
+            )
+    except SystemExit as stop:
+        cause = stop.__context__
+        while cause is not None:
+            if isinstance(cause, SettingError):
+                raise cause from None
+            cause = cause.__cause__ or cause.__context__
+        sys.stderr.write(said.getvalue())
+        raise
+
+
+def _default(kind: type, args: list[str]) -> Any:
+    """Defaults of a command: a scene's recipe where the command has one."""
+    known = [arg for arg in args if arg in RECIPES]
+    scene = next(
+        (arg for arg in (*known, *args) if arg in known or is_import(arg)), None
+    )
+    if scene is None or kind not in (Data, Train):
+        return tyro.MISSING_NONPROP
+    recipe = recipe_of(scene)
+    if kind is Data:
+        return Data(scene, config=recipe.data)
+    return Train(scene, config=recipe.train)
+
+
+def _fail(sentence: str) -> int:
+    print(f"nerd: {sentence}", file=sys.stderr)
+    return 2

@@ -1,0 +1,21 @@
+"""What several commands share: kinds of options, and the scene of a recording."""
+
+import tyro
+
+from torchrl_nerd.data.recorded import REAL
+from torchrl_nerd.scenes import Scene, load_scene
+
+Positional = tyro.conf.Positional
+Flat = tyro.conf.OmitArgPrefixes
+
+
+def real_scene(name: str) -> Scene:
+    """The scene that recorded tosses are of; ``cube`` is short for it.
+
+    Raises:
+        ValueError: another robot.
+    """
+    if name not in REAL:
+        expected = " or ".join(REAL)
+        raise ValueError(f"expected {expected} for recorded tosses, got '{name}'")
+    return load_scene(REAL[name])

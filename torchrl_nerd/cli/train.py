@@ -1,0 +1,87 @@
+"""``nerd train``: a model as it is shipped, or one of your own."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_nerd.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_nerd.cli.options import Flat, Positional
+from torchrl_nerd.data.generate import CARD, generate, load_data
+from torchrl_nerd.evaluation.protocols import protocol_of
+from torchrl_nerd.files import folder_name, read_json, writable_folder
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.training.recipes import recipe_of
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a NeRD; without options, exactly as the shipped model of the scene.
+
+    Robots of others get one recipe for all, validated from their own sampling ranges.
+    Missing data are generated first. A killed run goes on where it stopped.
+
+    Example: nerd train cartpole --out runs/cartpole --network mlp
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
+    or an MJCF file."""
+    out: Path | None = None
+    """Folder of the run; runs/SCENE by default."""
+    data: Path | None = None
+    """Folder of the data set; datasets/SCENE by default."""
+    config: Flat[TrainConfig] = field(default_factory=TrainConfig)
+    export: Path | None = None
+    """Copy the best checkpoint to this folder when done."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    threads: int | None = None
+    """Processor threads; torch's own choice by default."""
+    json: Path | None = None
+    """Write the figures to this file."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self) -> dict[str, Any]:
+        """Train and return the card of the best checkpoint."""
+        scene = load_scene(self.scene)
+        recipe, name = recipe_of(self.scene), folder_name(self.scene)
+        out = writable_folder(self.out or Path("runs") / name)
+        folder = self.data or Path("datasets") / name
+        if not (folder / CARD).exists():
+            generate(scene, recipe.data, folder, self.quiet)
+        if self.threads:
+            torch.set_num_threads(self.threads)
+        protocol = protocol_of(scene)
+        trainer = Trainer(
+            scene,
+            load_data(scene, folder),
+            recipe.source(scene),
+            self.config,
+            out,
+            self.device,
+            horizons=protocol.horizons[:2],
+            random_actions=bool(protocol.random_actions),
+            quiet=self.quiet,
+        )
+        trainer.run()
+        card = read_json(out / "best" / "card.json")
+        if self.export is not None:
+            save_checkpoint(load_checkpoint(out / "best", scene), self.export, card)
+        print(f"best checkpoint in {out / 'best'}: {_curve(card)}")
+        return card
+
+
+def _curve(card: dict[str, Any]) -> str:
+    """Validation error of a card in one line."""
+    parts = [
+        f"{name} {figures['mean']:.2g} {figures['unit']} at {horizon} steps"
+        if figures["mean"] is not None
+        else f"{name} not finite at {horizon} steps"
+        for horizon, by_name in card.get("validation_error", {}).items()
+        for name, figures in by_name.items()
+    ]
+    return ", ".join(parts) or "not validated"

@@ -1,0 +1,42 @@
+"""``nerd transfer``: what a policy earns, learned against true."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
+from torchrl_nerd.tasks import make_task
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Returns of a policy in learned and in true dynamics, and the gap.
+
+    Example: nerd transfer cartpole/swingup --policy runs/ppo
+    """
+
+    task: Positional[str]
+    """Id of the task, such as cartpole/swingup."""
+    policy: Path
+    """Folder of a policy, as examples/ppo.py writes it."""
+    dynamics: tuple[str, ...] = ("nerd", "mujoco")
+    """Any of nerd, mujoco, dm_control, checkpoint folders."""
+    episodes: int = 2048
+    """Per dynamics."""
+    seed: int = 500
+    """Of the resets."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print a table and return its rows."""
+        if self.episodes < 2:
+            raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
+        policy = load_policy(self.policy, make_task(self.task))
+        actor = make_actor(policy)
+        summaries = transfer(self.task, actor, self.dynamics, self.episodes, self.seed)
+        print(transfer_table(summaries))
+        figures = {name: asdict(summary) for name, summary in summaries.items()}
+        return {"task": self.task, "seed": self.seed, "returns": figures}
