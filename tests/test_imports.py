@@ -15,7 +15,7 @@ LEVELS = (
     {"keys", "geometry"},
     {"scenes"},
     {"transforms", "modules"},
-    {"dynamics", "checkpoint"},
+    {"dynamics", "selfcheck", "checkpoint"},
     {"tasks"},
     {"envs"},
     {"data", "training", "evaluation"},

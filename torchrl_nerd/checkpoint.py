@@ -28,6 +28,7 @@ from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
 from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene, is_import, load_scene
+from torchrl_nerd.selfcheck import self_check, warn_of_differences, write_check
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -77,10 +78,11 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
 
 
 def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
-    """Write weights, then card, each whole or not at all."""
+    """Write weights, a few steps to check them by, then card: each whole or not at all."""
     folder = writable_folder(folder)
     tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
     write_atomically(folder / WEIGHTS, lambda aside: save_file(tensors, aside))
+    write_check(model, folder)
     write_json(folder / CARD, card)
     return folder
 
@@ -128,6 +130,10 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
     if not all(value.isfinite().all() for value in tensors.values()):
         raise ValueError(f"expected finite weights in {folder}, got NaN or infinity")
     model.load_state_dict(tensors)
+    if card.get("scene_hash") == scene.hash:
+        check = self_check(model.eval(), folder)
+        if check is not None:
+            warn_of_differences(check, folder)
     return model.eval()
 
 

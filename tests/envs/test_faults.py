@@ -10,11 +10,16 @@ from dynamics_helpers import (
     each_dynamics,
     junk_fill,
     random_actions,
+    random_model,
     reset_rows,
     start_at,
     unequal_keys,
 )
 from tensordict import TensorDict
+
+from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd.cli.main import main
+from torchrl_nerd.evaluation.replay import read_dump, replay
 
 ROWS, STEPS = 4, 3
 each_junk = pytest.mark.parametrize("junk", [float("nan"), float("inf"), -float("inf")])
@@ -125,3 +130,42 @@ def test_a_given_state_is_copied(task_id, dynamics, generator):
     junk_fill(given)
     action = random_actions(env, 1, generator)[0]
     assert not unequal_keys(act(env, action), act(sound, action))
+
+
+@each_dynamics
+def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
+    make = EnvMaker("ant/run", dynamics, generator)
+    model = make.model
+    if model is None:
+        env = GroundTruthEnv("ant/run", dynamics, ROWS, fault_folder=tmp_path)
+    else:
+        env = NeRDEnv("ant/run", model, ROWS, inference=dynamics, fault_folder=tmp_path)
+    env.reset()
+    actions = random_actions(env, 5, generator)
+    row = int(torch.randint(ROWS, (), generator=generator))
+    good = act_all(env, actions[:3])
+    assert not good["fault"].any() and not list(tmp_path.iterdir())
+    bad = actions[3].clone()
+    bad[row, 0] = torch.nan
+    after = act(env, bad)
+    assert after["fault"][:, 0].tolist() == [int(i == row) for i in range(ROWS)]
+    (path,) = tmp_path.iterdir()
+    dump = read_dump(path)
+    assert dump.about["reason"] == "action" and dump.about["row"] == str(row)
+    assert torch.equal(dump.steps["qpos"][1:], good["qpos"][row])
+    stamp = path.stat().st_mtime_ns
+    act(env, bad)
+    assert path.stat().st_mtime_ns == stamp
+    steps = replay(dump, random_model(env.scene, generator))
+    assert len(steps) == 4 and all(step["speed"] < 1e4 for step in steps)
+
+
+def test_the_command_replays_a_dump(generator, tmp_path, capsys):
+    env = GroundTruthEnv("cartpole/swingup", num_envs=2, fault_folder=tmp_path)
+    env.reset()
+    act(env, torch.full(env.action_spec.shape, torch.inf))
+    assert main(["replay", str(tmp_path / "fault_action.safetensors")]) == 0
+    assert "action in row 0 of cartpole" in capsys.readouterr().out
+    (tmp_path / "other").write_text("no dump")
+    assert main(["replay", str(tmp_path / "other")]) == 2
+    assert "expected a fault's dump" in capsys.readouterr().err

@@ -10,10 +10,13 @@ import tyro
 
 from torchrl_nerd.cli.bench import Bench
 from torchrl_nerd.cli.data import Data
+from torchrl_nerd.cli.doctor import Doctor
 from torchrl_nerd.cli.eval import Eval
 from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
 from torchrl_nerd.cli.play import Play
+from torchrl_nerd.cli.replay import Replay
+from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
 from torchrl_nerd.files import write_json
@@ -30,6 +33,9 @@ COMMANDS = {
     "play": Play,
     "explain": Explain,
     "bench": Bench,
+    "stability": Stability,
+    "replay": Replay,
+    "doctor": Doctor,
 }
 
 

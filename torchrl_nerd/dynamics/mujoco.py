@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
+from torchrl_nerd.scenes.quiet import quiet_mujoco
 from torchrl_nerd.scenes.scene import Scene
 
 STATE: Any = mujoco.mjtState
@@ -156,13 +157,14 @@ class MujocoDynamics:
         start[:, 1 + qpos.shape[1] : 1 + qpos.shape[1] + qvel.shape[1]] = qvel
         if len(self._warmstart) != rows:
             self._warmstart = np.zeros((rows, self._model.nv))
-        states, felt = self._pool.rollout(
-            self._model,
-            self._data,
-            start,
-            np.repeat(control, self.scene.substeps, 1),
-            control_spec=CONTROL,
-            initial_warmstart=self._warmstart,
-        )
+        with quiet_mujoco():
+            states, felt = self._pool.rollout(
+                self._model,
+                self._data,
+                start,
+                np.repeat(control, self.scene.substeps, 1),
+                control_spec=CONTROL,
+                initial_warmstart=self._warmstart,
+            )
         self._felt = felt[:, -1].copy()
         return states

@@ -16,6 +16,7 @@ import numpy as np
 
 from torchrl_nerd.geometry.kinematics import HINGE, SLIDE, Base, quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.quiet import quiet_mujoco
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
@@ -200,9 +201,10 @@ def _largest_change(
         moved = copy.copy(data)
         move(moved, rng)
         size = abs(data.qvel).max()
-        change, moved_change = (
-            _change(model, d, substeps, base) for d in (data, moved)
-        )
+        with quiet_mujoco():
+            change, moved_change = (
+                _change(model, d, substeps, base) for d in (data, moved)
+            )
         if data.warning.number.any() or moved.warning.number.any():
             continue  # states that MuJoCo gave up on say nothing
         sound += 1

@@ -1,4 +1,4 @@
-"""Momentum of a free robot in the air, whatever its joints do."""
+"""Momentum of a free robot in the air, however its joints swing."""
 
 import numpy as np
 from torch import Generator
@@ -10,17 +10,19 @@ from torchrl_nerd.evaluation.stability.world import (
     largest,
     mechanics,
     starts,
-    uniform_torque,
 )
+from torchrl_nerd.keys import QVEL
 
 ROWS, STEPS = 16, 30
+QUIET = 0.3  # of the training speeds: MuJoCo's own steps lose momentum at more
 LINEAR, SPIN = "sideways momentum, share", "spin about the centre of mass, share"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
     scene = world.scene
     start = clear_of_ground(scene, starts(scene, ROWS, generator))
-    path = world.roll(start, STEPS, uniform_torque(scene, ROWS, STEPS, generator))
+    start[QVEL] = QUIET * start[QVEL]
+    path = world.roll(start, STEPS)
     found = mechanics(scene, path.flatten())
     push, spin = (found[k].reshape(ROWS, -1, 3) for k in ("momentum", "spin"))
     sideways = np.linalg.norm((push - push[:, :1])[..., :2], axis=-1)
@@ -36,9 +38,9 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
 CASE = Case(
     "momentum",
     "in the air only gravity acts from outside: sideways momentum and the spin about the "
-    "centre of mass stay, joints driven at random notwithstanding",
+    "centre of mass stay, however the joints swing",
     _run,
     has_floating_base,
-    true_lines={LINEAR: 5e-4, SPIN: 0.02},
-    lines={LINEAR: 0.02, SPIN: 0.05},
+    true_lines={LINEAR: 5e-4, SPIN: 5e-4},
+    lines={LINEAR: 0.02, SPIN: 0.02},
 )

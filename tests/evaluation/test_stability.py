@@ -1,0 +1,106 @@
+"""Every hard case runs over every robot, and MuJoCo keeps the lines made for it."""
+
+import json
+
+import pytest
+import torch
+from dynamics_helpers import EnvMaker, random_model
+
+from torchrl_nerd.cli.main import main
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.stability.case import Case
+from torchrl_nerd.evaluation.stability.cases import CASES
+from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_cases
+from torchrl_nerd.evaluation.stability.world import (
+    DynamicsWorld,
+    EnvWorld,
+    clear_of_ground,
+    mechanics,
+    starts,
+)
+
+SCALE = 0.001
+SLOW = ("adversary", "chaos", "drop", "sliding", "resting", "margin", "horizon")
+SHORT = [name for name in CASES if name not in SLOW]
+INDEPENDENT = ("bad_rows", "rotations", "quaternion_norm", "quaternion_sign")
+
+
+def results_of(scene, names, generator):
+    truth = DynamicsWorld(MujocoDynamics(scene, num_threads=1))
+    learned = DynamicsWorld(NeRDDynamics(random_model(scene, generator)))
+    seed = int(torch.randint(1000, (), generator=generator))
+    return list(run_cases(truth, learned, choose_cases(names), seed, SCALE))
+
+
+def test_the_true_dynamics_keep_their_lines(scene, generator):
+    results = results_of(scene, SHORT, generator)
+    assert {r.case: r.true for r in results if not r.true_passes} == {}
+    table = as_table(results)
+    for result in results:
+        assert result.case in table
+        assert set(result.lines) <= set(result.learned)
+
+
+@pytest.mark.slow
+def test_the_true_dynamics_keep_the_lines_of_long_cases(scene, generator):
+    results = results_of(scene, list(SLOW), generator)
+    assert {r.case: r.true for r in results if not r.true_passes} == {}
+
+
+def test_what_does_not_depend_on_weights_holds_for_any(scene, generator):
+    for result in results_of(scene, list(INDEPENDENT), generator):
+        assert result.passes, (result.case, result.learned)
+
+
+def test_a_figure_that_is_no_number_keeps_no_line():
+    case = Case("made up", "", lambda *_: {}, lines={"x": 1.0})
+    assert case.passes({"x": 1.0}, is_true=False)
+    assert not case.passes({"x": 1.1}, is_true=False)
+    assert not case.passes({"x": float("nan")}, is_true=False)
+    assert case.passes({"x": float("nan")}, is_true=True)  # no line for true dynamics
+
+
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+def test_an_env_is_a_world_too(dynamics, generator):
+    make = EnvMaker("ant/run", dynamics, generator)
+    world = EnvWorld(make(4))
+    start = starts(world.scene, 4, generator)
+    plain = DynamicsWorld(make(4).dynamics)
+    mine, expected = (w.roll(start, 3) for w in (world, plain))
+    torch.testing.assert_close(mine["qpos"], expected["qpos"], atol=1e-9, rtol=1e-9)
+    with pytest.raises(ValueError, match="expected 4 states"):
+        world.roll(start[:2], 3)
+
+
+def test_momentum_and_energy_are_those_of_a_falling_cube(generator):
+    make = EnvMaker("cube/toss", "mujoco", generator)
+    scene = make.task.scene
+    start = clear_of_ground(scene, starts(scene, 3, generator))
+    found = mechanics(scene, start)
+    mass = scene.model.body_mass[1]
+    qvel, height = start["qvel"].numpy(), start["qpos"][:, 2].numpy()
+    momentum = mass * qvel[:, :3]
+    assert abs(found["momentum"] - momentum).max() < 1e-9
+    spin = scene.model.body_inertia[1][0] * qvel[:, 3:]
+    energy = 0.5 * (momentum * qvel[:, :3]).sum(1) + 0.5 * (spin * qvel[:, 3:]).sum(1)
+    energy -= mass * scene.model.opt.gravity[2] * height
+    assert abs(found["energy"] - energy).max() < 1e-9 * abs(energy).max()
+
+
+def test_the_command_writes_table_json_and_plot(tmp_path, capsys):
+    out, plot = tmp_path / "s.json", tmp_path / "s.png"
+    arguments = ["cartpole", "--cases", "history", "batching", "--scale", "0.01"]
+    assert main(["stability", *arguments, "--json", str(out), "--plot", str(plot)]) == 0
+    shown = capsys.readouterr().out
+    assert "| history |" in shown and "| batching |" in shown
+    assert set(json.loads(out.read_text())) == {
+        *("scene", "seed", "scale", "history", "batching")
+    }
+    assert plot.stat().st_size > 1000
+
+
+def test_bad_settings_are_named(capsys):
+    assert main(["stability", "cartpole", "--cases", "luck"]) == 2
+    assert "unknown case 'luck'" in capsys.readouterr().err
+    assert main(["stability", "cartpole", "--scale", "0"]) == 2
+    assert "expected a scale in (0, 1], got 0.0" in capsys.readouterr().err

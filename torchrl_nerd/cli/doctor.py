@@ -1,0 +1,46 @@
+"""``nerd doctor``: what this machine has, and whether the shipped models work on it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.evaluation.doctor import machine, shipped_checks, versions
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Versions, devices, and the self-check of every shipped model.
+
+    Example: nerd doctor --json results/doctor.json
+    """
+
+    json: Path | None = None
+    """Write what was found to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print what was found and return it.
+
+        Raises:
+            RuntimeError: a shipped model does not repeat its stored steps.
+        """
+        found = {"versions": versions(), "machine": machine()}
+        for title, entries in found.items():
+            print(title)
+            for key, value in entries.items():
+                print(f"  {key:<14}{value}")
+        print("shipped models: relative difference from their stored steps")
+        checks = shipped_checks()
+        for name, check in checks.items():
+            if "error" in check:
+                print(f"  {name:<28}{check['error']}")
+                continue
+            differences = f"MuJoCo {check['true']:.0e}, model {check['learned']:.0e}"
+            verdict = "ok" if check["agrees"] else "DIFFERS"
+            print(f"  {name:<28}{differences:<30}{check['seconds']:>5} s  {verdict}")
+        wrong = [name for name, check in checks.items() if not check["agrees"]]
+        if wrong:
+            raise RuntimeError(
+                f"expected every shipped model to repeat its stored steps, "
+                f"{', '.join(wrong)} did not"
+            )
+        return {**found, "models": checks}

@@ -1,0 +1,41 @@
+"""``nerd replay``: a fault again, in learned and true dynamics."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.evaluation.replay import read_dump, replay
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The steps that led to a fault, again in learned and true dynamics.
+
+    Envs with a fault_folder leave dumps: make_env(..., fault_folder=Path("faults")).
+
+    Example: nerd replay faults/fault_diverged.safetensors
+    """
+
+    file: Positional[Path]
+    """The dump."""
+    model: str | None = None
+    """Checkpoint folder; the shipped model of its scene by default."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print a line per step and return the figures."""
+        dump = read_dump(self.file)
+        about = dump.about
+        model = from_pretrained(self.model or about["scene"], dump.scene)
+        steps = replay(dump, model)
+        print(
+            f"{about['reason']} in row {about.get('row', '?')} of {about['scene']}, "
+            f"stepped by {about.get('dynamics', '?')}"
+        )
+        print("  ".join(f"{key:>14}" for key in steps[0]))
+        for step in steps:
+            print("  ".join(f"{value:>14.3g}" for value in step.values()))
+        return {**about, "steps": steps}

@@ -1,0 +1,66 @@
+"""``nerd stability``: hard cases in true and in learned dynamics."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.stability.plot import plot_results
+from torchrl_nerd.evaluation.stability.run import (
+    as_json,
+    as_table,
+    choose_cases,
+    run_cases,
+)
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.settings import SettingError
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Hard cases: conservation, contact, geometry, bad input, long runs, gradients.
+
+    A case whose line is not met stays in the table; the exit status is 0 all the same.
+
+    Example: nerd stability cartpole --json results/stability.json --plot stability.png
+    """
+
+    scene: Positional[str]
+    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    cases: tuple[str, ...] = ()
+    """Only these; all that apply by default."""
+    model: str | None = None
+    """Checkpoint folder; the shipped model by default."""
+    seed: int = 0
+    """Of starts and torques."""
+    scale: float = 1.0
+    """Share of the long rollouts' steps and of large batches' rows, in (0, 1]."""
+    plot: Path | None = None
+    """Draw every figure as a share of its line to this PNG."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Print a line per case, then the table, and return the figures."""
+        if not 0.0 < self.scale <= 1.0:
+            raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
+        cases = choose_cases(list(self.cases) or None)
+        scene = load_scene(self.scene)
+        model = from_pretrained(self.model or self.scene, scene)
+        truth = DynamicsWorld(MujocoDynamics(scene))
+        learned = DynamicsWorld(NeRDDynamics(model))
+        results = []
+        for result in run_cases(truth, learned, cases, self.seed, self.scale):
+            verdict = "met" if result.passes else "NOT MET"
+            print(f"{result.case:<18}{verdict:<9}{result.seconds:>7} s", flush=True)
+            results.append(result)
+        print()
+        print(as_table(results))
+        if self.plot is not None:
+            plot_results(results, self.plot, f"{self.scene}: learned dynamics")
+        return {"scene": self.scene, "seed": self.seed, "scale": self.scale} | as_json(
+            results
+        )

@@ -1,0 +1,88 @@
+"""A fault again, in learned and true dynamics, from the dump that it left."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.scenes import Scene, load_scene
+
+
+@dataclass(frozen=True)
+class Dump:
+    """What a fault left; see `envs.faults`.
+
+    | field | meaning |
+    |---|---|
+    | ``about`` | scene, dynamics, reason, row |
+    | ``steps`` | ``[T]``: states, actions and torques up to the fault |
+    """
+
+    about: dict[str, str]
+    steps: TensorDict
+
+    @property
+    def scene(self) -> Scene:
+        """The robot."""
+        return load_scene(self.about["scene"])
+
+
+def read_dump(path: Path) -> Dump:
+    """A dump from disk.
+
+    Raises:
+        ValueError: a file that is not there, or is no dump.
+    """
+    keys = {QPOS, QVEL, "action", "joint_torque"}
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = dict(file.metadata() or {})
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"expected a fault's dump in {path}, got {error}") from None
+    if not keys <= tensors.keys() or not {"scene", "reason"} <= about.keys():
+        raise ValueError(f"expected a fault's dump in {path}, got other tensors")
+    length = len(tensors[QPOS])
+    if any(not value.ndim or len(value) != length for value in tensors.values()):
+        raise ValueError(f"expected steps of one length in {path}, got several")
+    return Dump(about, TensorDict(tensors, [length]))
+
+
+def replay(dump: Dump, model: NeRD) -> list[dict[str, float]]:
+    """Every step of a dump from its recorded state, in both dynamics.
+
+    Returns:
+        For each step the largest speed before and after it in either dynamics, the
+        largest difference of their velocities, and the input's distance from the training
+        data (`Coverage.distance`).
+    """
+    learned, truth = NeRDDynamics(model), MujocoDynamics(dump.scene)
+    rows = []
+    learned.reset(dump.steps[:1])
+    for step in range(len(dump.steps)):
+        now = dump.steps[step : step + 1]
+        terrain = now.get(TERRAIN, None)
+        state, torque = now.select(QPOS, QVEL), now["joint_torque"]
+        mine, distance = learned.scored_step(state, torque, terrain)
+        truth.reset(state)
+        true = truth.step(state, torque, terrain)
+        rows.append(
+            {
+                "speed": _largest(state[QVEL]),
+                "speed, MuJoCo": _largest(true[QVEL]),
+                "speed, learned": _largest(mine[QVEL]),
+                "apart": _largest(mine[QVEL] - true[QVEL]),
+                "distance": float("nan") if distance is None else float(distance[0]),
+            }
+        )
+    return rows
+
+
+def _largest(x: Tensor) -> float:
+    return float(x.abs().max()) if x.isfinite().all() else torch.inf

@@ -1,0 +1,118 @@
+"""Does the trust gate know what the model does not?"""
+
+from typing import cast
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import open_loop_errors
+from torchrl_nerd.evaluation.stability.case import Case, Figures
+from torchrl_nerd.evaluation.stability.world import World
+from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.nerd import TARGET, NeRD
+
+ROWS, LENGTH, STEPS = 200, 40, 20
+FASTEST = 4.0  # speeds and torques beyond the training range, times
+FALSE_ALARMS = 0.01
+MISSED = "rows outside the training range not caught at 1% false alarms, share"
+RATIO = "error with fallback outside the range, of that inside"
+
+
+def _run(world: World, generator: Generator, scale: float) -> Figures:
+    learned = getattr(world, "dynamics", None)
+    if not isinstance(learned, NeRDDynamics):
+        return {MISSED: 0.0, RATIO: 1.0}  # MuJoCo needs no guard
+    scene, model = world.scene, learned.model
+    data = simulate(scene, ROWS, LENGTH, generator)
+    data = cast(TensorDict, data[is_sound(data)].flatten(0, 1))
+    order = torch.randperm(len(data), generator=generator)
+    inside, calibration, outside = cast(TensorDict, data[order]).chunk(3)
+    outside = _stretched(outside.clone(), generator)
+    seen, known, unseen = (_scores(model, d) for d in (inside, calibration, outside))
+    level = torch.quantile(known["distance"], 1.0 - FALSE_ALARMS)
+    beyond = unseen["excess"] > 0.0
+    large = torch.quantile(known["error"], 0.99)
+    wrong = torch.cat([x["error"] > large for x in (seen, unseen)])
+    figures = {
+        MISSED: float((unseen["distance"][beyond] <= level).double().mean()),
+        "false alarms at the shipped level, share": float(
+            (seen["distance"] > 1.0).double().mean()
+        ),
+    }
+    for name in ("distance", "mahalanobis", "excess"):
+        score = torch.cat([x[name] for x in (seen, unseen)])
+        figures[f"area under ROC of {name}, large errors"] = _auc(score, wrong)
+    guarded = GuardedDynamics(NeRDDynamics(model), "fallback")
+    rows = beyond.nonzero()[:ROWS, 0]
+    errors = [
+        _rollout_error(dynamics, part)
+        for dynamics, part in (
+            (guarded, outside[rows]),
+            (NeRDDynamics(model), inside[:ROWS]),
+            (NeRDDynamics(model), outside[rows]),
+        )
+    ]
+    figures[RATIO] = errors[0] / errors[1]
+    figures["the same without a guard"] = errors[2] / errors[1]
+    return figures
+
+
+def _stretched(data: TensorDict, generator: Generator) -> TensorDict:
+    """Speeds, torques or both up to `FASTEST` times as large."""
+    factor = 1.0 + (FASTEST - 1.0) * torch.rand(len(data), 1, generator=generator)
+    kind = torch.randint(3, (len(data), 1), generator=generator)
+    data[QVEL] = torch.where(kind == 0, data[QVEL], factor.double() * data[QVEL])
+    torque = data[JOINT_TORQUE]
+    data[JOINT_TORQUE] = torch.where(kind == 1, torque, factor.double() * torque)
+    return data
+
+
+def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
+    """Scores of inputs, and the normalised one-step errors that they should foretell."""
+    terrain, torque = data.get(TERRAIN, None), data[JOINT_TORQUE]
+    now = data[QPOS], data[QVEL]
+    after = MujocoDynamics(model.scene).step(data, torque, terrain)
+    fine = torch.all(after[QVEL].isfinite(), -1)
+    target = model.state_delta.delta(*now, after[QPOS], after[QVEL])
+    features = model.features(*now, torque, terrain)
+    token = model.assemble(features, *now)
+    with torch.no_grad():
+        output = model.network.step(token, model.network.empty_memory(len(token)))
+    error = output.double() - model.normalize.normalize(TARGET, target)
+    coverage = model.coverage
+    return {
+        "error": error.square().mean(-1).sqrt()[fine],
+        "distance": coverage.distance(features)[fine],
+        "mahalanobis": coverage.mahalanobis(features)[fine],
+        "excess": coverage.excess(features)[fine],
+    }
+
+
+def _auc(score: Tensor, is_large: Tensor) -> float:
+    """Share of pairs of a large and a small error that the score puts in order."""
+    rank = torch.empty_like(score)
+    rank[score.argsort()] = torch.arange(1.0, len(score) + 1).to(score)
+    large, small = int(is_large.sum()), int((~is_large).sum())
+    if not large or not small:
+        return float("nan")
+    return float((rank[is_large].sum() - large * (large + 1) / 2) / (large * small))
+
+
+def _rollout_error(
+    dynamics: NeRDDynamics | GuardedDynamics, start: TensorDict
+) -> float:
+    """Median over rows of the mean position error of a passive rollout, m and rad."""
+    start = start.select(QPOS, QVEL, TERRAIN, strict=False).clone()
+    errors = open_loop_errors(MujocoDynamics(dynamics.scene), dynamics, start, STEPS)
+    return float(torch.stack(list(errors.values())).mean((0, 2)).nanmedian())
+
+
+CASE = Case(
+    "trust",
+    "inputs unlike those of training are told apart, and MuJoCo takes over for them",
+    _run,
+    lines={MISSED: 0.05, RATIO: 2.0},
+)

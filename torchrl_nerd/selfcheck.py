@@ -1,0 +1,121 @@
+"""A few steps kept beside the weights, and whether this machine still makes them.
+
+A checkpoint says which physics it learned; another MuJoCo, processor or library may step
+differently. Some states, what MuJoCo made of them where the model was trained, and what the
+model itself made of them are stored with it and tried again when it is loaded.
+"""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.files import write_atomically
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.nerd import NeRD
+
+FILE = "check.safetensors"
+ROWS = 8
+TRUE_TOLERANCE, LEARNED_TOLERANCE = 1e-6, 1e-3  # relative to 1 + the largest number
+
+
+@dataclass(frozen=True)
+class SelfCheck:
+    """How far this machine's next states are from the stored ones, relative.
+
+    | field | meaning |
+    |---|---|
+    | ``true`` | MuJoCo's |
+    | ``learned`` | the model's |
+    """
+
+    true: float
+    learned: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both are within their tolerance."""
+        return self.true <= TRUE_TOLERANCE and self.learned <= LEARNED_TOLERANCE
+
+
+def write_check(model: NeRD, folder: Path) -> None:
+    """Store a few steps of this machine beside the model's weights."""
+    scene = model.scene
+    start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
+    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
+    torque = (scale * high).clone()
+    given = {QPOS: start[QPOS], QVEL: start[QVEL], "joint_torque": torque}
+    if TERRAIN in start:
+        given[TERRAIN] = start[TERRAIN]
+    tensors = {**given, **_steps(model, given)}
+    tensors = {key: value.contiguous() for key, value in tensors.items()}
+    write_atomically(folder / FILE, lambda aside: save_file(tensors, aside))
+
+
+def self_check(model: NeRD, folder: Path) -> SelfCheck | None:
+    """Step the stored states again; None where there are none.
+
+    Args:
+        model: as it was loaded from ``folder``.
+        folder: of the checkpoint.
+
+    Raises:
+        ValueError: a file that cannot be read, or states of another robot.
+    """
+    if not (folder / FILE).is_file():
+        return None
+    try:
+        stored = load_file(folder / FILE)
+        made = _steps(model, stored)
+        worst = {key: _difference(value, stored[key]) for key, value in made.items()}
+    except (SafetensorError, KeyError, RuntimeError, ValueError, IndexError) as error:
+        raise ValueError(
+            f"expected a few steps of '{model.scene.name}' in {folder / FILE}, got "
+            f"something else: {str(error).splitlines()[0]}"
+        ) from None
+    true, learned = (
+        max(worst[f"{kind}_{key}"] for key in (QPOS, QVEL))
+        for kind in ("true", "learned")
+    )
+    return SelfCheck(true, learned)
+
+
+def warn_of_differences(check: SelfCheck, folder: Path) -> None:
+    """Say in one sentence what this machine does differently, if it does."""
+    if not check.agrees:
+        warnings.warn(
+            f"this machine does not repeat the steps stored in {folder}: MuJoCo differs "
+            f"by {check.true:.1e} (up to {TRUE_TOLERANCE:.0e} expected), the model by "
+            f"{check.learned:.1e} (up to {LEARNED_TOLERANCE:.0e}), relative",
+            stacklevel=3,
+        )
+
+
+def _steps(model: NeRD, given: dict[str, Tensor]) -> dict[str, Tensor]:
+    """One step of MuJoCo and of the model."""
+    state = TensorDict({key: given[key] for key in (QPOS, QVEL)}, [len(given[QPOS])])
+    torque, terrain = given["joint_torque"], given.get(TERRAIN)
+    worlds = {
+        "true": MujocoDynamics(model.scene, num_threads=1),
+        "learned": NeRDDynamics(model),
+    }
+    made = {}
+    for kind, dynamics in worlds.items():
+        dynamics.reset(state)
+        after = dynamics.step(state, torque, terrain)
+        made |= {f"{kind}_{key}": after[key] for key in (QPOS, QVEL)}
+    return made
+
+
+def _difference(a: Tensor, b: Tensor) -> float:
+    """Largest difference relative to 1 + the largest number; NaN equals NaN."""
+    a, b = a.nan_to_num(0.0), b.nan_to_num(0.0)
+    if a.shape != b.shape:
+        raise ValueError(f"shapes {tuple(a.shape)} and {tuple(b.shape)}")
+    return float((a - b).abs().max() / (1.0 + b.abs().max())) if a.numel() else 0.0
