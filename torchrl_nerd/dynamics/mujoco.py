@@ -115,7 +115,8 @@ class MujocoDynamics:
         timestep = self._model.opt.timestep
         velocity = slice(1 + qpos.shape[1], 1 + qpos.shape[1] + qvel.shape[1])
         before = fine[:, -2, velocity] if fine.shape[1] > 1 else qvel
-        self._warmstart = (fine[:, -1, velocity] - before) / timestep
+        with np.errstate(invalid="ignore"):  # infinite rows are found below
+            self._warmstart = (fine[:, -1, velocity] - before) / timestep
         states = fine[:, self.scene.substeps - 1 :: self.scene.substeps]
         # a row that MuJoCo gave up on stopped before the end: its clock is behind
         clock = self.scene.control_step * np.arange(1, states.shape[1] + 1)
