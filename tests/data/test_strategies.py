@@ -21,11 +21,12 @@ from torchrl_nerd.data.generate import (
     simulate,
 )
 from torchrl_nerd.data.policy_data import policy_data
-from torchrl_nerd.data.starts import Fallen, Standing
+from torchrl_nerd.data.starts import Fallen, Nudged, Standing
 from torchrl_nerd.data.strategies import mix, resample, strategies
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import GroundTruthEnv
 from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
@@ -266,3 +267,18 @@ def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
     del card["strategy"]
     write_json(tmp_path / CARD, card)
     generate(scene, config, tmp_path, quiet=True)  # as it was written by older versions
+
+
+def test_nudged_robots_lie_near_where_they_fell(scene, generator):
+    seed, rows = int(torch.randint(2**31, (), generator=generator)), 64
+    fallen = Fallen(scene, 0.2)
+    rest = fallen(rows, Generator().manual_seed(seed))
+    nudged = Nudged(fallen)(rows, Generator().manual_seed(seed))
+    push = (nudged["qvel"] - rest["qvel"]).abs().amax(-1)
+    assert push.max() < 3.0 * 6.0  # six deviations of the largest unit
+    assert push.min() > 0.0
+    assert push.quantile(0.25) < 0.1 * push.quantile(0.75)  # over decades
+    moved = differentiate_pos(scene.layout, rest["qpos"], nudged["qpos"])
+    assert moved.abs().max() < 0.03 * 6.0
+    still = Nudged(fallen, 1e-9)(rows, Generator().manual_seed(seed))
+    assert (still["qvel"] - rest["qvel"]).abs().amax(-1).min() < 1e-4
