@@ -14,6 +14,7 @@ from torchrl_nerd.cli.eval import Eval
 from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
 from torchrl_nerd.cli.play import Play
+from torchrl_nerd.cli.plot import Plot
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
 from torchrl_nerd.files import write_json
@@ -28,6 +29,7 @@ COMMANDS = {
     "finetune": Finetune,
     "transfer": Transfer,
     "play": Play,
+    "plot": Plot,
     "explain": Explain,
     "bench": Bench,
 }
