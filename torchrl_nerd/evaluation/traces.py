@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -48,7 +49,7 @@ class Traces:
 
 def trace(
     dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive
-) -> TensorDictBase:
+) -> TensorDict:
     """States ``[rows, steps + 1]``, the start first: ``qpos`` and ``qvel``."""
     terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL)
@@ -57,7 +58,7 @@ def trace(
     for step in range(steps):
         state = dynamics.step(state, drive(step, state), terrain)
         states.append(state.select(QPOS, QVEL))
-    return torch.stack(states, 1)
+    return cast(TensorDict, TensorDict.stack(states, 1))
 
 
 def energy(scene: Scene, qpos: Tensor, qvel: Tensor) -> Tensor:
@@ -100,7 +101,10 @@ def compare_traces(
     row = int(order[rows // 2])
     terrain = start.get(TERRAIN, None)
     ground = None if terrain is None else terrain[row].expand(steps + 1, -1)
-    chosen = dict(zip(NAMES, (path[row] for path in paths), strict=True))
+    chosen = {
+        name: cast(TensorDict, path[row])
+        for name, path in zip(NAMES, paths, strict=True)
+    }
     gaps = None
     if scene.terrain is not None:
         gaps = {

@@ -1,6 +1,7 @@
 """Numbers that describe a data set: ranges, coverage, contact, outliers."""
 
 from dataclasses import asdict, dataclass, field
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -96,7 +97,7 @@ def survey(scene: Scene, data: TensorDictBase, seed: int = 0) -> Survey:
     if count > most:
         draw = torch.randperm(count, generator=Generator().manual_seed(seed))[:most]
         picks = draw.sort().values
-    seen = data[picks].to_tensordict()
+    seen = cast(TensorDictBase, data[picks]).to_tensordict()
     tables = _tables(scene, seen)
     finite = [values.isfinite() for values, _, _, _ in tables]
     contact = _contact(scene, seen)
