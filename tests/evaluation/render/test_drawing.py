@@ -100,12 +100,31 @@ def picture(scene, qpos: torch.Tensor) -> np.ndarray:
     return DrawingRenderer(poser, camera, SIZE).frame(0, qpos[0], qpos[-1])
 
 
-def test_every_robot_is_in_the_picture(scene, generator):
+def assert_seen(scene, generator) -> None:
     start, _ = scene.sample_initial(2, generator)
     pixels = picture(scene, start["qpos"][:1])
     assert pixels.shape == (SIZE[1], SIZE[0], 3)
     is_colored = np.ptp(pixels.astype(int), -1) > 60
     assert 0.003 < is_colored.mean() < 0.6
+
+
+def test_every_robot_is_in_the_picture(scene, generator):
+    assert_seen(scene, generator)
+
+
+@pytest.mark.parametrize(
+    "name", ["dm_control/cheetah-run", "dm_control/reacher-easy", "gymnasium/Hopper-v5"]
+)
+def test_robots_of_others_are_in_the_picture(name, generator):
+    assert_seen(load_scene(name), generator)
+
+
+def test_walls_are_left_out_where_there_is_a_floor():
+    walls = '<geom type="plane" size="1 1 1" euler="90 0 0"/>' * 2
+    walled = FLOATER.replace("<body pos", walls + "<body pos", 1)
+    assert Poser(make_scene(walled)).planes == [0]
+    only_walls = walled.replace('name="floor"', 'name="floor" euler="0 90 0"')
+    assert Poser(make_scene(only_walls)).planes == [0, 1, 2]
 
 
 def test_the_picture_goes_with_the_robot(generator):
