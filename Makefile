@@ -20,7 +20,7 @@ MADE_FROM := $(shell { pwd; cat pyproject.toml $(CONSTRAINTS); } | cksum | cut -
 STAMP := $(VENV)/.installed-$(MADE_FROM)
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu format build lock clean
+.PHONY: help setup demo test check test-slow test-gpu format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -61,12 +61,16 @@ format: $(STAMP) ## repair what ruff can repair
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 
+docs: $(STAMP) ## the documentation site in site/, where a warning is an error
+	@$(PY) -c 'import mkdocs, material, mkdocstrings' 2>/dev/null || $(PIP) -c $(CONSTRAINTS) -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict -q
+
 build: $(STAMP) ## wheel and source archive in dist/
 	$(PY) -m hatchling build
 
 lock: ## write the newest versions that pyproject.toml allows to constraints.txt
 	rm -rf $(VENV)
-	$(MAKE) setup CONSTRAINTS=/dev/null
+	$(MAKE) setup docs CONSTRAINTS=/dev/null
 	echo "# The versions that make installs; written by make lock." > constraints.txt
 	$(PY) -m pip freeze -qq --exclude-editable | sed 's/+.*//' >> constraints.txt
 

@@ -1,18 +1,160 @@
-"""What the documentation shows is run."""
+"""What the documentation says exists: links, commands, names, examples, docstrings."""
 
+import doctest
+import importlib
+import inspect
+import os
+import pkgutil
 import re
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
+from tensordict import TensorDict
 
-DOCS = Path(__file__).parents[1] / "docs"
-SNIPPET = re.compile(r"```python\n(.*?)```", re.DOTALL)
+import torchrl_nerd
+from torchrl_nerd import load_scene
+from torchrl_nerd.cli import COMMANDS, main
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
+CODE = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
+RUN = [ROOT / "docs" / name for name in ("start.md", "drop_ins.md", "stability.md")]
+RUN += sorted((ROOT / "docs" / "howto").glob("*.md"))
+PACKAGES = [
+    "torchrl_nerd",
+    *(f"torchrl_nerd.{m.name}" for m in pkgutil.iter_modules(torchrl_nerd.__path__)),
+]
+WITH_EXAMPLES = [
+    path
+    for path in Path(torchrl_nerd.__file__).parent.rglob("*.py")
+    if ">>> " in path.read_text()
+]
+SHARED = {"load_scene": load_scene, "torch": torch, "TensorDict": TensorDict}
+"""What examples take for granted."""
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 
 
-@pytest.mark.parametrize("page", ["drop_ins.md"])
-def test_snippets_run_from_the_first_to_the_last(page, tmp_path, monkeypatch):
+def prose(page: Path) -> str:
+    """A page without its code."""
+    return re.sub(r"`[^`\n]*`", "", CODE.sub("", page.read_text()))
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    return [code for kind, code in CODE.findall(page.read_text()) if kind in languages]
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of a page's headings, as links have them."""
+    titles = re.findall(r"^#+ (.+)$", CODE.sub("", page.read_text()), re.M)
+    plain = (re.sub(r"[^\w\s-]", "", title.lower()) for title in titles)
+    return {re.sub(r"[\s-]+", "-", title).strip("-") for title in plain}
+
+
+@each_page
+def test_every_relative_link_leads_somewhere(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.is_file(), f"{page.name}: {link}"
+        assert target.is_relative_to(ROOT)
+        if anchor:
+            assert anchor in anchors(target), f"{page.name}: {link}"
+
+
+@each_page
+def test_every_command_exists_and_takes_these_options(page, capsys):
+    lines = "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
+    helps: dict[str, str] = {}
+    for line in lines:
+        words = line.split("#")[0].split()
+        if not words or words[0] != "nerd" or words[1] == "COMMAND":
+            continue
+        name = words[1]
+        assert name in COMMANDS, line
+        if name not in helps:
+            with pytest.raises(SystemExit):
+                main([name, "--help"])
+            helps[name] = capsys.readouterr().out
+        for option in (word for word in words if word.startswith("--")):
+            assert option in helps[name], line
+
+
+@each_page
+def test_every_file_that_is_named_is_there(page):
+    """Files of the repository in `code`, from its root or from the package."""
+    pattern = r"`((?:[\w.-]+/)+[\w-]+\.(?:py|md|json|png))`"
+    for name in re.findall(pattern, page.read_text()):
+        if "NAME" in name or "SCENE" in name or name.startswith(("runs/", "results/")):
+            continue
+        places = (ROOT / name, ROOT / "torchrl_nerd" / name, page.parent / name)
+        assert any(place.exists() for place in places), f"{page.name}: {name}"
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda p: p.stem)
+def test_code_of_the_pages_runs(page, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    snippets, names = SNIPPET.findall((DOCS / page).read_text()), {}
-    assert snippets
-    for snippet in snippets:
-        exec(compile(snippet, page, "exec"), names)
+    names = {"__name__": "__main__"}  # a page's blocks follow on each other
+    for code in blocks(page, "python"):
+        exec(compile(code, page.name, "exec"), names)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_code_of_every_page_can_be_read(page):
+    for code in blocks(page, "python"):
+        compile(code, page.name, "exec")
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_public_name_says_what_it_is(name):
+    module = importlib.import_module(name)
+    assert module.__doc__
+    for public in getattr(module, "__all__", []):
+        value = getattr(module, public)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert inspect.getdoc(value), f"{name}.{public}"
+
+
+@pytest.mark.parametrize("path", WITH_EXAMPLES, ids=lambda p: p.stem)
+def test_examples_in_docstrings_run(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    name = ".".join(parts).removesuffix(".__init__")
+    module = importlib.import_module(name)
+    failed, tried = doctest.testmod(module, extraglobs=SHARED | vars(module))
+    assert tried > 0 and failed == 0
+
+
+def test_the_site_shows_pages_that_exist():
+    nav = (ROOT / "mkdocs.yml").read_text().split("\nnav:")[1]
+    named = re.findall(r": ([\w/]+\.md)$", nav, re.M)
+    assert len(named) > 15 and len(named) == len(set(named))
+    assert all((ROOT / "docs" / name).is_file() for name in named)
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    if find_spec("mkdocs") is None:
+        pytest.skip("no mkdocs: make docs")
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "-d",
+        tmp_path / "s",
+    ]
+    env = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for page in (tmp_path / "s").rglob("*.html"):
+        text = page.read_text()
+        loaded = r'<(?:script|img)[^>]+src="https?:|<link[^>]+stylesheet[^>]+https?:'
+        assert not re.search(loaded, text), f"{page.name} fetches something"

@@ -7,10 +7,12 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
-from torchrl_nerd.data.generate import CARD, DataConfig, generate
+from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
 from torchrl_nerd.data.recorded import write_tosses
+from torchrl_nerd.evaluation.data_report.page import write_page
+from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
 from torchrl_nerd.files import folder_name, read_json
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes import Scene, load_scene
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,8 @@ class Data:
     Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
 
     Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
+
+    Example: nerd data cartpole --inspect
     """
 
     scene: Positional[str]
@@ -30,6 +34,8 @@ class Data:
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
+    inspect: bool = False
+    """Write a page about the data set, made before or now, to report.html in its folder."""
     json: Path | None = None
     """Write the figures to this file."""
     quiet: bool = False
@@ -38,6 +44,10 @@ class Data:
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
         if self.recorded is not None:
+            if self.inspect:
+                raise ValueError(
+                    "expected --inspect without --from: it is of drawn data"
+                )
             scene = real_scene(self.scene)
             out = self.out or Path("datasets") / f"{scene.name}_recorded"
             card = write_tosses(self.recorded, scene, out)
@@ -51,4 +61,13 @@ class Data:
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
         )
-        return card
+        return card | self.report(scene, out, card)
+
+    def report(self, scene: Scene, out: Path, card: dict[str, Any]) -> dict[str, Any]:
+        """Write the page where it was asked for, and return its figures."""
+        if not self.inspect:
+            return {}
+        found = survey(scene, load_data(scene, out))
+        write_page(found, card, out / "report.html")
+        print(f"report: {out / 'report.html'}")
+        return {"survey": survey_figures(found)}

@@ -15,6 +15,7 @@ from torchrl_nerd.cli.eval import Eval
 from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
 from torchrl_nerd.cli.play import Play
+from torchrl_nerd.cli.plot import Plot
 from torchrl_nerd.cli.replay import Replay
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
@@ -31,6 +32,7 @@ COMMANDS = {
     "finetune": Finetune,
     "transfer": Transfer,
     "play": Play,
+    "plot": Plot,
     "explain": Explain,
     "bench": Bench,
     "stability": Stability,

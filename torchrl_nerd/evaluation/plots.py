@@ -27,6 +27,15 @@ PARTS = {  # of a joint's qpos
     mjtJoint.mjJNT_SLIDE: ("(m)",),
     mjtJoint.mjJNT_HINGE: ("(rad)",),
 }
+DOFS = {  # of a joint's qvel
+    mjtJoint.mjJNT_FREE: (
+        *("x' (m/s)", "y' (m/s)", "z' (m/s)"),
+        *("wx (rad/s)", "wy (rad/s)", "wz (rad/s)"),
+    ),
+    mjtJoint.mjJNT_BALL: ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)"),
+    mjtJoint.mjJNT_SLIDE: ("speed (m/s)",),
+    mjtJoint.mjJNT_HINGE: ("speed (rad/s)",),
+}
 STYLES = ("-", "--", ":", "-.")
 PANEL = (7.0, 2.0)  # inches
 
@@ -66,7 +75,7 @@ def plot_states(
         scene: the robot.
         path: of the PNG.
     """
-    labels = [*_qpos_names(scene), "reward"]
+    labels = [*qpos_names(scene), "reward"]
     figure, panels = make_figure(len(labels), height=PANEL[1] * len(labels))
     for number, (name, steps) in enumerate(episodes.items()):
         values = torch.cat((steps["qpos"], steps["reward"]), -1)
@@ -80,12 +89,21 @@ def plot_states(
     save_figure(figure, path)
 
 
-def _qpos_names(scene: Scene) -> list[str]:
+def qpos_names(scene: Scene) -> list[str]:
     """Name and unit of every entry of ``qpos``."""
     model, names = scene.model, []
     for joint in range(model.njnt):
         name = model.joint(joint).name
         names += [f"{name} {part}" for part in PARTS[mjtJoint(model.jnt_type[joint])]]
+    return names
+
+
+def dof_names(scene: Scene) -> list[str]:
+    """Name and unit of every entry of ``qvel``."""
+    model, names = scene.model, []
+    for joint in range(model.njnt):
+        name = model.joint(joint).name
+        names += [f"{name} {part}" for part in DOFS[mjtJoint(model.jnt_type[joint])]]
     return names
 
 

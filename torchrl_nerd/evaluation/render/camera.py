@@ -11,7 +11,8 @@ from torchrl_nerd.evaluation.render.poser import Poser
 
 FIELD_OF_VIEW = 45.0  # degrees, vertical, MuJoCo's default
 MARGIN = 1.15
-OBLIQUE, SIDE = (125.0, -18.0), -8.0  # azimuth and elevation, degrees
+OBLIQUE, ABOVE = (125.0, -18.0), (90.0, -75.0)  # azimuth and elevation, degrees
+SIDE = -8.0  # elevation, degrees
 SMOOTHING = 0.25  # s: how lazily the camera follows
 
 
@@ -82,21 +83,27 @@ def aim(poser: Poser, path: Tensor, step_size: float, aspect: float) -> Camera:
     else:
         lows[0], highs[0] = _with(poser.scene.mount[0], lows[0], highs[0])
         lookat = np.broadcast_to((lows.min(0) + highs.max(0)) / 2.0, lows.shape)
-    side = poser.side()
-    azimuth, elevation = OBLIQUE if side is None else (_along(side), SIDE)
-    camera = Camera(lookat, 1.0, azimuth, elevation, side is not None)
+    azimuth, elevation, is_side = _view(poser.common_axis())
+    camera = Camera(lookat, 1.0, azimuth, elevation, is_side)
     spread = np.maximum(abs(lows - lookat), abs(highs - lookat)).max(0)
     width, height, depth = abs(camera.axes) @ spread
     half = MARGIN * max(height, width / aspect)
-    distance = half / tan(radians(FIELD_OF_VIEW / 2.0)) + (
-        0.0 if side is None else depth
-    )
+    distance = half / tan(radians(FIELD_OF_VIEW / 2.0)) + (depth if is_side else 0.0)
     return replace(camera, distance=float(distance))
 
 
 def _with(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """A box grown to hold a point, ``(2, 3)``."""
     return np.stack((np.minimum(low, point), np.maximum(high, point)))
+
+
+def _view(axis: np.ndarray | None) -> tuple[float, float, bool]:
+    """Azimuth and elevation, and whether they are along a planar robot's axis."""
+    if axis is None or 0.1 < abs(axis[2]) < 0.9:
+        return (*OBLIQUE, False)
+    if abs(axis[2]) >= 0.9:
+        return (*ABOVE, False)
+    return _along(axis), SIDE, True
 
 
 def _along(axis: np.ndarray) -> float:

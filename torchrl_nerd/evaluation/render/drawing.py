@@ -1,6 +1,6 @@
 """Drawings of a robot by matplotlib: no OpenGL, no display, no perspective."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
@@ -74,12 +74,13 @@ class DrawingRenderer:
         for plane in self.poser.planes:
             line = profile(data, plane, camera, number) if camera.is_side else None
             if line is not None:
-                axes.fill_between(*line.T, -FAR * camera.half_height, color="0.93")
-                axes.plot(*line.T, color="0.5", lw=1.0)
+                x, y = line.T
+                axes.fill_between(x, y, -FAR * camera.half_height, color="0.93")
+                axes.plot(x, y, color="0.5", lw=1.0)
                 continue
             lines = grid(data, plane, camera.lookat[number], grid_spacing(camera))
-            flat = camera.project(lines, number)
-            look = {"colors": "0.86", "linewidths": 0.8, "zorder": 0}
+            flat = list(camera.project(lines, number))
+            look: dict[str, Any] = {"colors": "0.86", "linewidths": 0.8, "zorder": 0}
             axes.add_collection(LineCollection(flat, **look))
 
     def _robot(
@@ -89,8 +90,11 @@ class DrawingRenderer:
 
         poser, camera = self.poser, self.camera
         data = poser.pose(qpos)
-        bones = camera.project(poser.bones(), number)
-        look = {"colors": [GHOST if is_ghost else BONE], "linewidths": 2.0}
+        bones = list(camera.project(poser.bones(), number))
+        look: dict[str, Any] = {
+            "colors": [GHOST if is_ghost else BONE],
+            "linewidths": 2.0,
+        }
         axes.add_collection(LineCollection(bones, **look, zorder=1))
         geoms = sorted(
             poser.moving if is_ghost else poser.shapes,

@@ -3,7 +3,9 @@
 import shutil
 import subprocess
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,14 +63,15 @@ def write_movie(pictures: Iterable["Image"], path: Path) -> None:
 def _write_gif(pictures: Iterable["Image"], path: Path) -> None:
     from PIL.Image import Dither, Quantize
 
-    frames = [
-        x.quantize(COLORS, Quantize.FASTOCTREE, dither=Dither.NONE) for x in pictures
-    ]
-    frames[0].save(
+    def few_colors(picture: "Image") -> "Image":
+        return picture.quantize(COLORS, Quantize.FASTOCTREE, dither=Dither.NONE)
+
+    frames = map(few_colors, pictures)
+    next(frames).save(
         path,
         format="GIF",
         save_all=True,
-        append_images=frames[1:],
+        append_images=frames,
         duration=1000 // FRAMES_PER_SECOND,
         loop=0,
     )
@@ -77,20 +80,19 @@ def _write_gif(pictures: Iterable["Image"], path: Path) -> None:
 def _write_mp4(pictures: Iterable["Image"], path: Path) -> None:
     pictures = iter(pictures)
     first = next(pictures)
-    source = [
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        f"{first.width}x{first.height}",
-    ]
+    size = f"{first.width}x{first.height}"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size]
     source += ["-r", str(FRAMES_PER_SECOND), "-i", "-"]
     target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-f", "mp4", str(path)]
     command = [str(find_ffmpeg()), "-y", "-loglevel", "error", *source, *target]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
-    raw = first.tobytes() + b"".join(picture.tobytes() for picture in pictures)
-    _, said = process.communicate(raw)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stderr=pipe) as process:
+        assert process.stdin is not None and process.stderr is not None
+        with suppress(BrokenPipeError):  # it gave up; what it says comes next
+            for picture in chain([first], pictures):
+                process.stdin.write(picture.tobytes())
+            process.stdin.close()
+        complaint = process.stderr.read().decode(errors="replace")
     if process.returncode:
-        complaint = " ".join(said.decode(errors="replace").split())
+        complaint = " ".join(complaint.split())
         raise ValueError(f"ffmpeg could not write {path.name}: {complaint}")

@@ -19,8 +19,8 @@ from torch import Tensor
 from torchrl_nerd.evaluation.render.camera import FIELD_OF_VIEW, Camera
 from torchrl_nerd.evaluation.render.ghost import add_ghost
 from torchrl_nerd.evaluation.render.outline import grid
-from torchrl_nerd.evaluation.render.poser import Poser
-from torchrl_nerd.evaluation.render.style import BONE, PAPER, grid_spacing
+from torchrl_nerd.evaluation.render.poser import PLANE, Poser
+from torchrl_nerd.evaluation.render.style import BONE, GROUND, PAPER, grid_spacing
 
 HEADLESS = ("egl", "osmesa")
 NONE = ("0", "disable", "disabled", "false", "no", "off")  # MuJoCo's words for it
@@ -85,7 +85,7 @@ class OpenGLRenderer:
         model = poser.model
         model.vis.global_.offwidth, model.vis.global_.offheight = size
         model.vis.global_.fovy = FIELD_OF_VIEW
-        _soften(model, camera)
+        _soften(poser, camera)
         self._size = size
         self._gl: Any = import_module(f"mujoco.{gl}").GLContext(*size)
         self._gl.make_current()
@@ -156,8 +156,13 @@ class OpenGLRenderer:
         self._gl.free()
 
 
-def _soften(model: mujoco.MjModel, camera: Camera) -> None:
-    """White haze far away in place of a black sky, and light that does not blind."""
+def _soften(poser: Poser, camera: Camera) -> None:
+    """Endless plain ground, haze in place of a black sky, light that does not blind."""
+    model, planes = poser.model, poser.model.geom_type == PLANE
+    model.geom_rgba[planes, 3] = 0.0  # walls
+    model.geom_rgba[poser.planes], model.geom_matid[planes] = GROUND, -1
+    model.geom_size[planes] = (0.0, 0.0, camera.half_height)  # endless; its mesh
+    model.mat_reflectance[:] = 0.0
     haze = model.vis.map
     haze.zfar = 10.0 * HAZE[1] * camera.distance / model.stat.extent
     haze.fogstart, haze.fogend = (x * camera.distance / model.stat.extent for x in HAZE)

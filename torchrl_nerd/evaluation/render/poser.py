@@ -14,6 +14,8 @@ PLANE, HEIGHT_FIELD, MESH = (
     int(mujoco.mjtGeom.mjGEOM_HFIELD),
     int(mujoco.mjtGeom.mjGEOM_MESH),
 )
+PLAIN = (0.2, 0.4, 0.7, 1.0)
+STEEP = 0.3  # upward part of the normal of a wall
 VISIBLE_GROUPS = 3  # MuJoCo draws geom groups 0 to 2 by default
 
 
@@ -27,7 +29,6 @@ class Poser:
 
     def __init__(self, scene: Scene, terrain: Tensor | None = None) -> None:
         self.scene, self.model = scene, copy.copy(scene.model)
-        self.model.geom_size[self.planes, :2] = 0.0  # drawn as endless as they are
         self.data = mujoco.MjData(self.model)
         ground = scene.terrain
         if terrain is not None and ground is not None and ground.is_per_row:
@@ -36,6 +37,7 @@ class Poser:
                 pose[:size],
                 pose[size:],
             )
+        self.planes = self._grounds()
 
     def pose(self, qpos: Tensor | np.ndarray) -> mujoco.MjData:
         """The data after kinematics at ``qpos (nq,)``; the same object every time."""
@@ -70,10 +72,12 @@ class Poser:
             and model.geom_group[geom] < VISIBLE_GROUPS
         ]
 
-    @property
-    def planes(self) -> list[int]:
-        """Flat grounds."""
-        return np.flatnonzero(self.model.geom_type == PLANE).tolist()
+    def _grounds(self) -> list[int]:
+        """Planes to draw: walls only where there is nothing else."""
+        mujoco.mj_kinematics(self.model, self.data)
+        planes = np.flatnonzero(self.model.geom_type == PLANE)
+        is_flat = self.data.geom_xmat[planes, 8] > STEEP
+        return (planes[is_flat] if is_flat.any() else planes).tolist()
 
     @property
     def moving(self) -> list[int]:
@@ -93,17 +97,18 @@ class Poser:
         colors = model.geom_rgba.copy()
         has_material = model.geom_matid >= 0
         colors[has_material] = model.mat_rgba[model.geom_matid[has_material]]
+        colors[(colors == 1.0).all(-1)] = PLAIN  # textured, or never given a colour
         return colors
 
-    def side(self) -> np.ndarray | None:
-        """The horizontal axis ``(3,)`` that all hinges turn about, None for no such one.
+    def common_axis(self) -> np.ndarray | None:
+        """The axis ``(3,)`` that all hinges of a fixed robot turn about, if there is one.
 
-        The axis that a planar robot is best seen along.
+        A planar robot is best seen along it.
         """
         if self.scene.base.is_floating:
             return None
         data = self.pose(self.model.qpos0)
         axes = data.xaxis[self.model.jnt_type == HINGE]
-        if len(axes) == 0 or abs(axes[0, 2]) > 0.1:
+        if len(axes) == 0:
             return None
         return axes[0] if (abs(axes @ axes[0]) > 0.99).all() else None

@@ -6,6 +6,7 @@ from torchrl_nerd.evaluation.render.camera import Camera
 
 PAPER = (1.0, 1.0, 1.0)
 GHOST = (0.55, 0.55, 0.55, 0.35)
+GROUND = (0.8, 0.85, 0.8, 1.0)
 BONE = (0.45, 0.45, 0.45, 1.0)
 INK, FAINT = (30, 30, 30), (120, 120, 120)
 STEPS = (1.0, 2.0, 5.0)

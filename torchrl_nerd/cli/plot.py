@@ -1,0 +1,88 @@
+"""``nerd plot``: figures of a model's rollouts, or of a training run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.protocols import protocol_of
+from torchrl_nerd.evaluation.rollout_error import scene_of
+from torchrl_nerd.evaluation.trace_plot import plot_traces, plot_training
+from torchrl_nerd.evaluation.traces import Traces, compare_traces
+from torchrl_nerd.files import folder_name
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.settings import expect_at_least
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Error, energy and distance to the ground over time; or the curves of a training run.
+
+    Example: nerd plot double_pendulum --case "ground 3" --out rollouts.png
+
+    Example: nerd plot runs/cartpole
+    """
+
+    what: Positional[str]
+    """Name of a robot, as for eval; or the folder of a run, which holds a log.csv."""
+    model: Path | None = None
+    """Checkpoint folder; the shipped model by default."""
+    case: str | None = None
+    """Of the robot's protocol, as eval names them; the first by default."""
+    rows: int = 64
+    """Trajectories."""
+    steps: int | None = None
+    """Control steps; the protocol's shortest horizon by default."""
+    seed: int = 500
+    """Of the starts."""
+    out: Path | None = None
+    """PNG to write; runs/NAME_rollouts.png, or training.png in the run's folder."""
+    json: Path | None = None
+    """Write the figures to this file."""
+
+    def run(self) -> dict[str, Any]:
+        """Draw and return what was drawn."""
+        folder = Path(self.what)
+        if (folder / "log.csv").is_file():
+            out = self.out or folder / "training.png"
+            log = plot_training(folder, out)
+            print(f"{out}: {len(log['step'])} validations")
+            return {"run": self.what, "log": log}
+        scene = load_scene(self.what)
+        expect_at_least(2, rows=self.rows)
+        protocol = protocol_of(scene)
+        case = self.case or next(iter(protocol.cases))
+        if case not in protocol.cases:
+            known = ", ".join(protocol.cases)
+            raise ValueError(f"unknown case '{case}', expected one of {known}")
+        steps = min(protocol.horizons) if self.steps is None else self.steps
+        expect_at_least(1, steps=steps)
+        source = protocol.cases[case]
+        place = scene_of(source)
+        model = from_pretrained(self.model or self.what, scene)
+        traces = compare_traces(
+            source,
+            NeRDDynamics(model if place is scene else model.over(place)),
+            MujocoDynamics(place),
+            steps,
+            self.rows,
+            self.seed,
+            case in protocol.random_actions,
+        )
+        out = self.out or Path("runs") / f"{folder_name(self.what)}_rollouts.png"
+        plot_traces(traces, out)
+        print(f"{out}: {self.what}, {case}, {self.rows} trajectories of {steps} steps")
+        return {"scene": self.what, "case": case, **_figures(traces)}
+
+
+def _figures(traces: Traces) -> dict[str, Any]:
+    """What the figure shows, for JSON."""
+    gaps = traces.gaps or {}
+    return {
+        "seconds": traces.seconds.tolist(),
+        "errors": {k: v.mean(0).tolist() for k, v in traces.errors.items()},
+        "energies": {k: v.tolist() for k, v in traces.energies.items()},
+        "gaps": {k: v.tolist() for k, v in gaps.items()},
+    }
