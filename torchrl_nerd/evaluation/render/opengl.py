@@ -39,6 +39,7 @@ MAX_GEOMS = 2000
 LINE_WIDTH = 1.5  # pixels
 LINE_COLOR = (0.7, 0.72, 0.7, 1.0)
 BONE_WIDTH = 0.004  # of the distance
+SHRINK = 0.99  # of every second shape, so that equal surfaces do not flicker
 HAZE = (1.5, 4.0)  # where it begins and is full, in distances
 
 
@@ -163,6 +164,7 @@ def _soften(poser: Poser, camera: Camera) -> None:
     model.geom_rgba[poser.planes], model.geom_matid[planes] = GROUND, -1
     model.geom_size[planes] = (0.0, 0.0, camera.half_height)  # endless; its mesh
     model.mat_reflectance[:] = 0.0
+    model.geom_size[poser.shapes[::2]] *= SHRINK
     haze = model.vis.map
     haze.zfar = 10.0 * HAZE[1] * camera.distance / model.stat.extent
     haze.fogstart, haze.fogend = (x * camera.distance / model.stat.extent for x in HAZE)

@@ -119,7 +119,7 @@ class Sheet:
             pen.line((x, y, x + 22, y), fill=color, width=3)
             text = f"{line.name}  {line.values[step]:.2g} {line.unit}"
             pen.text((x + 30, y), text, INK, font, anchor="lm")
-            x += 230
+            x += 285
 
     def _draw_chart(self) -> "tuple[Image, Callable[[int], tuple[float, ...]]]":
         """The chart, and of a step the cursor's x, top and bottom in it, pixels."""
