@@ -13,6 +13,7 @@ from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
 from torchrl_nerd.files import folder_name, read_json
 from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.training.recipes import recipe_of
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class Data:
             return card
         scene = load_scene(self.scene)
         out = self.out or Path("datasets") / folder_name(self.scene)
-        generate(scene, self.config, out, self.quiet)
+        draw = recipe_of(self.scene).draw(scene)
+        generate(scene, self.config, out, self.quiet, draw)
         card = read_json(out / CARD)
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"

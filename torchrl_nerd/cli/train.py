@@ -35,7 +35,7 @@ class Train:
     """Folder of the data set; datasets/SCENE by default."""
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
-    """Copy the best checkpoint to this folder when done."""
+    """Copy the recipe's checkpoint, best or last, to this folder when done."""
     device: str = "cpu"
     """cpu or cuda."""
     threads: int | None = None
@@ -46,13 +46,13 @@ class Train:
     """No progress bar."""
 
     def run(self) -> dict[str, Any]:
-        """Train and return the card of the best checkpoint."""
+        """Train and return the card of the checkpoint that the recipe takes."""
         scene = load_scene(self.scene)
         recipe, name = recipe_of(self.scene), folder_name(self.scene)
         out = writable_folder(self.out or Path("runs") / name)
         folder = self.data or Path("datasets") / name
         if not (folder / CARD).exists():
-            generate(scene, recipe.data, folder, self.quiet)
+            generate(scene, recipe.data, folder, self.quiet, recipe.draw(scene))
         if self.threads:
             torch.set_num_threads(self.threads)
         protocol = protocol_of(scene)
@@ -68,10 +68,11 @@ class Train:
             quiet=self.quiet,
         )
         trainer.run()
-        card = read_json(out / "best" / "card.json")
+        made = out / recipe.exports
+        card = read_json(made / "card.json")
         if self.export is not None:
-            save_checkpoint(load_checkpoint(out / "best", scene), self.export, card)
-        print(f"best checkpoint in {out / 'best'}: {_curve(card)}")
+            save_checkpoint(load_checkpoint(made, scene), self.export, card)
+        print(f"{recipe.exports} checkpoint in {made}: {_curve(card)}")
         return card
 
 

@@ -170,5 +170,5 @@ def cover(model: NeRD, data: TensorDict) -> None:
         model: whose `Coverage` is filled.
         data: transitions, ``[trajectories, steps]``.
     """
-    flat = (x.flatten(0, -2) for x in normalised(model, data))
-    model.coverage.fit(*flat, data[NEXT_QVEL].flatten(0, -2))
+    tokens, targets = (x.flatten(0, -2) for x in normalised(model, data))
+    model.coverage.fit(tokens, targets, data[NEXT_QVEL].flatten(0, -2))

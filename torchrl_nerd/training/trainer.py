@@ -147,10 +147,9 @@ class Trainer:
             stats = symmetry.complete(stats)
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
-        flat = (
-            x.flatten(0, -2) for x in (self.sequences.tokens, self.sequences.targets)
-        )
-        model.coverage.to(self.device).fit(*flat, data[NEXT_QVEL].flatten(0, -2))
+        known = self.sequences.tokens, self.sequences.targets, data[NEXT_QVEL]
+        tokens, targets, qvel = (x.flatten(0, -2) for x in known)
+        model.coverage.to(self.device).fit(tokens, targets, qvel.to(self.device))
         self.model = model.to(self.device)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
@@ -163,6 +162,7 @@ class Trainer:
         weights = dict(self.model.network.named_parameters())
         self.average = {name: w.detach().clone() for name, w in weights.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
+        self.errors: dict[int, dict[str, ErrorSummary]] = {}  # of the last validation
         if (self.folder / "state.json").exists():
             self._resume()
 
@@ -181,6 +181,7 @@ class Trainer:
         while self.step < last:
             loss = self.update()
             self.step += 1
+            self.errors = {}
             is_last = self.step == self.config.total_steps
             if self.step % self.config.validate_every == 0 or is_last:
                 figures = self.validate()
@@ -279,6 +280,7 @@ class Trainer:
             for horizon, by_name in summaries.items()
             for name, summary in by_name.items()
         }
+        self.errors = summaries
         score = sum(
             v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}")
         )
@@ -292,7 +294,7 @@ class Trainer:
 
     def save(self) -> None:
         """Everything a resumed run needs; the state's card is written last."""
-        self._save_model("last", {})
+        self._save_model("last", self.errors)
         tensors = {f"model.{k}": v for k, v in self.model.network.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.items()}
         for name, optimizer in self.optimizers.items():
