@@ -12,7 +12,7 @@ import torchrl_nerd
 PACKAGE = Path(torchrl_nerd.__file__).parent
 LEAVES = {"files", "settings", "__version__"}
 LEVELS = (
-    {"keys", "geometry"},
+    {"keys", "geometry", "tensor_files"},
     {"scenes"},
     {"transforms", "modules"},
     {"dynamics", "checkpoint"},
