@@ -21,7 +21,7 @@ from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training.log import TrainingLog
 
-FILES = 20  # of each kind
+FILES = 12  # of each kind
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
