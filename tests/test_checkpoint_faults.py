@@ -65,7 +65,8 @@ def test_weights_of_a_wrong_shape_or_name(folder):
     assert key in said and str(shape) in said and "(3, 1)" in said
     edit_weights(folder, lambda t: t.pop(key))
     assert key in refusal(folder)
-    edit_weights(folder, lambda t: t.update({key: torch.zeros(shape)}))
+    dtype = random_model(SCENE, torch.Generator()).state_dict()[key].dtype
+    edit_weights(folder, lambda t: t.update({key: torch.zeros(shape, dtype=dtype)}))
     load_checkpoint(folder)
     edit_weights(folder, lambda t: t.update(aaa=torch.zeros(1)))
     assert "aaa" in refusal(folder)

@@ -4,6 +4,7 @@ The card says which physics the weights were trained on. Loading compares it wit
 local scene and warns, in one sentence, of what differs.
 """
 
+import os
 import platform
 import warnings
 from dataclasses import asdict
@@ -12,29 +13,21 @@ from typing import Any, cast
 
 import mujoco
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 
 from torchrl_nerd import __version__
-from torchrl_nerd.files import (
-    folder_name,
-    read_json,
-    writable_folder,
-    write_atomically,
-    write_json,
-)
+from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
 from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene, is_import, load_scene
 from torchrl_nerd.selfcheck import self_check, warn_of_differences, write_check
+from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
 LARGEST_SIZE = 2**14  # of any number in a network's configuration
 COVERAGE = "coverage."
-LFS_POINTER = b"version https://git-lfs"
 KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
     "mlp": MLPConfig,
@@ -80,8 +73,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
 def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
     """Write weights, a few steps to check them by, then card: each whole or not at all."""
     folder = writable_folder(folder)
-    tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-    write_atomically(folder / WEIGHTS, lambda aside: save_file(tensors, aside))
+    write_tensors(folder / WEIGHTS, model.state_dict())
     write_check(model, folder)
     write_json(folder / CARD, card)
     return folder
@@ -105,30 +97,21 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
     card = read_json(folder / CARD)
     scene = scene or _scene_of(card, folder)
     _compare(card, scene, folder)
-    with torch.random.fork_rng(
-        devices=[]
-    ):  # its first weights are drawn, then replaced
+    config, tensors = _network_config(card, folder), read_tensors(folder / WEIGHTS)
+    # its first weights are drawn, then replaced
+    with torch.random.fork_rng(devices=[]):
         try:
-            model = make_model(scene, _network_config(card, folder))
+            _expect_room(config, tensors)
+            model = make_model(scene, config)
         except ValueError as error:
             raise ValueError(
                 f"the network in {folder} cannot be built: {error}"
             ) from None
-    tensors = _read_tensors(folder / WEIGHTS)
     if not any(key.startswith(COVERAGE) for key in tensors):  # weights of before 0.2
         state = model.state_dict()
         tensors |= {k: v for k, v in state.items() if k.startswith(COVERAGE)}
-    expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
-    found = {key: tuple(value.shape) for key, value in tensors.items()}
-    if expected != found:
-        keys = sorted(expected.keys() | found.keys())
-        key = next(k for k in keys if expected.get(k) != found.get(k))
-        raise ValueError(
-            f"weights in {folder} do not fit scene '{scene.name}': expected '{key}' of "
-            f"shape {expected.get(key)}, got {found.get(key)}"
-        )
-    if not all(value.isfinite().all() for value in tensors.values()):
-        raise ValueError(f"expected finite weights in {folder}, got NaN or infinity")
+    what = f"weights in {folder}"
+    expect_fit(tensors, model.state_dict(), what, f"scene '{scene.name}'")
     model.load_state_dict(tensors)
     if card.get("scene_hash") == scene.hash:
         check = self_check(model.eval(), folder)
@@ -147,7 +130,7 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> N
     name = folder_name(asked) if is_import(asked) else asked
     if name in shipped_models():
         return load_checkpoint(PRETRAINED / name, scene)
-    if Path(name_or_folder).is_dir():
+    if os.path.isdir(asked):  # False, too, for what no path can be
         return load_checkpoint(Path(name_or_folder), scene)
     if is_import(asked):
         raise ValueError(
@@ -156,7 +139,7 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> N
         )
     names = ", ".join(shipped_models())
     raise ValueError(
-        f"expected a shipped model ({names}) or a checkpoint folder, got '{asked}'"
+        f"expected a shipped model ({names}) or a checkpoint folder, got {asked!r}"
     )
 
 
@@ -193,6 +176,19 @@ def _network_config(
         ) from None
 
 
+def _expect_room(
+    config: NetworkConfig | ResidualConfig, tensors: dict[str, torch.Tensor]
+) -> None:
+    """Refuse a card's network that its weights cannot fill, before memory is asked for."""
+    depth = getattr(config, "depth", 0) or getattr(config, "layers", 0)
+    if depth <= len(tensors):
+        with torch.device("meta"):
+            needed = sum(weight.numel() for weight in config.build(1, 1).parameters())
+        if needed <= sum(value.numel() for value in tensors.values()):
+            return
+    raise ValueError(f"its weights are too few for {config}")
+
+
 def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
     """Refuse another robot; warn of other physics or another MuJoCo.
 
@@ -226,17 +222,3 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
 def _versions(card: dict[str, Any]) -> dict[str, Any]:
     found = card.get("versions")
     return found if isinstance(found, dict) else {}
-
-
-def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    with open(path, "rb") as file:
-        if file.read(len(LFS_POINTER)) == LFS_POINTER:
-            raise ValueError(
-                f"{path} is a git-lfs pointer, not weights: run `git lfs pull`"
-            )
-    try:
-        return load_file(path)
-    except SafetensorError as error:
-        raise ValueError(
-            f"{path} is truncated or no safetensors file: {error}"
-        ) from None

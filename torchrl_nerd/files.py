@@ -1,8 +1,10 @@
 """Files that are either whole or not there: written aside, flushed, renamed."""
 
+import glob
 import json
 import os
 import re
+import tempfile
 from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
@@ -12,9 +14,25 @@ from typing import Any
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Replace ``path`` by what ``write(temporary path)`` leaves, durably.
 
-    A crash at any moment leaves the old file or the new one, never a part.
+    A crash at any moment leaves the old file or the new one, never a part; what it left
+    aside is removed by the next write.
+
+    Raises:
+        ValueError: in one sentence, why it cannot be written.
     """
+    try:
+        _replace(path, write)
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be written: {error.strerror or error}"
+        ) from None
+
+
+def _replace(path: Path, write: Callable[[Path], object]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        if not _is_running(left.suffixes[-2]):
+            left.unlink(missing_ok=True)
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         write(aside)
@@ -28,6 +46,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def _is_running(process: str) -> bool:
+    """Whether a process of that number, ``.123``, may still write."""
+    try:
+        os.kill(int(process[1:]), 0)
+    except (ProcessLookupError, ValueError, OverflowError):
+        return False
+    except PermissionError:  # of another user
+        return True
+    return True
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -51,9 +80,11 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: the file holds something else, said in one sentence.
     """
+    if not path.is_file():  # a device would be read without end
+        raise ValueError(f"expected JSON in {path}, found no file")
     try:
         content = json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(
             f"expected JSON in {path}, got something else: {error}"
         ) from None
@@ -71,9 +102,7 @@ def writable_folder(path: Path) -> Path:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".probe.{os.getpid()}"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=path).close()
     except OSError as error:
         raise ValueError(
             f"expected a folder that can be written, got {path}: {error.strerror}"

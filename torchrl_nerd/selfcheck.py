@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.files import write_atomically
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.tensor_files import read_tensors, write_tensors
 
 FILE = "check.safetensors"
 ROWS = 8
@@ -53,9 +51,7 @@ def write_check(model: NeRD, folder: Path) -> None:
     given = {QPOS: start[QPOS], QVEL: start[QVEL], "joint_torque": torque}
     if TERRAIN in start:
         given[TERRAIN] = start[TERRAIN]
-    tensors = {**given, **_steps(model, given)}
-    tensors = {key: value.contiguous() for key, value in tensors.items()}
-    write_atomically(folder / FILE, lambda aside: save_file(tensors, aside))
+    write_tensors(folder / FILE, {**given, **_steps(model, given)})
 
 
 def self_check(model: NeRD, folder: Path) -> SelfCheck | None:
@@ -71,10 +67,10 @@ def self_check(model: NeRD, folder: Path) -> SelfCheck | None:
     if not (folder / FILE).is_file():
         return None
     try:
-        stored = load_file(folder / FILE)
+        stored = read_tensors(folder / FILE)
         made = _steps(model, stored)
         worst = {key: _difference(value, stored[key]) for key, value in made.items()}
-    except (SafetensorError, KeyError, RuntimeError, ValueError, IndexError) as error:
+    except (KeyError, RuntimeError, TypeError, ValueError, IndexError) as error:
         raise ValueError(
             f"expected a few steps of '{model.scene.name}' in {folder / FILE}, got "
             f"something else: {str(error).splitlines()[0]}"

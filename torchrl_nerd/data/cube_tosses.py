@@ -19,7 +19,7 @@ physics.
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -45,6 +45,9 @@ COLUMNS = {
     "linear_velocity": ("vx", "vy", "vz"),
     "angular_velocity": ("wx", "wy", "wz"),
 }
+
+ARRAYS = (*COLUMNS, "trajectory_offsets", "time")
+LARGEST_LOG = 2**30  # bytes of an npz file, unpacked
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +151,15 @@ def read_log(path: Path) -> TossLog:
     Raises:
         ValueError: in one sentence, a file, array or shape that is not as expected.
     """
+    if not path.is_file():
+        raise ValueError(f"expected a log in {path}, found no file")
     arrays = _read_csv(path) if path.suffix == ".csv" else _read_npz(path)
+    for name, array in arrays.items():
+        if array.ndim == 0 or array.dtype.kind not in "fiu":
+            raise ValueError(
+                f"expected an array of numbers in '{name}' of {path}, got {array.dtype} "
+                f"of shape {array.shape}"
+            )
     for name in ("position", "quaternion_wxyz"):
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"
@@ -168,8 +179,10 @@ def read_log(path: Path) -> TossLog:
             raise ValueError(
                 f"expected finite numbers in '{name}' of {path}, got others"
             )
-    is_order = offsets.ndim == 1 and len(offsets) > 1 and (np.diff(offsets) > 1).all()
-    if not is_order or offsets[0] != 0 or offsets[-1] != count:
+    whole = offsets.astype(np.int64) if offsets.dtype.kind in "iu" else offsets
+    is_order = whole.ndim == 1 and len(whole) > 1 and (np.diff(whole) > 1).all()
+    is_order = is_order and whole.dtype == np.int64
+    if not is_order or whole[0] != 0 or whole[-1] != count:
         raise ValueError(
             f"expected trajectory_offsets in {path} to rise from 0 to {count} by at "
             "least 2, got others"
@@ -184,26 +197,34 @@ def read_log(path: Path) -> TossLog:
         tensors["quaternion_wxyz"],
         tensors.get("linear_velocity"),
         tensors.get("angular_velocity"),
-        torch.as_tensor(offsets.astype(np.int64)),
+        torch.as_tensor(whole),
         tensors.get("time"),
     )
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
+        with ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > LARGEST_LOG:
+            raise ValueError(f"{size} bytes when unpacked")
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (BadZipFile, ValueError, AttributeError) as error:
+            return {name: file[name] for name in ARRAYS if name in file.files}
+    except Exception as error:  # numpy and zipfile raise a dozen kinds at odd bytes
+        said = str(error).splitlines() or [type(error).__name__]
         raise ValueError(
-            f"expected an npz file in {path}, got another: {error}"
+            f"expected an npz file in {path}, got another: {said[0]}"
         ) from None
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     try:
-        table: Any = np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64)
-    except ValueError as error:
-        raise ValueError(f"expected a CSV table in {path}: {error}") from None
+        table: Any = np.genfromtxt(
+            path, delimiter=",", names=True, dtype=np.float64, ndmin=1
+        )
+    except (ValueError, IndexError) as error:
+        said = " ".join(str(error).split())
+        raise ValueError(f"expected a CSV table in {path}: {said}") from None
     names = table.dtype.names or ()
     arrays = {
         array: np.stack([table[column] for column in columns], -1)
@@ -211,7 +232,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         if set(columns) <= set(names)
     }
     if "time" in names:
-        arrays["time"] = np.atleast_1d(table["time"])
+        arrays["time"] = table["time"]
     if "toss" in names:
         edges = np.flatnonzero(np.diff(table["toss"])) + 1
         arrays["trajectory_offsets"] = np.array([0, *edges, len(table)])

@@ -20,6 +20,7 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from torchrl_nerd import __version__
+from torchrl_nerd.data.store import create_store, expect_finite, read_store
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
@@ -127,7 +128,7 @@ def generate(
     """
     name, draw = strategy or (None, partial(simulate, scene))
     card = _open_card(scene, config, writable_folder(folder), name)
-    store = _open_store(draw, config, folder)
+    store = _open_store(draw, config, folder, card["chunks_done"])
     chunks = -(-config.trajectories // CHUNK)
     bar = tqdm(
         total=config.trajectories * config.steps,
@@ -167,11 +168,15 @@ def load_data(scene: Scene, folder: Path) -> TensorDict:
             f"the data in {folder} are of scene '{card.get('scene')}' "
             f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
         )
-    if card["chunks_done"] * CHUNK < card["config"]["trajectories"]:
+    config = _check_counts(card, folder)
+    if card["trajectories"] + card["dropped"] < config.trajectories:
         raise ValueError(
             f"the data in {folder} are not finished: run the command again"
         )
-    return TensorDict.load_memmap(folder)[: card["trajectories"]]
+    data = read_store(folder)[: card["trajectories"]]
+    _check_layout(data, scene, config, folder)
+    expect_finite(data, folder)
+    return data
 
 
 def _open_card(
@@ -195,22 +200,72 @@ def _open_card(
         write_json(path, fresh)  # before any data: they never outlive their card
         return fresh
     card = read_json(path)
-    # older cards also list what is not set
-    ranges = {k: v for k, v in card.get("ranges", {}).items() if v is not None}
-    card["ranges"] = ranges
+    ranges = card.get("ranges")
+    if isinstance(ranges, dict):  # older cards also list what is not set
+        card["ranges"] = {k: v for k, v in ranges.items() if v is not None}
     for key in ("scene_hash", "config", "strategy", "ranges"):
         if card.get(key) != fresh[key]:
             raise ValueError(
                 f"{folder} already holds data with {key} {card.get(key)}, asked for "
                 f"{fresh[key]}: choose another folder"
             )
+    _check_counts(card, folder)
+    done = card["chunks_done"]
+    if type(done) is not int or card["trajectories"] + card["dropped"] != min(
+        done * CHUNK, config.trajectories
+    ):
+        raise ValueError(f"expected {path} to count whole chunks, got {done!r} of them")
     return card
 
 
-def _open_store(draw: Draw, config: DataConfig, folder: Path) -> TensorDictBase:
-    """The memory-mapped tensordict, created where it is not there yet."""
-    if (folder / "meta.json").exists():
-        return TensorDict.load_memmap(folder)
+def _check_counts(card: dict, folder: Path) -> DataConfig:
+    """The configuration of a card whose counts are possible."""
+    try:
+        config = DataConfig(**card["config"])
+        counts = card["trajectories"], card["dropped"]
+        numbers = *asdict(config).values(), *counts
+        if not all(type(n) is int for n in numbers) or min(counts) < 0:
+            raise ValueError
+        if sum(counts) > config.trajectories:
+            raise ValueError
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(
+            f"expected {folder / CARD} to count trajectories, got something else"
+        ) from None
+    return config
+
+
+def _check_layout(
+    data: TensorDictBase, scene: Scene, config: DataConfig, folder: Path
+) -> None:
+    """Refuse trajectories without the scene's keys, in its sizes."""
+    layout, shape = scene.layout, (len(data), config.steps)
+    sizes = {QPOS: layout.nq, QVEL: layout.nv}
+    after = {**sizes, "joint_torque": len(scene.actuated)}
+    for key, size in (*sizes.items(), *((("next", k), n) for k, n in after.items())):
+        value = data.get(key, None)
+        found = None if value is None else tuple(value.shape)
+        if found != (*shape, size) or value.dtype != torch.float64:
+            raise ValueError(
+                f"expected {key!r} of shape {(*shape, size)}, float64, in {folder}, "
+                f"got {found}"
+            )
+
+
+def _open_store(
+    draw: Draw, config: DataConfig, folder: Path, done: int
+) -> TensorDictBase:
+    """The memory-mapped tensordict, created where nothing is in it yet."""
     example = draw(1, 1, Generator().manual_seed(0))
     shape = [config.trajectories, config.steps]
-    return example.expand(*shape).memmap_like(str(folder))
+    example = example.expand(*shape)
+    if not done:
+        return create_store(example, folder)
+    store = read_store(folder)
+    for key, value in example.items(True, True):
+        found = store.get(key, None)
+        if found is None or (found.shape, found.dtype) != (value.shape, value.dtype):
+            raise ValueError(
+                f"expected {key!r} of shape {tuple(value.shape)} in {folder}"
+            )
+    return store

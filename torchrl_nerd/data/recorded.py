@@ -11,6 +11,7 @@ from torchrl_nerd import __version__
 from torchrl_nerd.data.cube_tosses import Tosses, make_tosses, read_log, split_tosses
 from torchrl_nerd.data.generate import CARD
 from torchrl_nerd.data.physics_checks import check_log
+from torchrl_nerd.data.store import create_store, expect_finite, read_store
 from torchrl_nerd.files import writable_folder, write_json
 from torchrl_nerd.scenes import Scene
 
@@ -53,7 +54,7 @@ def write_tosses(path: Path, scene: Scene, folder: Path) -> dict[str, Any]:
     for number, members in enumerate(split.values()):
         part[members] = number
     data["part"] = part[data["collector", "traj_ids"]]
-    data.memmap(str(writable_folder(folder)))
+    create_store(data, writable_folder(folder)).update_(data)
     card = {
         "scene": scene.name,
         "scene_hash": scene.hash,
@@ -69,5 +70,11 @@ def write_tosses(path: Path, scene: Scene, folder: Path) -> dict[str, Any]:
 
 
 def read_transitions(folder: Path) -> TensorDict:
-    """The data set that `write_tosses` wrote, memory-mapped, ``[transitions]``."""
-    return TensorDict.load_memmap(folder)
+    """The data set that `write_tosses` wrote, memory-mapped, ``[transitions]``.
+
+    Raises:
+        ValueError: in one sentence, what is missing or broken.
+    """
+    data = read_store(folder)
+    expect_finite(data, folder)
+    return data

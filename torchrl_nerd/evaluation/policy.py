@@ -5,17 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import ACTION, OBSERVATION
 from torchrl_nerd.tasks import Task
+from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
+MOST_LAYERS, LARGEST_SIZE = 2**7, 2**14
 MIN_STD = 1e-3  # of an observation: a constant one is not blown up
 
 
@@ -103,8 +103,7 @@ def save_policy(
         card: what else to say: task, dynamics it was trained in, configuration.
     """
     folder = writable_folder(folder)
-    tensors = {k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}
-    write_atomically(folder / WEIGHTS, lambda aside: save_file(tensors, aside))
+    write_tensors(folder / WEIGHTS, policy.state_dict())
     write_json(
         folder / CARD, {"format": 1, "sizes": list(policy.sizes), **(card or {})}
     )
@@ -125,7 +124,9 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
         raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no policy")
     found = read_json(folder / CARD).get("sizes")
     sizes = found if isinstance(found, list) else []
-    if len(sizes) < 2 or not all(type(size) is int and size > 0 for size in sizes):
+    if not 2 <= len(sizes) <= MOST_LAYERS or not all(
+        type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes
+    ):
         raise ValueError(f"expected the layer sizes in {folder / CARD}, got {found!r}")
     if task is not None:
         expected = (task.observation_size, task.controller.num_actions)
@@ -134,13 +135,10 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
                 f"the policy in {folder} has {sizes[0]} observations and {sizes[-1]} "
                 f"actions, the task has {expected[0]} and {expected[1]}"
             )
+    tensors = read_tensors(folder / WEIGHTS)
+    with torch.device("meta"):  # shapes alone, whatever memory the sizes would take
+        expected = Policy(sizes).state_dict()
+    expect_fit(tensors, expected, f"weights in {folder}", f"layers of {sizes}")
     policy = Policy(sizes)
-    try:
-        policy.load_state_dict(load_file(folder / WEIGHTS))
-    except SafetensorError as error:
-        raise ValueError(
-            f"{folder / WEIGHTS} is no safetensors file: {error}"
-        ) from None
-    except RuntimeError:
-        raise ValueError(f"weights in {folder} do not fit layers of {sizes}") from None
+    policy.load_state_dict(tensors)
     return policy.eval()

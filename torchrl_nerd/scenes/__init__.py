@@ -52,7 +52,7 @@ def load_scene(name: str) -> Scene:
     if name.endswith(".xml"):
         return Scene.from_mjcf(name)
     raise ValueError(
-        f"unknown scene '{name}', expected one of {', '.join(SCENES)}, "
+        f"unknown scene {name!r}, expected one of {', '.join(SCENES)}, "
         "dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
     )
 

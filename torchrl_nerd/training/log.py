@@ -27,8 +27,19 @@ class TrainingLog:
     def _read(self) -> list[dict[str, str]]:
         if not self.path.exists():
             return []
-        with open(self.path, newline="") as file:
-            return list(csv.DictReader(file))
+        try:
+            if not self.path.is_file():
+                raise ValueError
+            with open(self.path, newline="") as file:
+                rows = list(csv.DictReader(file, strict=True))
+            for row in rows:
+                if None in row or None in row.values() or int(row["step"]) < 0:
+                    raise ValueError
+        except (ValueError, KeyError, csv.Error):
+            raise ValueError(
+                f"expected a table of figures by 'step' in {self.path}, got another"
+            ) from None
+        return rows
 
     def _write_rows(self, path: Path) -> None:
         with open(path, "w", newline="") as file:

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 from torch import Generator, Tensor, nn
 from tqdm import tqdm
@@ -18,11 +17,12 @@ from torchrl_nerd.evaluation.rollout_error import (
     Source,
     passive_errors,
 )
-from torchrl_nerd.files import read_json, writable_folder, write_atomically, write_json
+from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import NEXT_QVEL
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
@@ -34,6 +34,9 @@ COUNTS = (
     *("rows", "length", "rollout_rows", "rollout_length"),
     *("save_every", "validate_every", "rollout_rounds"),
 )
+
+LIKE = {"muon": ("momentum",), "adamw": ("exp_avg", "exp_avg_sq")}
+"""What an optimiser remembers of a weight, of the weight's shape."""
 
 
 @dataclass(frozen=True)
@@ -147,9 +150,10 @@ class Trainer:
             stats = symmetry.complete(stats)
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
-        known = self.sequences.tokens, self.sequences.targets, data[NEXT_QVEL]
-        tokens, targets, qvel = (x.flatten(0, -2) for x in known)
-        model.coverage.to(self.device).fit(tokens, targets, qvel.to(self.device))
+        tokens, targets = self.sequences.tokens, self.sequences.targets
+        qvel = self.sequences.data[NEXT_QVEL].flatten(0, -2)
+        coverage = model.coverage.to(self.device)
+        coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), qvel)
         self.model = model.to(self.device)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
@@ -300,11 +304,9 @@ class Trainer:
         for name, optimizer in self.optimizers.items():
             for index, state in optimizer.state_dict()["state"].items():
                 tensors |= {f"{name}.{index}.{k}": v for k, v in state.items()}
-        tensors = {k: v.detach().cpu().clone() for k, v in tensors.items()}
         tensors["step"] = torch.tensor(self.step)
         tensors["best"] = torch.tensor(self.best, dtype=torch.float64)
-        path = self.folder / "state.safetensors"
-        write_atomically(path, lambda aside: save_file(tensors, aside))
+        write_tensors(self.folder / "state.safetensors", tensors)
         card = {"config": asdict(self.config), "scene_hash": self.scene.hash}
         card |= {"seconds": self.seconds}
         write_json(self.folder / "state.json", card)
@@ -339,9 +341,20 @@ class Trainer:
                     f"{self.folder} holds a run with {key} {card.get(key)}, asked for "
                     f"{value}: choose another folder"
                 )
-        tensors = load_file(self.folder / "state.safetensors")
-        self.step = int(tensors["step"])
-        self.seconds, self.best = card["seconds"], float(tensors["best"])
+        path = self.folder / "state.safetensors"
+        tensors = read_tensors(path)
+        best = tensors.pop("best", torch.tensor([]))  # infinite before any validation
+        expect_fit(tensors, self._expected(tensors), f"tensors in {path}", "this run")
+        if best.shape or best.dtype != torch.float64 or best.isnan():
+            raise ValueError(f"expected the best error in {path}, got {best}")
+        self.step, self.best = int(tensors["step"]), float(best)
+        seconds = card.get("seconds")
+        if not 0 < self.step <= self.config.total_steps or type(seconds) is not float:
+            raise ValueError(
+                f"expected a step of this run and its seconds in {self.folder}, got "
+                f"{self.step} and {seconds!r}"
+            )
+        self.seconds = seconds
         pick = _with_prefix(tensors, "model.")
         self.model.network.load_state_dict(pick)
         for name, value in _with_prefix(tensors, "average.").items():
@@ -353,6 +366,22 @@ class Trainer:
                 state.setdefault(int(index), {})[entry] = value
             groups = optimizer.state_dict()["param_groups"]
             optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+    def _expected(self, found: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Tensors like those that a state must hold, for the parameters it has seen."""
+        weights = self.model.network.state_dict()
+        expected = {f"model.{k}": v for k, v in weights.items()}
+        expected |= {f"average.{k}": v for k, v in self.average.items()}
+        for name, optimizer in self.optimizers.items():
+            groups = optimizer.param_groups
+            parameters = [weight for group in groups for weight in group["params"]]
+            seen = {key.split(".")[0] for key in _with_prefix(found, f"{name}.")}
+            for index, weight in enumerate(parameters):
+                if str(index) in seen:
+                    expected |= {f"{name}.{index}.{k}": weight for k in LIKE[name]}
+                    if name == "adamw":
+                        expected[f"{name}.{index}.step"] = torch.tensor(0.0)
+        return {**expected, "step": torch.tensor(0)}
 
 
 def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:

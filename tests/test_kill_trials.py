@@ -1,0 +1,25 @@
+"""Killed at random times, nothing is lost beyond the last interval; see the benchmark."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchrl_nerd.files import read_json
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.slow)])
+def test_nothing_is_lost(kills, seed, tmp_path):
+    command = [sys.executable, "kill_trials.py", "--kills", str(kills)]
+    figures = tmp_path / "kills.json"
+    subprocess.run(
+        [*command, "--seed", str(seed), "--json", figures], check=True, cwd=BENCHMARKS
+    )
+    rows = read_json(figures)["kinds"]
+    assert sum(row["kills"] for row in rows.values()) == kills
+    for name, row in rows.items():
+        assert row["equal"] == row["kills"], f"{name}: {row}"
+        assert not row["losses"] and not row["corrupt"] and not row["left over"], name

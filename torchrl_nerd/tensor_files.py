@@ -1,0 +1,81 @@
+"""Tensors in safetensors files: written whole or not at all, checked when read."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from torchrl_nerd.files import write_atomically
+
+LFS_POINTER = b"version https://git-lfs"
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Replace the file by these tensors, from whatever device.
+
+    Raises:
+        ValueError: it cannot be written, said in one sentence.
+    """
+    copies = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+
+    def write(aside: Path) -> None:
+        try:
+            save_file(copies, aside)
+        except SafetensorError as error:  # a disk that is full, among others
+            raise OSError(str(error)) from None
+
+    write_atomically(path, write)
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a file.
+
+    Raises:
+        ValueError: in one sentence, no file there, or something else in it.
+    """
+    if not path.is_file():
+        raise ValueError(f"expected tensors in {path}, found no file")
+    with open(path, "rb") as file:
+        if file.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise ValueError(
+                f"{path} is a git-lfs pointer, not weights: run `git lfs pull`"
+            )
+    try:
+        return load_file(path)
+    except SafetensorError as error:
+        raise ValueError(
+            f"{path} is truncated or no safetensors file: {error}"
+        ) from None
+
+
+def expect_fit(
+    found: Mapping[str, Tensor], expected: Mapping[str, Tensor], what: str, of: str
+) -> None:
+    """Refuse tensors of other names, shapes or types than expected, or not finite.
+
+    Args:
+        found: what was read.
+        expected: tensors to compare with; their values, and hence their device, do not
+            matter.
+        what: was read, for the sentence: ``"weights in FOLDER"``.
+        of: whom they must fit: ``"scene 'cartpole'"``.
+
+    Raises:
+        ValueError: naming the first tensor that does not fit.
+    """
+    shapes, own = ({k: tuple(v.shape) for k, v in x.items()} for x in (expected, found))
+    for key in sorted(shapes.keys() | own.keys()):
+        if shapes.get(key) != own.get(key):
+            raise ValueError(
+                f"{what} do not fit {of}: expected {key!r} of shape {shapes.get(key)}, "
+                f"got {own.get(key)}"
+            )
+        if found[key].dtype != expected[key].dtype:
+            raise ValueError(
+                f"{what} do not fit {of}: expected {key!r} of type "
+                f"{expected[key].dtype}, got {found[key].dtype}"
+            )
+        if not found[key].isfinite().all():
+            raise ValueError(f"expected finite {what}, got NaN or infinity in {key!r}")
