@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -53,7 +54,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 def expect_fit(
     found: Mapping[str, Tensor], expected: Mapping[str, Tensor], what: str, of: str
 ) -> None:
-    """Refuse tensors of other names, shapes or types than expected, or not finite.
+    """Refuse tensors of other names, shapes or kinds than expected, or not finite.
 
     Args:
         found: what was read.
@@ -72,10 +73,16 @@ def expect_fit(
                 f"{what} do not fit {of}: expected {key!r} of shape {shapes.get(key)}, "
                 f"got {own.get(key)}"
             )
-        if found[key].dtype != expected[key].dtype:
+        if not _casts(found[key].dtype, expected[key].dtype):
             raise ValueError(
                 f"{what} do not fit {of}: expected {key!r} of type "
                 f"{expected[key].dtype}, got {found[key].dtype}"
             )
-        if not found[key].isfinite().all():
+        if not found[key].to(expected[key].dtype).isfinite().all():
             raise ValueError(f"expected finite {what}, got NaN or infinity in {key!r}")
+
+
+def _casts(found: torch.dtype, expected: torch.dtype) -> bool:
+    """Whether loading may change the type: from one kind of float to another alone."""
+    floats = found.is_floating_point and expected.is_floating_point
+    return floats or found == expected
