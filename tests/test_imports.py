@@ -87,7 +87,14 @@ def test_files_of_one_part_import_each_other_one_way_at_most():
 
 def test_checkpoints_know_scenes_and_modules_only():
     found = own_imports(PACKAGE / "checkpoint.py") - LEAVES
-    assert found <= {"scenes", "modules", "transforms", "keys", "geometry", "tensor_files"}
+    assert found <= {
+        "scenes",
+        "modules",
+        "transforms",
+        "keys",
+        "geometry",
+        "tensor_files",
+    }
     users = {part_of(path) for path in SOURCES if "checkpoint" in own_imports(path)}
     assert min(map(LEVEL.get, users)) >= LEVEL["envs"]
 
