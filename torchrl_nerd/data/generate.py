@@ -20,7 +20,12 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from torchrl_nerd import __version__
-from torchrl_nerd.data.store import create_store, expect_finite, read_store
+from torchrl_nerd.data.store import (
+    create_store,
+    expect_finite,
+    expect_layout,
+    read_store,
+)
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
@@ -174,7 +179,7 @@ def load_data(scene: Scene, folder: Path) -> TensorDict:
             f"the data in {folder} are not finished: run the command again"
         )
     data = read_store(folder)[: card["trajectories"]]
-    _check_layout(data, scene, config, folder)
+    expect_layout(data, scene, config.steps, folder)
     expect_finite(data, folder)
     return data
 
@@ -233,23 +238,6 @@ def _check_counts(card: dict, folder: Path) -> DataConfig:
             f"expected {folder / CARD} to count trajectories, got something else"
         ) from None
     return config
-
-
-def _check_layout(
-    data: TensorDictBase, scene: Scene, config: DataConfig, folder: Path
-) -> None:
-    """Refuse trajectories without the scene's keys, in its sizes."""
-    layout, shape = scene.layout, (len(data), config.steps)
-    sizes = {QPOS: layout.nq, QVEL: layout.nv}
-    after = {**sizes, "joint_torque": len(scene.actuated)}
-    for key, size in (*sizes.items(), *((("next", k), n) for k, n in after.items())):
-        value = data.get(key, None)
-        found = None if value is None else tuple(value.shape)
-        if found != (*shape, size) or value.dtype != torch.float64:
-            raise ValueError(
-                f"expected {key!r} of shape {(*shape, size)}, float64, in {folder}, "
-                f"got {found}"
-            )
 
 
 def _open_store(

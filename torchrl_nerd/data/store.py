@@ -16,6 +16,8 @@ from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.files import read_json
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes import Scene
 
 META = "meta.json"
 ABOUT = ("shape", "device", "_type")  # entries that are no tensors
@@ -71,6 +73,25 @@ def read_store(folder: Path, depth: int = 0) -> TensorDict:
     return TensorDict(found, batch_size=shape)
 
 
+def expect_layout(data: TensorDictBase, scene: Scene, steps: int, folder: Path) -> None:
+    """Refuse trajectories ``[*, steps]`` without the scene's keys, in its sizes.
+
+    Raises:
+        ValueError: naming the first key that is missing or of another shape.
+    """
+    now = {QPOS: scene.layout.nq, QVEL: scene.layout.nv}
+    after = {**now, "joint_torque": len(scene.actuated)}
+    sizes = {**now, **{("next", key): size for key, size in after.items()}}
+    for key, size in sizes.items():
+        value, shape = data.get(key, None), (len(data), steps, size)
+        found = value is not None and (tuple(value.shape), value.dtype)
+        if found != (shape, torch.float64):
+            raise ValueError(
+                f"expected {key!r} of shape {shape}, float64, in {folder}, "
+                f"got {found or 'none'}"
+            )
+
+
 def expect_finite(data: TensorDictBase, folder: Path) -> None:
     """Refuse data with NaN or infinity.
 
@@ -86,7 +107,7 @@ def expect_finite(data: TensorDictBase, folder: Path) -> None:
 
 
 def _shape(found: Any, path: Path) -> torch.Size:
-    sizes = found if isinstance(found, list) else [None]
+    sizes: list[Any] = found if isinstance(found, list) else [None]
     if not all(type(size) is int and 0 <= size < 2**40 for size in sizes):
         raise ValueError(f"expected a shape in {path}, got {found!r}")
     return torch.Size(sizes)

@@ -1,0 +1,70 @@
+"""Long runs cost no more memory than short ones, and leave no process behind."""
+
+import functools
+import resource
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+import pytest
+import torch
+from dynamics_helpers import EnvMaker, random_actions
+from tensordict import TensorDict
+from torchrl.envs import ParallelEnv
+
+from torchrl_nerd.tasks import TASKS
+
+TASK = next(iter(TASKS))
+ROWS, HORIZON = 4, 5
+WARM_UP = 20  # steps until caches and pools are as large as they get
+GROWTH = 2 * 2**20  # bytes, of all the steps
+
+each_length = pytest.mark.parametrize(
+    "steps", [50, pytest.param(5_000, marks=pytest.mark.slow)]
+)
+
+
+def resident() -> int:
+    """Memory of this process, bytes."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
+
+
+def children() -> set[str]:
+    """Process numbers of all children of this process, ended ones included."""
+    lists = Path("/proc/self/task").glob("*/children")
+    return {number for path in lists for number in path.read_text().split()}
+
+
+@each_length
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+def test_memory_does_not_grow_with_steps_and_resets(dynamics, steps, generator):
+    env = EnvMaker(TASK, dynamics, generator, HORIZON)(ROWS)
+    actions = random_actions(env, 64, generator)
+    now, sizes = env.reset(), {}
+    for step in range(WARM_UP + steps + 1):
+        now["action"] = actions[step % len(actions)]
+        _, now = env.step_and_maybe_reset(now)
+        if step in (WARM_UP, WARM_UP + steps):
+            sizes[step] = resident()
+    first, last = sizes.values()
+    assert last - first < GROWTH, f"{(last - first) / steps:.0f} bytes a step"
+
+
+@pytest.mark.parametrize("resets", [5, pytest.param(3000, marks=pytest.mark.slow)])
+def test_parallel_envs_reset_and_leave_no_process(resets, generator):
+    resource_tracker.ensure_running()  # Python's own, which stays
+    before = children()
+    makers = [EnvMaker(TASK, d, generator, HORIZON) for d in ("streaming", "mujoco")]
+    parallel = ParallelEnv(2, [functools.partial(make, ROWS) for make in makers])
+    try:
+        shape = (2, ROWS, 1)
+        for _ in range(resets):
+            mask = torch.rand(shape, generator=generator) < 0.5
+            mask[:, 0] = True
+            state = parallel.reset(TensorDict({"_reset": mask}, [2, ROWS]))
+            assert state["observation"].isfinite().all()
+        workers = children() - before
+        assert len(workers) >= 2
+    finally:
+        parallel.close(raise_if_closed=False)
+    assert not children() & workers
