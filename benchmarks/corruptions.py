@@ -153,6 +153,8 @@ def _edit_json(path: Path, rng: Generator, marker: Path) -> None:
     content = json.loads(path.read_text())
     for _ in range(int(rng.integers(1, 4))):
         places = _places(content, [])
+        if not places:
+            break
         node, key = places[int(rng.integers(len(places)))]
         choice = rng.random()
         if choice < 0.6:

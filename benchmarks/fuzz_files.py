@@ -57,6 +57,8 @@ def in_child(work: Callable[[], Iterable[str]]) -> list[str]:
         try:
             for line in work():
                 os.write(writer, json.dumps(line).encode() + b"\n")
+        except Exception:  # of the benchmark itself
+            traceback.print_exc()
         finally:
             os._exit(0)
     os.close(writer)

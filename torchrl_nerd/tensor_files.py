@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from torchrl_nerd.files import write_atomically
@@ -20,14 +20,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
         ValueError: it cannot be written, said in one sentence.
     """
     copies = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-
-    def write(aside: Path) -> None:
-        try:
-            save_file(copies, aside)
-        except SafetensorError as error:  # a disk that is full, among others
-            raise OSError(str(error)) from None
-
-    write_atomically(path, write)
+    content = save(copies)  # save_file would leave a file of its own if it is killed
+    write_atomically(path, lambda aside: aside.write_bytes(content))
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
 from torchrl_nerd.checkpoint import (
     CARD,
@@ -14,9 +13,10 @@ from torchrl_nerd.checkpoint import (
     shipped_models,
 )
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
-from torchrl_nerd.files import read_json, write_atomically, write_json
+from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tensor_files import write_tensors
 from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
 from torchrl_nerd.training.toss_models import from_scratch, pretrain
 
@@ -73,6 +73,5 @@ def finetune(
     tuner = FineTuner(model, tosses, *parts, config, quiet, keep)
     keep(tuner.run())
     if tuner.encoder is not None:
-        tensors = {k: v.contiguous() for k, v in tuner.encoder.state_dict().items()}
-        write_atomically(out / "encoder.safetensors", lambda p: save_file(tensors, p))
+        write_tensors(out / "encoder.safetensors", tuner.encoder.state_dict())
     return read_json(out / CARD)
