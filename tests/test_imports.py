@@ -85,7 +85,7 @@ def test_files_of_one_part_import_each_other_one_way_at_most():
     list(TopologicalSorter(graph).static_order())
 
 
-def test_checkpoints_know_scenes_and_modules_only():
+def test_checkpoints_know_no_env():
     found = own_imports(PACKAGE / "checkpoint.py") - LEAVES
     assert found <= {
         "scenes",
@@ -93,6 +93,7 @@ def test_checkpoints_know_scenes_and_modules_only():
         "transforms",
         "keys",
         "geometry",
+        "selfcheck",
         "tensor_files",
     }
     users = {part_of(path) for path in SOURCES if "checkpoint" in own_imports(path)}

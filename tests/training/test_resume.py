@@ -36,7 +36,7 @@ KILLS = {
     "Trainer.update": (1, 7, 15, 20),
     "Trainer.validate": (2,),
     "save_checkpoint": (2, 4, 7),
-    "write_atomically": (1, 2, 4),
+    "write_tensors": (1, 2, 4),
     "write_json": (1, 2, 5),
 }
 """Function of the module -> calls at whose beginning the process is killed."""
