@@ -148,7 +148,8 @@ def gl() -> str:
 
 def test_mujoco_and_drawing_show_the_robot_in_the_same_place(gl, generator):
     scene = load_scene("ant")
-    qpos = scene.sample_initial(2, generator)[0]["qpos"]
+    qpos = scene.sample_initial(1, generator)[0]["qpos"].repeat(2, 1)
+    qpos[1, 1] += 2.0  # the ghost, beside it
     poser = Poser(scene)
     camera = aim(poser, qpos, 0.02, SIZE[0] / SIZE[1])
     centres = []
@@ -160,7 +161,8 @@ def test_mujoco_and_drawing_show_the_robot_in_the_same_place(gl, generator):
         renderer.close()
         rows, columns = np.nonzero(abs(pixels[..., 0] - pixels[..., 2]) > 50)
         centres.append((rows.mean(), columns.mean()))
-    assert np.allclose(*centres, atol=12.0)
+    # the drawing has no perspective
+    assert np.allclose(*centres, atol=0.15 * SIZE[0])
 
 
 def test_mujoco_gl_of_the_user_is_obeyed():
