@@ -26,7 +26,6 @@ from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json, write_atomically, write_json
 from torchrl_nerd.modules.nerd import NETWORKS
 from torchrl_nerd.scenes import SCENES
-from torchrl_nerd.selfcheck import FILE as CHECK
 from torchrl_nerd.training.recipes import RECIPES
 
 SCENE = load_scene(next(iter(SCENES)))
@@ -52,7 +51,7 @@ def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
     for copy in copies:
         assert copy.config == NETWORKS[network] and copy.scene.hash == scene.hash
         assert not unequal_keys(roll(NeRDDynamics(copy), *drive), expected)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [CARD, CHECK, WEIGHTS]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [CARD, WEIGHTS]
     assert json.loads((tmp_path / CARD).read_text()) == json.loads(json.dumps(card))
 
 
@@ -119,7 +118,7 @@ def test_a_write_cut_short_leaves_the_old_file_whole(folder, share):
     with pytest.raises(Killed):
         write_atomically(path, write)
     assert path.read_bytes() == content
-    assert sorted(p.name for p in folder.iterdir()) == [CARD, CHECK, WEIGHTS]
+    assert sorted(p.name for p in folder.iterdir()) == [CARD, WEIGHTS]
     load_checkpoint(folder)
 
 

@@ -17,6 +17,7 @@ from torchrl_nerd.checkpoint import (
     save_checkpoint,
 )
 from torchrl_nerd.scenes import SCENES, Scene
+from torchrl_nerd.selfcheck import PREFIX
 
 SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
 
@@ -34,6 +35,12 @@ def refusal(folder: Path, scene: Scene | None = None) -> str:
     assert "\n" not in str(caught.value)
     assert str(folder) in str(caught.value)
     return str(caught.value)
+
+
+def weights_in(folder: Path) -> dict[str, torch.Tensor]:
+    """Without the steps that are stored with them."""
+    tensors = load_file(folder / WEIGHTS)
+    return {k: v for k, v in tensors.items() if not k.startswith(PREFIX)}
 
 
 def edit_weights(folder: Path, change) -> None:
@@ -58,8 +65,9 @@ def test_git_lfs_pointers(folder):
 
 
 def test_weights_of_a_wrong_shape_or_name(folder):
-    key = sorted(k for k, v in load_file(folder / WEIGHTS).items() if v.ndim == 2)[0]
-    shape = tuple(load_file(folder / WEIGHTS)[key].shape)
+    weights = weights_in(folder)
+    key = sorted(k for k, v in weights.items() if v.ndim == 2)[0]
+    shape = tuple(weights[key].shape)
     edit_weights(folder, lambda t: t.update({key: torch.zeros(3, 1)}))
     said = refusal(folder)
     assert key in said and str(shape) in said and "(3, 1)" in said
@@ -74,8 +82,8 @@ def test_weights_of_a_wrong_shape_or_name(folder):
 
 @pytest.mark.parametrize("junk", [float("nan"), float("inf")])
 def test_weights_that_are_not_finite(folder, junk, generator):
-    tensors = load_file(folder / WEIGHTS)
-    key = sorted(tensors)[int(torch.randint(len(tensors), (), generator=generator))]
+    keys = sorted(weights_in(folder))
+    key = keys[int(torch.randint(len(keys), (), generator=generator))]
     edit_weights(folder, lambda t: t[key].view(-1)[-1:].fill_(junk))
     assert "finite" in refusal(folder)
 

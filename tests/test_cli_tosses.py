@@ -46,7 +46,6 @@ def test_what_was_fine_tuned_is_measured(tmp_path, capsys):
     assert {p.name for p in out.iterdir()} == {
         "model.safetensors",
         "card.json",
-        "check.safetensors",
         "curve.json",
     }
     argv = ["eval", "cube", "--data", str(EXCERPT), "--model", str(out)]

@@ -21,7 +21,13 @@ from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
 from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene, is_import, load_scene
-from torchrl_nerd.selfcheck import self_check, warn_of_differences, write_check
+from torchrl_nerd.selfcheck import PREFIX as CHECK
+from torchrl_nerd.selfcheck import (
+    SelfCheck,
+    self_check,
+    stored_steps,
+    warn_of_differences,
+)
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
@@ -71,16 +77,30 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
 
 
 def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
-    """Write weights, a few steps to check them by, then card: each whole or not at all."""
+    """Write weights, with a few steps to check them by, then card: each whole or not."""
     folder = writable_folder(folder)
-    write_tensors(folder / WEIGHTS, model.state_dict())
-    write_check(model, folder)
+    write_tensors(folder / WEIGHTS, model.state_dict() | stored_steps(model))
     write_json(folder / CARD, card)
     return folder
 
 
 def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
-    """A model from a folder that `save_checkpoint` wrote.
+    """A model from a folder; warns where this machine does not repeat its steps.
+
+    See `read_checkpoint`.
+    """
+    model, check = read_checkpoint(folder, scene)
+    if check is not None:
+        warn_of_differences(check, folder)
+    return model
+
+
+def read_checkpoint(
+    folder: Path, scene: Scene | None = None
+) -> tuple[NeRD, SelfCheck | None]:
+    """A model from a folder that `save_checkpoint` wrote, and its self-check.
+
+    There is none for another scene than the card's, nor in weights of before 0.2.
 
     Args:
         folder: where.
@@ -111,13 +131,12 @@ def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
         state = model.state_dict()
         tensors |= {k: v for k, v in state.items() if k.startswith(COVERAGE)}
     what = f"weights in {folder}"
-    expect_fit(tensors, model.state_dict(), what, f"scene '{scene.name}'")
-    model.load_state_dict(tensors)
-    if card.get("scene_hash") == scene.hash:
-        check = self_check(model.eval(), folder)
-        if check is not None:
-            warn_of_differences(check, folder)
-    return model.eval()
+    weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
+    expect_fit(weights, model.state_dict(), what, f"scene '{scene.name}'")
+    model.load_state_dict(weights)
+    if card.get("scene_hash") != scene.hash:
+        return model.eval(), None
+    return model, self_check(model.eval(), tensors, str(folder / WEIGHTS))
 
 
 def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> NeRD:

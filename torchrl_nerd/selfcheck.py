@@ -1,4 +1,4 @@
-"""A few steps kept beside the weights, and whether this machine still makes them.
+"""A few steps kept among the weights, and whether this machine still makes them.
 
 A checkpoint says which physics it learned; another MuJoCo, processor or library may step
 differently. Some states, what MuJoCo made of them where the model was trained, and what the
@@ -16,9 +16,8 @@ from torch import Generator, Tensor
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.tensor_files import read_tensors, write_tensors
 
-FILE = "check.safetensors"
+PREFIX = "check."  # of the names of what is stored
 ROWS = 8
 TRUE_TOLERANCE, LEARNED_TOLERANCE = 1e-6, 1e-3  # relative to 1 + the largest number
 
@@ -42,8 +41,8 @@ class SelfCheck:
         return self.true <= TRUE_TOLERANCE and self.learned <= LEARNED_TOLERANCE
 
 
-def write_check(model: NeRD, folder: Path) -> None:
-    """Store a few steps of this machine beside the model's weights."""
+def stored_steps(model: NeRD) -> dict[str, Tensor]:
+    """A few steps of this machine, to be kept among the model's weights."""
     scene = model.scene
     start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
     high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
@@ -51,28 +50,33 @@ def write_check(model: NeRD, folder: Path) -> None:
     given = {QPOS: start[QPOS], QVEL: start[QVEL], "joint_torque": torque}
     if TERRAIN in start:
         given[TERRAIN] = start[TERRAIN]
-    write_tensors(folder / FILE, {**given, **_steps(model, given)})
+    return {PREFIX + k: v for k, v in (given | _steps(model, given)).items()}
 
 
-def self_check(model: NeRD, folder: Path) -> SelfCheck | None:
+def self_check(model: NeRD, tensors: dict[str, Tensor], where: str) -> SelfCheck | None:
     """Step the stored states again; None where there are none.
 
     Args:
-        model: as it was loaded from ``folder``.
-        folder: of the checkpoint.
+        model: as it was loaded.
+        tensors: that were stored with its weights; others than steps are passed over.
+        where: they were read from, for the sentence.
 
     Raises:
-        ValueError: a file that cannot be read, or states of another robot.
+        ValueError: states of another robot.
     """
-    if not (folder / FILE).is_file():
+    stored = {
+        key.removeprefix(PREFIX): value
+        for key, value in tensors.items()
+        if key.startswith(PREFIX)
+    }
+    if not stored:
         return None
     try:
-        stored = read_tensors(folder / FILE)
         made = _steps(model, stored)
         worst = {key: _difference(value, stored[key]) for key, value in made.items()}
     except (KeyError, RuntimeError, TypeError, ValueError, IndexError) as error:
         raise ValueError(
-            f"expected a few steps of '{model.scene.name}' in {folder / FILE}, got "
+            f"expected a few steps of '{model.scene.name}' in {where}, got "
             f"something else: {str(error).splitlines()[0]}"
         ) from None
     true, learned = (

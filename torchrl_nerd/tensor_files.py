@@ -13,14 +13,24 @@ from torchrl_nerd.files import write_atomically
 LFS_POINTER = b"version https://git-lfs"
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+def write_tensors(
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    about: Mapping[str, str] | None = None,
+) -> None:
     """Replace the file by these tensors, from whatever device.
+
+    Args:
+        path: of the file.
+        tensors: by name.
+        about: a few words kept with them.
 
     Raises:
         ValueError: it cannot be written, said in one sentence.
     """
     copies = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-    content = save(copies)  # save_file would leave a file of its own if it is killed
+    # save_file would leave a file of its own if it is killed
+    content = save(copies, dict(about or {}))
     write_atomically(path, lambda aside: aside.write_bytes(content))
 
 

@@ -9,12 +9,12 @@ from collections import deque
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.files import writable_folder, write_atomically
+from torchrl_nerd.files import writable_folder
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.tensor_files import write_tensors
 
 REASONS = ("none", "action", "diverged", "runaway")
 """Meaning of ``fault``: no fault; an action that is not finite; a next state that is not;
@@ -88,5 +88,5 @@ class FaultRecorder:
         tensors = {k: torch.stack([s[k][row] for s in self._steps]) for k in keys}
         about = {**self.about, "reason": REASONS[kind], "row": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
-        write_atomically(path, lambda aside: save_file(tensors, aside, about))
+        write_tensors(path, tensors, about)
         return path

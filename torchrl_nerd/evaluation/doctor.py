@@ -10,8 +10,7 @@ from typing import Any
 import torch
 
 from torchrl_nerd import __version__
-from torchrl_nerd.checkpoint import PRETRAINED, from_pretrained, shipped_models
-from torchrl_nerd.selfcheck import self_check
+from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
 
 PACKAGES = (
     *("torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium"),
@@ -61,8 +60,7 @@ def shipped_checks() -> dict[str, dict[str, Any]]:
     for name in shipped_models():
         began = time.monotonic()
         try:
-            model = from_pretrained(name)
-            check = self_check(model, PRETRAINED / name)
+            model, check = read_checkpoint(PRETRAINED / name)
         except ValueError as error:
             found[name] = {"agrees": False, "error": str(error)}
             continue

@@ -48,16 +48,17 @@ class Traces:
 
 
 def trace(
-    dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive
+    dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive, every: int = 1
 ) -> TensorDict:
-    """States ``[rows, steps + 1]``, the start first: ``qpos`` and ``qvel``."""
+    """States ``[rows, 1 + steps // every]``, the start first: ``qpos`` and ``qvel``."""
     terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL)
     dynamics.reset(state)
     states = [state]
     for step in range(steps):
         state = dynamics.step(state, drive(step, state), terrain)
-        states.append(state.select(QPOS, QVEL))
+        if (step + 1) % every == 0:
+            states.append(state.select(QPOS, QVEL))
     return cast(TensorDict, TensorDict.stack(states, 1))
 
 

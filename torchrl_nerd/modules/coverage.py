@@ -78,8 +78,7 @@ class Coverage(nn.Module):
         self.center.copy_(center)
         self.whitening.copy_((axes / values.sqrt()).T)
         length = self.mahalanobis(some.to(tokens.dtype))
-        kept = length[:: max(1, len(length) // LARGEST_SAMPLE)]
-        self.reach.copy_(torch.quantile(kept, QUANTILE))
+        self.reach.copy_(torch.quantile(length, QUANTILE))
 
     def clamp_token(self, token: Tensor) -> Tensor:
         """Normalised tokens ``(*batch, F)``, each entry within the box; NaN stays."""

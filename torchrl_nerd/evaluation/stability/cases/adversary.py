@@ -6,12 +6,8 @@ from torch import Generator
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_motors
-from torchrl_nerd.evaluation.stability.world import (
-    DynamicsWorld,
-    World,
-    starts,
-    uniform_torque,
-)
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QPOS
 
 ROWS, STEPS, ROUNDS, ELITE = 128, 20, 8, 16

@@ -4,7 +4,8 @@ import torch
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import World, starts, uniform_torque
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL
 
 ROWS, STEPS = 4096, 3

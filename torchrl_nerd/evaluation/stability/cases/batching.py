@@ -4,12 +4,9 @@ import torch
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    largest,
-    starts,
-    uniform_torque,
-)
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QVEL
 
 ROWS, STEPS, ALONE = 4096, 3, 8

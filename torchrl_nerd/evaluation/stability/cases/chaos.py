@@ -4,9 +4,10 @@ import torch
 from torch import Generator
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World, starts
+from torchrl_nerd.evaluation.stability.measures import apart
+from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QPOS, QVEL
 
 ROWS, STEPS = 32, 200
@@ -22,8 +23,8 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
         nudged[QVEL].shape, generator=generator, dtype=torch.float64
     )
     true = truth.roll(start, STEPS)[QPOS]
-    floor = _error(world, true, truth.roll(nudged, STEPS)[QPOS])
-    error = _error(world, true, world.roll(start, STEPS)[QPOS])
+    floor = apart(world.scene, true, truth.roll(nudged, STEPS)[QPOS])
+    error = apart(world.scene, true, world.roll(start, STEPS)[QPOS])
     grown = (floor[:, -1].median() / floor[:, 1].median().clamp(min=1e-15)).log()
     rate = float(grown) / (world.scene.control_step * (STEPS - 1))
     hold = (error < GONE).long().cumprod(1).sum(1).double().mean()
@@ -34,11 +35,6 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
         "final error, m or rad": float(error[:, -1].nan_to_num(torch.inf).mean()),
         "chaos floor of a nudge of 1e-6": float(floor[:, -1].mean()),
     }
-
-
-def _error(world: World, true: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    errors = position_errors(world.scene, true, other)
-    return torch.stack(list(errors.values())).amax(0)
 
 
 CASE = Case(

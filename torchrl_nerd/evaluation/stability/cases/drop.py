@@ -5,13 +5,9 @@ from torch import Generator
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import (
-    DynamicsWorld,
-    World,
-    largest,
-    rows_of,
-    settled,
-)
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.states import rows_of, settled
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QPOS
 
 HEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0)  # m

@@ -5,30 +5,18 @@ import torch
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    clear_of_ground,
-    largest,
-    mechanics,
-    starts,
-)
-from torchrl_nerd.keys import QVEL
+from torchrl_nerd.evaluation.stability.flight import STEPS, quiet_flight
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.world import World
 
-ROWS, STEPS = 16, 30
-QUIET = 0.3  # of the training speeds, see momentum
 MISS = "miss after half a second, m"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
     scene = world.scene
-    start = clear_of_ground(scene, starts(scene, ROWS, generator))
-    start[QVEL] = QUIET * start[QVEL]
-    path = world.roll(start, STEPS)
-    found = mechanics(scene, path.flatten())
-    com = found["com"].reshape(ROWS, -1, 3)
-    velocity = (
-        found["momentum"].reshape(ROWS, -1, 3)[:, 0] / scene.model.body_mass.sum()
-    )
+    found = quiet_flight(world, generator)
+    com, mass = found["com"], scene.model.body_mass.sum()
+    velocity = found["momentum"][:, 0] / mass
     time = scene.control_step * np.arange(STEPS + 1)[:, None]
     gravity = scene.model.opt.gravity
     # MuJoCo's semi-implicit Euler falls half a substep's worth farther

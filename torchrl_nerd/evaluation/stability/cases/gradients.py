@@ -6,7 +6,8 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_motors
-from torchrl_nerd.evaluation.stability.world import World, starts, uniform_torque
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 
 ROWS = 8
@@ -15,7 +16,7 @@ OFF = "one step against finite differences, share"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
-    learned = getattr(world, "dynamics", None)
+    learned = world.dynamics
     if not isinstance(learned, NeRDDynamics):
         return {BROKEN: 0.0, OFF: 0.0}  # MuJoCo has none
     start = starts(world.scene, ROWS, generator)
@@ -35,15 +36,11 @@ def _figures(
     broken, figures = 0, {}
     for steps in (1, 32, 100):
         push = torque[:, :1].clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(
-            _end(dynamics, start, push, torque, steps).sum(), push
-        )
+        gradient = _slope(dynamics, start, push, torque, steps)
         broken += int((~gradient.isfinite()).sum())
         figures[f"largest gradient after {steps} steps"] = float(gradient.abs().amax())
     push = torque[:, :1].clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(
-        _end(dynamics, start, push, torque, 1).sum(), push
-    )
+    gradient = _slope(dynamics, start, push, torque, 1)
     way = torch.randn(push.shape, generator=generator, dtype=torch.float64)
     step = 1e-6 * push.detach().abs().amax()
     ends = [

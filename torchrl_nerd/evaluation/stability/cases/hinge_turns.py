@@ -4,14 +4,10 @@ import mujoco
 import torch
 from torch import Generator
 
-from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    largest,
-    starts,
-    uniform_torque,
-)
+from torchrl_nerd.evaluation.stability.measures import apart, largest
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
 
@@ -38,8 +34,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     turned[QPOS][:, free_hinges(scene)] += 2.0 * torch.pi * TURNS
     torque = uniform_torque(scene, ROWS, STEPS, generator)
     paths = [world.roll(s, STEPS, torque)[QPOS] for s in (start, turned)]
-    errors = position_errors(scene, *paths)
-    return {APART: max(largest(error) for error in errors.values())}
+    return {APART: largest(apart(scene, *paths))}
 
 
 CASE = Case(

@@ -7,12 +7,9 @@ from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    largest,
-    starts,
-    uniform_torque,
-)
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 
 ROWS, STEPS = 16, 12
@@ -20,7 +17,7 @@ APART = "apart from a fresh start, share"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
-    dynamics = getattr(world, "dynamics", None)
+    dynamics = world.dynamics
     if dynamics is None:
         return {APART: 0.0}  # envs have tests of their own
     scene = world.scene

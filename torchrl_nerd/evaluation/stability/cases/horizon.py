@@ -3,13 +3,11 @@
 import torch
 from torch import Generator
 
+from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    length,
-    starts,
-    uniform_torque,
-)
+from torchrl_nerd.evaluation.stability.measures import length
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL
 
 ROWS, STEPS, KEPT = 4, 100_000, 1000
@@ -26,11 +24,10 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
         BROKEN: float((~state.isfinite()).flatten(1).any(1).sum()),
         "largest speed, m/s or rad/s": float(path[QVEL].abs().amax()),
     }
-    if scene.base.is_floating and world.is_true is False:
-        coverage = getattr(getattr(world, "dynamics", None), "model", None)
+    if scene.base.is_floating and isinstance(world.dynamics, NeRDDynamics):
         q, v = scene.base.qpos_address, scene.base.dof_address
         moved = path[QPOS][:, 1:, q : q + 3] - path[QPOS][:, :-1, q : q + 3]
-        limit = float(coverage.coverage.speed[v]) if coverage is not None else 1e4
+        limit = float(world.dynamics.model.coverage.speed[v])
         allowed = 1.5 * limit * scene.control_step * (steps // KEPT)
         figures[LEAP] = float((length(moved) - allowed).clamp(min=0.0).amax())
     return figures

@@ -6,12 +6,9 @@ from torch import Generator
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import (
-    DynamicsWorld,
-    World,
-    largest,
-    starts,
-)
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
 

@@ -7,7 +7,9 @@ from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import World, largest, settled
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.states import settled
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.transforms import ContactFeatures
 

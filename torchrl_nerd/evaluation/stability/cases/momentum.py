@@ -4,27 +4,17 @@ import numpy as np
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    clear_of_ground,
-    largest,
-    mechanics,
-    starts,
-)
-from torchrl_nerd.keys import QVEL
+from torchrl_nerd.evaluation.stability.flight import quiet_flight
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.world import World
 
-ROWS, STEPS = 16, 30
-QUIET = 0.3  # of the training speeds: MuJoCo's own steps lose momentum at more
 LINEAR, SPIN = "sideways momentum, share", "spin about the centre of mass, share"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
     scene = world.scene
-    start = clear_of_ground(scene, starts(scene, ROWS, generator))
-    start[QVEL] = QUIET * start[QVEL]
-    path = world.roll(start, STEPS)
-    found = mechanics(scene, path.flatten())
-    push, spin = (found[k].reshape(ROWS, -1, 3) for k in ("momentum", "spin"))
+    found = quiet_flight(world, generator)
+    push, spin = found["momentum"], found["spin"]
     sideways = np.linalg.norm((push - push[:, :1])[..., :2], axis=-1)
     turned = np.linalg.norm(spin - spin[:, :1], axis=-1)
     mass, extent = scene.model.body_mass.sum(), scene.model.stat.extent

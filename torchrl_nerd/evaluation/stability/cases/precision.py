@@ -7,7 +7,8 @@ from torch import Generator, bfloat16, float32, float64
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World, starts
+from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QPOS
 
 ROWS, STEPS = 32, 100
@@ -15,7 +16,7 @@ SINGLE, HALF = "float32 against float64 after 1 step", "bfloat16 after 1 step"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
-    learned = getattr(world, "dynamics", None)
+    learned = world.dynamics
     if not isinstance(learned, NeRDDynamics):
         return {SINGLE: 0.0, HALF: 0.0}  # MuJoCo knows one precision
     start, paths = starts(world.scene, ROWS, generator), {}

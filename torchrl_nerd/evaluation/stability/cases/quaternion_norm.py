@@ -4,7 +4,9 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures
-from torchrl_nerd.evaluation.stability.world import World, largest, length, starts
+from torchrl_nerd.evaluation.stability.measures import largest, length
+from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import QPOS, QVEL
 

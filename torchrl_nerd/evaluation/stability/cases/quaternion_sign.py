@@ -2,14 +2,10 @@
 
 from torch import Generator
 
-from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import (
-    World,
-    largest,
-    starts,
-    uniform_torque,
-)
+from torchrl_nerd.evaluation.stability.measures import apart, largest
+from torchrl_nerd.evaluation.stability.states import starts, uniform_torque
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS
 
 ROWS, STEPS = 16, 10
@@ -23,8 +19,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     other[QPOS][:, q : q + 4] *= -1.0
     torque = uniform_torque(scene, ROWS, STEPS, generator)
     paths = [world.roll(s, STEPS, torque)[QPOS] for s in (start, other)]
-    errors = position_errors(scene, *paths)
-    return {APART: max(largest(error) for error in errors.values())}
+    return {APART: largest(apart(scene, *paths))}
 
 
 CASE = Case(

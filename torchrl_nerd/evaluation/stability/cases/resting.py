@@ -5,7 +5,9 @@ from torch import Generator
 
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import World, largest, mechanics, settled
+from torchrl_nerd.evaluation.stability.measures import largest, mechanics
+from torchrl_nerd.evaluation.stability.states import settled
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS
 
 ROWS, STEPS, KEPT = 16, 10_000, 100

@@ -8,13 +8,9 @@ from torch import Generator
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import (
-    DynamicsWorld,
-    World,
-    largest,
-    length,
-    settled,
-)
+from torchrl_nerd.evaluation.stability.measures import largest, length
+from torchrl_nerd.evaluation.stability.states import settled
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QPOS, QVEL
 
 ROWS, STEPS = 16, 300

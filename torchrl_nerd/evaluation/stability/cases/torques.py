@@ -4,7 +4,9 @@ import torch
 from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_motors
-from torchrl_nerd.evaluation.stability.world import World, idle, largest, starts
+from torchrl_nerd.evaluation.stability.measures import largest
+from torchrl_nerd.evaluation.stability.states import idle, starts
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL
 
 ROWS, STEPS = 4, 1000

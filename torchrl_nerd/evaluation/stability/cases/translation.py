@@ -2,9 +2,10 @@
 
 from torch import Generator
 
-from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.world import World, largest, starts
+from torchrl_nerd.evaluation.stability.measures import apart, largest
+from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
 
@@ -22,15 +23,14 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     scene, q = world.scene, world.scene.base.qpos_address
     start = starts(scene, ROWS, generator)
     here = world.roll(start, STEPS)[QPOS]
-    apart = {}
+    farthest = {}
     for distance in (1.0, 1e2, 1e4, 1e6):
         other = start.clone()
         other[QPOS][:, q] += distance
         there = world.roll(other, STEPS)[QPOS]
         there[..., q] -= distance
-        errors = position_errors(scene, here, there)
-        apart[distance] = max(largest(error) for error in errors.values())
-    return {NEAR: max(apart[d] for d in (1.0, 1e2, 1e4)), FAR: apart[1e6]}
+        farthest[distance] = largest(apart(scene, here, there))
+    return {NEAR: max(farthest[d] for d in (1.0, 1e2, 1e4)), FAR: farthest[1e6]}
 
 
 CASE = Case(

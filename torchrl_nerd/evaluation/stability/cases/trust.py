@@ -3,6 +3,7 @@
 from typing import cast
 
 import torch
+from scipy.stats import mannwhitneyu
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
@@ -22,7 +23,7 @@ RATIO = "error with fallback outside the range, of that inside"
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
-    learned = getattr(world, "dynamics", None)
+    learned = world.dynamics
     if not isinstance(learned, NeRDDynamics):
         return {MISSED: 0.0, RATIO: 1.0}  # MuJoCo needs no guard
     scene, model = world.scene, learned.model
@@ -92,13 +93,14 @@ def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
 
 
 def _auc(score: Tensor, is_large: Tensor) -> float:
-    """Share of pairs of a large and a small error that the score puts in order."""
-    rank = torch.empty_like(score)
-    rank[score.argsort()] = torch.arange(1.0, len(score) + 1).to(score)
-    large, small = int(is_large.sum()), int((~is_large).sum())
-    if not large or not small:
+    """Share of pairs of a large and a small error that the score puts in order.
+
+    A tie counts as half a pair, as in Mann and Whitney's statistic.
+    """
+    large, small = (score[rows].numpy() for rows in (is_large, ~is_large))
+    if not len(large) or not len(small):
         return float("nan")
-    return float((rank[is_large].sum() - large * (large + 1) / 2) / (large * small))
+    return float(mannwhitneyu(large, small).statistic / (len(large) * len(small)))
 
 
 def _rollout_error(

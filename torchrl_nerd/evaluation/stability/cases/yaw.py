@@ -1,12 +1,14 @@
 """The same motion in any direction."""
 
 import torch
-from torch import Generator
+from tensordict import TensorDict
+from torch import Generator, Tensor
 
-from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.cases.translation import applies
-from torchrl_nerd.evaluation.stability.world import World, largest, starts
+from torchrl_nerd.evaluation.stability.measures import apart, largest
+from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 
@@ -23,12 +25,11 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     turn = torch.cat((half.cos(), zero, zero, half.sin()), -1)
     here = _turned(world.roll(start, STEPS), turn, q, v)
     there = world.roll(_turned(start[:, None], turn, q, v)[:, 0], STEPS)
-    errors = position_errors(scene, here[QPOS], there[QPOS])
-    worst = torch.stack(list(errors.values())).amax((0, 2))
+    worst = apart(scene, here[QPOS], there[QPOS]).amax(1)
     return {APART: float(worst.median()), "worst row": largest(worst)}
 
 
-def _turned(states, turn, q, v):  # noqa: ANN001, ANN202
+def _turned(states: TensorDict, turn: Tensor, q: int, v: int) -> TensorDict:
     """States ``[rows, T]`` turned about the vertical through the origin."""
     states, turn = states.clone(), turn[:, None].expand(*states.batch_size, 4)
     qpos, qvel = states[QPOS], states[QVEL]

@@ -1,0 +1,65 @@
+"""Where cases begin: the training ranges, at rest, or up in the air."""
+
+from functools import cache
+from typing import cast
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.sampling import sample_torque
+
+SETTLE, STILL = 5.0, 1e-3  # s; m/s and rad/s
+HIGH = 100.0  # m
+
+
+def idle(scene: Scene, rows: int) -> Tensor:
+    """No torque, ``(rows, num_actuated)``."""
+    return torch.zeros(rows, len(scene.actuated), dtype=torch.float64)
+
+
+def starts(scene: Scene, rows: int, generator: Generator) -> TensorDict:
+    """States ``[rows]`` from the scene's training ranges."""
+    return TensorDict(scene.sample_initial(rows, generator)[0], [rows])
+
+
+@cache
+def settled(scene: Scene, rows: int) -> TensorDict:
+    """Where the robot comes to lie in true dynamics, dropped from its training ranges.
+
+    Returns:
+        Up to ``rows`` states at rest; fewer where it does not come to rest.
+    """
+    start = starts(scene, 2 * rows, Generator().manual_seed(0))
+    start[QVEL] = 0.0 * start[QVEL]
+    steps = round(SETTLE / scene.control_step)
+    torque = idle(scene, 2 * rows)[:, None].expand(-1, steps, -1)
+    path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None))
+    for key in (QPOS, QVEL):
+        start[key] = path[key][:, -1].clone()
+    is_still = torch.amax(start[QVEL].abs(), -1) < STILL
+    return rows_of(start, is_still.nonzero()[:rows, 0])
+
+
+def rows_of(states: TensorDict, rows: Tensor) -> TensorDict:
+    """Some of the states, by index or mask; a copy."""
+    return cast(TensorDict, states[rows])
+
+
+def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
+    """The same states where nothing can be touched: lifted, or the ground lowered."""
+    start = start.clone()
+    if scene.base.is_floating:
+        start[QPOS][:, scene.base.qpos_address + 2] += HIGH
+    if scene.terrain is not None and scene.terrain.is_per_row:
+        start[TERRAIN][:, 3] -= HIGH
+    return start
+
+
+def uniform_torque(scene: Scene, rows: int, steps: int, generator: Generator) -> Tensor:
+    """Torques in the training range, ``(rows, steps, num_actuated)``."""
+    scale = torch.ones(rows, 1, dtype=torch.float64)
+    return sample_torque(scene.sampling, scale, steps, generator)
