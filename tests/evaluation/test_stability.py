@@ -17,9 +17,15 @@ from torchrl_nerd.evaluation.stability.world import DynamicsWorld, EnvWorld
 from torchrl_nerd.evaluation.traces import energy as traced_energy
 
 SCALE = 0.001
-SLOW = ("adversary", "chaos", "drop", "sliding", "resting", "margin", "horizon")
+SLOW = (
+    *("adversary", "chaos", "drop", "sliding", "resting", "margin", "horizon"),
+    *("stiff_contact", "execution"),
+)
 SHORT = [name for name in CASES if name not in SLOW]
-INDEPENDENT = ("bad_rows", "rotations", "quaternion_norm", "quaternion_sign")
+INDEPENDENT = (
+    *("bad_rows", "rotations", "quaternion_norm", "quaternion_sign"),
+    *("altitude", "history", "statistics", "tilt"),
+)
 
 
 def results_of(scene, names, generator):

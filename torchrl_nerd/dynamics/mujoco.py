@@ -65,11 +65,13 @@ class MujocoDynamics:
 
     def __getstate__(self) -> dict:
         """Threads do not travel: a copy in another process starts its own."""
-        return {"scene": self.scene, "num_threads": self.num_threads}
+        kept = ("scene", "num_threads", "_warmstart", "_felt")
+        return {name: copy.copy(self.__dict__[name]) for name in kept}
 
     def __setstate__(self, state: dict) -> None:
         self.scene, self.num_threads = state["scene"], state["num_threads"]
         self._start()
+        self.__dict__.update(state)
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Clear the warm start of ``rows``."""

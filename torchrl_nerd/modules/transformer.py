@@ -46,13 +46,14 @@ class KeyValueCache:
     |---|---|
     | ``keys``, ``values`` | per layer ``(rows, heads, band - 1, head width)`` |
     | ``age`` | ``(rows,)``: tokens seen since the row's reset, at most ``band - 1`` |
-    | ``slot`` | where the oldest token lies, which the next one overwrites |
+    | ``slot`` | ``(1,)``: where the oldest token lies, which the next one overwrites; a
+      tensor, so that compiled code is the same for all of them |
     """
 
     keys: list[Tensor]
     values: list[Tensor]
     age: Tensor
-    slot: int = 0
+    slot: Tensor
 
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
@@ -64,15 +65,20 @@ class KeyValueCache:
         """Store one token of one layer; out of place while gradients are recorded."""
         for past, new in ((self.keys, key), (self.values, value)):
             if torch.is_grad_enabled():
-                kept = past[layer].roll(-self.slot, 2)[:, :, 1:]
+                size = past[layer].shape[2]
+                later = torch.arange(1, size, device=new.device) + self.slot
+                kept = past[layer].index_select(2, later % size)
                 past[layer] = torch.cat((kept, new[:, :, None]), 2)
             else:
-                past[layer][:, :, self.slot] = new
+                past[layer].index_copy_(2, self.slot, new[:, :, None])
 
     def advance(self) -> None:
         """Count one token."""
         size = self.keys[0].shape[2]
-        self.slot = 0 if torch.is_grad_enabled() else (self.slot + 1) % size
+        is_shifted = torch.is_grad_enabled()
+        self.slot = (
+            torch.zeros_like(self.slot) if is_shifted else (self.slot + 1) % size
+        )
         self.age = (self.age + 1).clamp_max(size)
 
 
@@ -211,9 +217,8 @@ class CausalTransformer(nn.Module):
         keys, values = (
             [weight.new_zeros(shape) for _ in range(c.layers)] for _ in range(2)
         )
-        return KeyValueCache(
-            keys, values, torch.zeros(rows, dtype=torch.long, device=weight.device)
-        )
+        age = torch.zeros(rows, dtype=torch.long, device=weight.device)
+        return KeyValueCache(keys, values, age, slot=age.new_zeros(1))
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
         """The next token of every row, ``(rows, F) -> (rows, D)``; advances ``memory``."""

@@ -17,6 +17,7 @@ import numpy as np
 from torchrl_nerd.geometry.kinematics import HINGE, SLIDE, Base, quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.quiet import quiet_mujoco
+from torchrl_nerd.scenes.support import unit_gravity
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
@@ -140,7 +141,7 @@ def base_effects(
     moves = {
         f"base {axis}": (q + i, _shift(QPOS, q + i)) for i, axis in enumerate("xyz")
     }
-    moves["base heading"] = (q + 3, _heading(base))
+    moves["base heading"] = (q + 3, _heading(base, unit_gravity(model)))
     return tuple(
         Effect(name, QPOS, at, _largest_change(free, substeps, rng, move, base))
         for name, (at, move) in moves.items()
@@ -161,13 +162,13 @@ def _shift(key: str, address: int) -> Move:
     return move
 
 
-def _heading(base: Base) -> Move:
-    """Turn the robot about the vertical, and its velocity with it."""
+def _heading(base: Base, axis: np.ndarray) -> Move:
+    """Turn the robot about gravity, and its velocity with it."""
     q, v = base.qpos_address + 3, base.dof_address
 
     def move(data: mujoco.MjData, rng: np.random.Generator) -> None:
         half = 0.5 * rng.normal()
-        turn, turned = np.array([np.cos(half), 0, 0, np.sin(half)]), np.empty(4)
+        turn, turned = np.append(np.cos(half), np.sin(half) * axis), np.empty(4)
         mujoco.mju_mulQuat(turned, turn, data.qpos[q : q + 4])
         data.qpos[q : q + 4] = turned
         data.qvel[v : v + 3] = quat_matrix(turn) @ data.qvel[v : v + 3]

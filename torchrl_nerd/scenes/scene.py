@@ -39,7 +39,7 @@ from torchrl_nerd.scenes.importer import (
     import_mjcf,
 )
 from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
-from torchrl_nerd.scenes.support import check_supported
+from torchrl_nerd.scenes.support import check_supported, unit_gravity
 from torchrl_nerd.scenes.terrain import Terrain
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
@@ -148,6 +148,12 @@ class Scene:
     def mount(self) -> tuple[np.ndarray, np.ndarray]:
         """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base."""
         return mount_pose(self.model, self.base)
+
+    @cached_property
+    def down(self) -> tuple[float, float, float]:
+        """Unit vector of gravity in the world; where there is none, against z."""
+        x, y, z = unit_gravity(self.model)
+        return x, y, z
 
     @cached_property
     def actuated(self) -> list[int]:

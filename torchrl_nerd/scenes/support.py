@@ -54,7 +54,7 @@ def check_supported(name: str, model: mujoco.MjModel) -> None:
     if base.is_floating and not _moves_alike_everywhere(model, base):
         raise ValueError(
             f"scene '{name}' has a floating base whose motion depends on where it is or "
-            "faces (wind, gravity off the vertical, a spring): not supported"
+            "faces (wind, a spring): not supported"
         )
 
 
@@ -128,12 +128,18 @@ def _kind_of_joint(model: mujoco.MjModel, actuator: int) -> int:
     return HINGE if wrap == mujoco.mjtWrap.mjWRAP_JOINT else NOTHING
 
 
+def unit_gravity(model: mujoco.MjModel) -> np.ndarray:
+    """Direction of gravity ``(3,)``; where there is none, against z."""
+    size = np.linalg.norm(model.opt.gravity)
+    return model.opt.gravity / size if size else np.array([0.0, 0.0, -1.0])
+
+
 def _moves_alike_everywhere(model: mujoco.MjModel, base: Base) -> bool:
-    """True where a free flight, moved and turned about the vertical, stays the same."""
+    """True where a free flight, moved and turned about gravity, stays the same."""
     flight = copy.copy(model)
     for bit in ("CONTACT", "ACTUATION"):
         flight.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}")
-    rng, yaw = np.random.default_rng(0), np.array([0.8, 0.0, 0.0, 0.6])
+    rng, yaw = np.random.default_rng(0), np.append(0.8, 0.6 * unit_gravity(model))
     q, v = base.qpos_address, base.dof_address
     data = mujoco.MjData(flight)
     mujoco.mj_integratePos(flight, data.qpos, rng.normal(size=model.nv), 1.0)

@@ -2,7 +2,8 @@
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
 zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out; where
-all there is is one plane that all rows share and that is level, or that a fixed base
+all there is is one plane that all rows share and that is level (gravity is normal to
+it), or that a fixed base
 cannot turn against, n follows from gravity and pose and is left out too. Of several
 surfaces each point sees the nearest, so that a model fits any number of them.
 
@@ -80,7 +81,9 @@ class ContactFeatures(FeatureTransform):
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
             plane = terrain.fixed_plane
-            is_level = plane is not None and abs(float(plane[2])) > 1.0 - 1e-12
+            is_level = (
+                plane is not None and abs(float(plane[:3] @ scene.down)) > 1.0 - 1e-12
+            )
             if plane is None or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)

@@ -13,8 +13,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-FLOOR = 1e-6
-"""Smallest standard deviation, relative to 1 + |mean|: a constant stays a constant."""
+FLOOR, ROUNDING = 1e-6, 1e-12
+"""Smallest standard deviation, and what is added for each unit of |mean|: a constant
+stays a constant, and whatever varies beside a huge offset counts."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Stats:
     @property
     def std(self) -> Tensor:
         """Population standard deviation ``(D,)``, floored."""
-        floor = FLOOR * (1.0 + self.mean.abs())
+        floor = FLOOR + ROUNDING * self.mean.abs()
         return torch.maximum((self.m2 / max(self.count, 1)).sqrt(), floor)
 
 

@@ -55,7 +55,7 @@ class RobotCentric(FeatureTransform):
         super().__init__([QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
         self.base = scene.base
         self.joints = joints
-        self.down = -1.0 if scene.model.opt.gravity[2] <= 0.0 else 1.0
+        self.down = scene.down
 
     def state_features(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """``robot_state`` in the dtype of the inputs, ``(*batch, D)``."""
@@ -63,7 +63,9 @@ class RobotCentric(FeatureTransform):
         if self.base.is_floating:
             q, v = self.base.qpos_address, self.base.dof_address
             quat, down = qpos[..., q + 3 : q + 7], torch.zeros_like(qvel[..., :3])
-            down[..., 2] = self.down
+            for axis, share in enumerate(self.down):
+                if share:
+                    down[..., axis] = share
             linear = rotate_inverse(quat, qvel[..., v : v + 3])
             angular = qvel[..., v + 3 : v + 6]
             parts = [linear, angular, rotate_inverse(quat, down), *parts]

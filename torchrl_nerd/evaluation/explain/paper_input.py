@@ -73,7 +73,8 @@ class PaperInput(nn.Module):
         self.register_buffer("margins", margins, persistent=False)
         self.count = len(bodies) if scene.terrain is not None else 0
         self.frame = BaseFrame(scene)
-        self.down = -1.0 if model.opt.gravity[2] <= 0.0 else 1.0
+        down = torch.tensor(scene.down, dtype=torch.float64)
+        self.register_buffer("down", down, persistent=False)
         if self.count:
             self.kinematics = PointKinematics(model, scene.base, bodies, positions)
 
@@ -109,7 +110,7 @@ class PaperInput(nn.Module):
             return found
         position, rotation = self.scene.base_pose(qpos)
         turn, offset = self.frame(qpos)
-        found[GRAVITY_B] = self.down * (rotation @ turn)[..., 2, :]
+        found[GRAVITY_B] = (rotation @ turn).mT @ self.down.to(qpos)
         if base.is_floating:
             v = base.dof_address
             identity = qpos.new_tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])

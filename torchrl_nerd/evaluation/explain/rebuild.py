@@ -131,8 +131,9 @@ def recover_state(scene: Scene, part: dict[str, Tensor]) -> tuple[Tensor, Tensor
         qvel[:, joints.velocities] = part[SPEED]
     if GRAVITY in part:
         q, v = scene.base.qpos_address, scene.base.dof_address
-        down = -1.0 if scene.model.opt.gravity[2] <= 0.0 else 1.0
-        quat = quat_from_matrix(_upright(down * part[GRAVITY]))
+        down = part[GRAVITY].new_tensor(scene.down)
+        matrix = _upright(down).mT @ _upright(part[GRAVITY])
+        quat = quat_from_matrix(matrix)
         qpos[:, q : q + 3], qpos[:, q + 3 : q + 7] = 0.0, quat
         qvel[:, v : v + 3] = rotate(quat, part[LINEAR])
         qvel[:, v + 3 : v + 6] = part[ANGULAR]
@@ -181,7 +182,7 @@ def _seen(scene: Scene, part: dict[str, Tensor], qpos: Tensor) -> tuple[Tensor, 
 
 
 def _upright(up: Tensor) -> Tensor:
-    """A rotation ``(rows, 3, 3)`` from base to world, given the world's z in the base."""
+    """A rotation ``(*rows, 3, 3)`` that turns these unit vectors into z."""
     side = torch.eye(3).to(up)[up.abs().argmin(-1)]
     x = torch.linalg.cross(side, up)
     x = x / torch.linalg.vector_norm(x, dim=-1, keepdim=True)

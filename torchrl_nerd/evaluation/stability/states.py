@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
@@ -63,3 +64,20 @@ def uniform_torque(scene: Scene, rows: int, steps: int, generator: Generator) ->
     """Torques in the training range, ``(rows, steps, num_actuated)``."""
     scale = torch.ones(rows, 1, dtype=torch.float64)
     return sample_torque(scene.sampling, scale, steps, generator)
+
+
+def turned(scene: Scene, states: TensorDict, turn: Tensor) -> TensorDict:
+    """States of a floating robot, turned about the world's origin.
+
+    Args:
+        scene: the robot.
+        states: ``[*batch]``.
+        turn: ``(*batch, 4)``.
+    """
+    q, v = scene.base.qpos_address, scene.base.dof_address
+    states = states.clone()
+    qpos, qvel = states[QPOS], states[QVEL]
+    qpos[..., q : q + 3] = rotate(turn, qpos[..., q : q + 3])
+    qpos[..., q + 3 : q + 7] = quat_multiply(turn, qpos[..., q + 3 : q + 7])
+    qvel[..., v : v + 3] = rotate(turn, qvel[..., v : v + 3])
+    return states

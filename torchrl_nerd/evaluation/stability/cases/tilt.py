@@ -1,0 +1,72 @@
+"""Gravity and the floor tilted together."""
+
+import copy
+from dataclasses import replace
+
+import torch
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.stability.case import Case, Figures
+from torchrl_nerd.evaluation.stability.cases.translation import applies
+from torchrl_nerd.evaluation.stability.measures import apart, largest
+from torchrl_nerd.evaluation.stability.states import starts, turned
+from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
+from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.keys import QPOS
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.contact_points import ground_geoms
+
+ROWS, STEPS = 16, 10
+APART = "apart after 10 steps, m or rad"
+
+
+def tilted(scene: Scene, turn: Tensor) -> Scene:
+    """The robot in a world that is turned by a quaternion ``(4,)``, its floor too."""
+    model = copy.copy(scene.model)
+    gravity = torch.from_numpy(scene.model.opt.gravity.copy())
+    model.opt.gravity[:] = rotate(turn, gravity).numpy()
+    for geom in ground_geoms(model):
+        position = torch.from_numpy(scene.model.geom_pos[geom].copy())
+        quat = torch.from_numpy(scene.model.geom_quat[geom].copy())
+        model.geom_pos[geom] = rotate(turn, position).numpy()
+        model.geom_quat[geom] = quat_multiply(turn, quat).numpy()
+        model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's frame for it
+    return replace(scene, model=model)
+
+
+def _run(world: World, generator: Generator, scale: float) -> Figures:
+    start = starts(world.scene, ROWS, generator)
+    way = torch.randn(4, generator=generator, dtype=torch.float64)
+    turn = way / torch.linalg.vector_norm(way)
+    here = turned(world.scene, world.roll(start, STEPS), turn)
+    other = _over(world, tilted(world.scene, turn))
+    there = other.roll(turned(world.scene, start, turn), STEPS)
+    worst = apart(world.scene, here[QPOS], there[QPOS]).amax(1)
+    return {APART: float(worst.median()), "worst row": largest(worst)}
+
+
+def _over(world: World, scene: Scene) -> World:
+    """The same dynamics of another scene, whose features are the same.
+
+    Raises:
+        ValueError: the world is an env, which cannot be moved to another scene.
+    """
+    if isinstance(world.dynamics, MujocoDynamics):
+        return DynamicsWorld(MujocoDynamics(scene))
+    if not isinstance(world.dynamics, NeRDDynamics):
+        raise ValueError("expected dynamics, got an env: tilt its world yourself")
+    old = world.dynamics.model
+    model = type(old)(scene, old.config)
+    model.load_state_dict(old.state_dict())
+    return DynamicsWorld(NeRDDynamics(model))
+
+
+CASE = Case(
+    "tilt",
+    "down is where gravity points: robot, floor and gravity turned together move alike",
+    _run,
+    applies,
+    true_lines={APART: 1e-4},
+    lines={APART: 1e-4},
+)
