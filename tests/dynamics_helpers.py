@@ -20,6 +20,7 @@ from torchrl_nerd.dynamics import (
     MujocoDynamics,
     NeRDDynamics,
 )
+from torchrl_nerd.dynamics.mujoco_warp import MujocoWarpDynamics, is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import Scene
@@ -30,8 +31,13 @@ from torchrl_nerd.transforms import Stats
 LEARNED = ("streaming", "window")
 TRUE = ("mujoco", "dm_control")
 DYNAMICS = (*LEARNED, *TRUE)
+WARP = pytest.param("mujoco_warp", marks=pytest.mark.slow)
 
 each_dynamics = pytest.mark.parametrize("dynamics", DYNAMICS)
+warp_too = pytest.mark.parametrize(
+    "dynamics", (*DYNAMICS, WARP) if is_warp_installed() else DYNAMICS
+)
+"""With MuJoCo Warp where it is installed, on the CPU, where it takes minutes."""
 
 
 def enliven(network: nn.Module, generator: Generator) -> nn.Module:
@@ -112,6 +118,8 @@ class DynamicsMaker:
             return NeRDDynamics(self.model, inference=self.kind)
         if self.kind == "mujoco":
             return MujocoDynamics(self.scene, num_threads=2)
+        if self.kind == "mujoco_warp":
+            return MujocoWarpDynamics(self.scene, "cpu")
         return DMControlDynamics(self.scene)
 
 

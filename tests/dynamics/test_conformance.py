@@ -6,14 +6,14 @@ import pickle
 import pytest
 import torch
 from dynamics_helpers import (
-    TRUE,
+    LEARNED,
     DynamicsMaker,
     assert_same_motion,
-    each_dynamics,
     random_drive,
     random_mask,
     roll,
     unequal_keys,
+    warp_too,
 )
 from tensordict import TensorDict
 
@@ -24,17 +24,18 @@ def rows_of(rows, state, torques, terrain):
     return state[rows], torques[:, rows], None if terrain is None else terrain[rows]
 
 
-@each_dynamics
+@warp_too
 def test_a_row_of_a_batch_moves_as_it_would_alone(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
     drive = random_drive(scene, ROWS, STEPS, generator)
     together = roll(make(), *drive)
     for row in range(ROWS):
         alone = roll(make(), *rows_of(slice(row, row + 1), *drive))
-        assert_same_motion(alone[0], together[row], 0.0 if dynamics in TRUE else 1e-6)
+        tolerance = 1e-6 if dynamics in LEARNED else 0.0
+        assert_same_motion(alone[0], together[row], tolerance)
 
 
-@each_dynamics
+@warp_too
 def test_a_partial_reset_forgets_its_rows_and_no_others(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
     start, torques, terrain = random_drive(scene, ROWS, 2 * STEPS, generator)
@@ -54,7 +55,7 @@ def test_a_partial_reset_forgets_its_rows_and_no_others(scene, dynamics, generat
     assert_same_motion(after[rows], fresh[rows], tolerance)
 
 
-@each_dynamics
+@warp_too
 @pytest.mark.parametrize("junk", [float("nan"), float("inf"), 1e200])
 def test_a_broken_row_breaks_no_other(scene, dynamics, junk, generator):
     make = DynamicsMaker(scene, dynamics, generator)
@@ -77,7 +78,7 @@ def test_a_broken_row_breaks_no_other(scene, dynamics, junk, generator):
     assert healed["qpos"].isfinite().all() and healed["qvel"].isfinite().all()
 
 
-@each_dynamics
+@warp_too
 def test_a_step_keeps_its_inputs_and_shares_no_memory(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
@@ -95,7 +96,7 @@ def test_a_step_keeps_its_inputs_and_shares_no_memory(scene, dynamics, generator
     assert not unequal_keys(torch.stack(states, 1), expected)
 
 
-@each_dynamics
+@warp_too
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
 )
@@ -111,7 +112,7 @@ def test_a_copy_moves_like_the_original_and_apart_from_it(
     assert not unequal_keys(roll(twin, *drive), expected)
 
 
-@each_dynamics
+@warp_too
 @pytest.mark.parametrize("is_reset", [True, False], ids=["reset", "no reset"])
 def test_another_number_of_rows_starts_anew(scene, dynamics, is_reset, generator):
     make = DynamicsMaker(scene, dynamics, generator)
@@ -125,7 +126,7 @@ def test_another_number_of_rows_starts_anew(scene, dynamics, is_reset, generator
         assert not unequal_keys(roll(used, *fewer), roll(make(), *fewer))
 
 
-@each_dynamics
+@warp_too
 def test_wrong_shapes_are_refused_in_one_sentence(scene, dynamics, generator):
     moving = DynamicsMaker(scene, dynamics, generator)()
     start, torques, terrain = random_drive(scene, ROWS, 1, generator)
@@ -148,7 +149,7 @@ def test_wrong_shapes_are_refused_in_one_sentence(scene, dynamics, generator):
         assert "terrain" in message(terrain=terrain[0])
 
 
-@each_dynamics
+@warp_too
 def test_torque_and_ground_matter(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
     start, torques, terrain = random_drive(scene, ROWS, 1, generator)
@@ -163,7 +164,7 @@ def test_torque_and_ground_matter(scene, dynamics, generator):
     assert (touched != pushed).any()
 
 
-@each_dynamics
+@warp_too
 def test_states_are_float64_and_of_the_scene(scene, dynamics, generator):
     moving = DynamicsMaker(scene, dynamics, generator)()
     start, torques, terrain = random_drive(scene, ROWS, 1, generator)

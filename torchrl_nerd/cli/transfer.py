@@ -22,7 +22,7 @@ class Transfer:
     policy: Path
     """Folder of a policy, as examples/ppo.py writes it."""
     dynamics: tuple[str, ...] = ("nerd", "mujoco")
-    """Any of nerd, mujoco, dm_control, checkpoint folders."""
+    """Any of nerd, mujoco, dm_control, mujoco_warp, checkpoint folders."""
     episodes: int = 2048
     """Per dynamics."""
     seed: int = 500

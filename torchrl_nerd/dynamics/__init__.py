@@ -1,9 +1,10 @@
-"""Physics behind one call: true (MuJoCo, dm_control) and learned (NeRD)."""
+"""Physics behind one call: true (MuJoCo, dm_control, MuJoCo Warp) and learned (NeRD)."""
 
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.dynamics.dm_control import DMControlDynamics
 from torchrl_nerd.dynamics.guarded import GuardedDynamics, UntrustedError
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
+from torchrl_nerd.dynamics.mujoco_warp import MujocoWarpDynamics
 from torchrl_nerd.dynamics.nerd import NeRDDynamics
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Dynamics",
     "GuardedDynamics",
     "MujocoDynamics",
+    "MujocoWarpDynamics",
     "NeRDDynamics",
     "UntrustedError",
 ]

@@ -1,30 +1,47 @@
 """A task in true dynamics."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 import torch
 
-from torchrl_nerd.dynamics import DMControlDynamics, MujocoDynamics
+from torchrl_nerd.dynamics import (
+    DMControlDynamics,
+    Dynamics,
+    MujocoDynamics,
+    MujocoWarpDynamics,
+)
+from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task, make_task
 
-Engine = Literal["mujoco", "dm_control"]
+Engine = Literal["mujoco", "dm_control", "mujoco_warp"]
+ENGINES: dict[str, Callable[[Scene, torch.device | str], Dynamics]] = {
+    "mujoco": lambda scene, device: MujocoDynamics(scene),
+    "dm_control": lambda scene, device: DMControlDynamics(scene),
+    "mujoco_warp": MujocoWarpDynamics,
+}
+GROUND_TRUTH = tuple(e for e in ENGINES if e != "mujoco_warp" or is_warp_installed())
+"""Those that can be used here."""
 
 
 class GroundTruthEnv(SceneEnv):
-    """A `SceneEnv` on MuJoCo's batched rollout or on dm_control's `Physics`.
+    """A `SceneEnv` on MuJoCo's batched rollout, dm_control's `Physics` or MuJoCo Warp.
 
     Args:
         task: id of a registered task, or a task.
-        engine: ``"mujoco"`` or ``"dm_control"``.
+        engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"``.
         num_envs: rows.
         seed: of the resets.
-        device: where states, observations and rewards live; the physics runs on the CPU.
+        device: where states, observations and rewards live, and where MuJoCo Warp runs;
+            the others run on the CPU.
         fault_folder: see `SceneEnv`.
 
     Raises:
-        ValueError: an unknown engine.
+        ValueError: an unknown engine, or one that cannot step this scene.
+        ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
 
     Examples:
         >>> env = GroundTruthEnv("cartpole/swingup", num_envs=3)
@@ -41,11 +58,10 @@ class GroundTruthEnv(SceneEnv):
         device: torch.device | str = "cpu",
         fault_folder: Path | None = None,
     ) -> None:
-        engines = {"mujoco": MujocoDynamics, "dm_control": DMControlDynamics}
-        if engine not in engines:
+        if engine not in ENGINES:
             raise ValueError(
-                f"unknown engine '{engine}', expected one of {', '.join(engines)}"
+                f"unknown engine '{engine}', expected one of {', '.join(GROUND_TRUTH)}"
             )
         task = make_task(task) if isinstance(task, str) else task
-        dynamics = engines[engine](task.scene)
+        dynamics = ENGINES[engine](task.scene, device)
         super().__init__(task, dynamics, num_envs, seed, device, fault_folder)

@@ -7,11 +7,14 @@ import torch
 
 from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.ground_truth import Engine, GroundTruthEnv
+from torchrl_nerd.envs.ground_truth import (
+    ENGINES,
+    GROUND_TRUTH,
+    Engine,
+    GroundTruthEnv,
+)
 from torchrl_nerd.envs.nerd import NeRDEnv
 from torchrl_nerd.tasks import Task
-
-GROUND_TRUTH = ("mujoco", "dm_control")
 
 
 def make_env(
@@ -27,8 +30,8 @@ def make_env(
 
     Args:
         task: id of a registered task, or a task.
-        dynamics: ``"nerd"`` (the shipped model), ``"mujoco"``, ``"dm_control"``, or the
-            folder of a checkpoint.
+        dynamics: ``"nerd"`` (the shipped model), ``"mujoco"``, ``"dm_control"``,
+            ``"mujoco_warp"`` (extra ``warp``), or the folder of a checkpoint.
         num_envs: rows.
         seed: of the resets.
         device: where all tensors live.
@@ -38,8 +41,9 @@ def make_env(
 
     Raises:
         ValueError: unknown task or dynamics, named in one sentence.
+        ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
     """
-    if dynamics in GROUND_TRUTH:
+    if dynamics in ENGINES:
         engine = cast(Engine, dynamics)
         return GroundTruthEnv(task, engine, num_envs, seed, device, fault_folder)
     model = None if dynamics == "nerd" else dynamics

@@ -14,7 +14,7 @@ from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
 
 PACKAGES = (
     *("torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium"),
-    *("safetensors", "numpy"),
+    *("safetensors", "numpy", "mujoco-warp"),
 )
 
 

@@ -1,0 +1,265 @@
+"""Ground truth on a GPU: all rows as one batch of MuJoCo Warp, in float32."""
+
+import sys
+from contextlib import AbstractContextManager
+from importlib.util import find_spec
+from typing import Any, cast
+
+import mujoco
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
+from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
+from torchrl_nerd.scenes.scene import Scene
+
+CONTACTS_PER_PAIR = 8  # of two geoms, two boxes at most; MuJoCo Warp has no more
+CONTACTS_PER_HEIGHT_FIELD = 50  # of it and another geom, MuJoCo's mjMAXCONPAIR
+LARGEST = 1e10  # m, rad, m/s, rad/s: MuJoCo's mjMAXVAL, beyond which it gives up
+
+
+def is_warp_installed() -> bool:
+    """Whether the package mujoco-warp can be imported."""
+    return find_spec("mujoco_warp") is not None
+
+
+def import_warp() -> tuple[Any, Any]:
+    """The modules ``warp`` and ``mujoco_warp``, without their greeting.
+
+    Raises:
+        ModuleNotFoundError: they are not installed; names the extra.
+    """
+    if not is_warp_installed():
+        raise ModuleNotFoundError(
+            "dynamics 'mujoco_warp' needs the package mujoco-warp, which is not "
+            "installed: pip install 'torchrl-nerd[warp]'"
+        )
+    is_first = "warp" not in sys.modules
+    import warp
+
+    if is_first:  # whoever imported it before has chosen what it says
+        warp.config.log_level = warp.LOG_ERROR
+    import mujoco_warp
+
+    warp.init()
+
+    return warp, mujoco_warp
+
+
+def warp_model(scene: Scene) -> mujoco.MjModel:
+    """The scene's model driven by joint torques alone, in flags that Warp knows.
+
+    It never resets a row by itself, so there is nothing to switch off.
+    """
+    model = torque_model(scene)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return model
+
+
+def largest_constraints(model: mujoco.MjModel, max_contacts: int) -> int:
+    """How many scalar constraints a row can have with so many contacts."""
+    condim = int(max(model.geom_condim, default=1))
+    is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    each = max(1, 2 * (condim - 1)) if is_pyramid else condim
+    # a limit holds a joint at both ends at worst; friction loss acts on every dof
+    others = 2 * (model.njnt + model.ntendon) + model.nv + model.ntendon
+    return each * max_contacts + others
+
+
+class MujocoWarpDynamics:
+    """MuJoCo Warp: states stay on the device, one launch of kernels for all rows.
+
+    States are float64 like everywhere, but Warp computes in float32: a step agrees with
+    `MujocoDynamics` to float32's rounding, and far from the origin positions are as
+    coarse as float32 is there. On a GPU the order of sums, and with it the last digits,
+    may change from run to run. The first step of a scene compiles kernels, minutes once;
+    Warp keeps them on the disk. The solver's warm start is carried from step to step and
+    cleared for rows that are reset.
+
+    Args:
+        scene: robot, ground and substeps.
+        device: ``"cuda"`` or, slowly and one row after the other, ``"cpu"``.
+        max_contacts: memory for so many contacts a row; by default as many as its geoms
+            can have. Where fewer are given and more occur, rows come back as NaN.
+        is_capturing: on a GPU, replay the control step as one CUDA graph.
+
+    Raises:
+        ModuleNotFoundError: mujoco-warp is not installed.
+        ValueError: a model or a device that Warp cannot step on (named).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        device: torch.device | str = "cuda",
+        max_contacts: int | None = None,
+        is_capturing: bool = True,
+    ) -> None:
+        self.scene, self.device = scene, torch.device(device)
+        self.max_contacts, self.is_capturing = max_contacts, is_capturing
+        self._start()
+
+    def _start(self) -> None:
+        self._warp, self._engine = import_warp()
+        try:
+            self._place = self._warp.device_from_torch(self.device)
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"MuJoCo Warp finds no device '{self.device}' here"
+            ) from error
+        self._source = warp_model(self.scene)
+        try:
+            with self._warp.ScopedDevice(self._place):
+                self._model = self._engine.put_model(self._source)
+        except (NotImplementedError, ValueError) as error:
+            raise ValueError(
+                f"MuJoCo Warp cannot step scene '{self.scene.name}': {error}"
+            ) from error
+        from torchrl_nerd.dynamics.warp_frames import straighten_frames
+
+        self._model.callback.contactfilter = straighten_frames
+        self._model.opt.warn_overflow = 0  # such rows become NaN
+        self._data: Any = None
+        self._graph: Any = None
+        self._rows = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is on the device does not travel, but for the warm start."""
+        kept = ("scene", "device", "max_contacts", "is_capturing")
+        warmstart = self._view("qacc_warmstart").cpu() if self._rows else None
+        return {name: self.__dict__[name] for name in kept} | {"warmstart": warmstart}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        warmstart = state.pop("warmstart")
+        self.__dict__.update(state)
+        self._start()
+        if warmstart is not None:
+            self._allocate(len(warmstart))
+            self._view("qacc_warmstart").copy_(warmstart)
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Clear the warm start of ``rows``."""
+        if len(state[QPOS]) != self._rows:
+            self._allocate(len(state[QPOS]))
+        elif self._rows:
+            every = slice(None) if rows is None else rows.to(self.device)
+            self._view("qacc_warmstart")[every] = 0.0
+
+    @torch.no_grad()
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`. Rows that cannot be stepped come back as NaN."""
+        check_step(self.scene, state, joint_torque, terrain)
+        if len(joint_torque) != self._rows:
+            self._allocate(len(joint_torque))
+        if not self._rows:
+            return TensorDict({key: state[key].double() for key in (QPOS, QVEL)}, [0])
+        is_broken = ~self._write(state, joint_torque, terrain)
+        self._advance()
+        moved = torch.cat((self._view("qpos"), self._view("qvel")), -1)
+        is_broken |= ~(moved.abs() <= LARGEST).all(-1) | self._has_overflown()
+        self._view("qacc_warmstart")[is_broken] = 0.0
+        values = {
+            QPOS: self._view("qpos")
+            .double()
+            .masked_fill(is_broken[:, None], torch.nan),
+            QVEL: self._view("qvel")
+            .double()
+            .masked_fill(is_broken[:, None], torch.nan),
+        }
+        if feels_forces(self.scene):
+            values[SENSORDATA] = self._view("sensordata").double()
+        device = state[QPOS].device
+        return TensorDict(values, [self._rows]).to(device)
+
+    def _write(
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Tensor:
+        """Put rows where they should be; bool ``(rows,)``: those that can be stepped.
+
+        The others stand at rest meanwhile, so that their numbers cost no other row.
+        """
+        qpos, qvel, force = (
+            value.to(self.device, torch.float32)
+            for value in (state[QPOS], state[QVEL], joint_torque)
+        )
+        is_sound = (torch.cat((qpos, qvel), -1).abs() <= LARGEST).all(-1)
+        is_sound &= force.isfinite().all(-1)
+        rest = torch.as_tensor(self._source.qpos0, device=self.device).to(qpos)
+        self._view("qpos").copy_(torch.where(is_sound[:, None], qpos, rest))
+        self._view("qvel").copy_(torch.where(is_sound[:, None], qvel, 0.0))
+        applied = self._view("qfrc_applied").zero_()
+        applied[:, self.scene.actuated] = torch.where(is_sound[:, None], force, 0.0)
+        self._view("overflow").zero_()
+        ground = self.scene.terrain
+        if terrain is not None and ground is not None and ground.is_per_row:
+            pose = ground.mocap_pose(terrain.to(self.device, torch.float64))
+            pos, quat = pose.split(
+                (3 * self._source.nmocap, 4 * self._source.nmocap), -1
+            )
+            self._view("mocap_pos").copy_(pos.unflatten(-1, (-1, 3)))
+            self._view("mocap_quat").copy_(quat.unflatten(-1, (-1, 4)))
+        return is_sound
+
+    def _has_overflown(self) -> Tensor:
+        """Rows ``(rows,)`` that lost contacts or constraints for want of memory."""
+        kinds = self._engine.OverflowType
+        lost = kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE
+        return (self._view("overflow") & int(lost | kinds.CCD)) != 0
+
+    def _view(self, name: str) -> Tensor:
+        """An array of Warp's as a tensor of the same memory, ``(rows, ...)``."""
+        return cast(Tensor, self._warp.to_torch(getattr(self._data, name)))
+
+    def _scope(self) -> AbstractContextManager[Any]:
+        """Warp's work in the order of torch's, on the same device."""
+        if self.device.type != "cuda":
+            return self._warp.ScopedDevice(self._place)
+        return self._warp.ScopedStream(self._warp.stream_from_torch(self.device))
+
+    def _allocate(self, rows: int) -> None:
+        """Memory for so many rows, at rest, with nothing remembered."""
+        self._rows, self._graph, self._data = rows, None, None
+        if not rows:
+            return
+        contacts = self.max_contacts
+        if contacts is None:
+            pairs = len(self._model.nxn_geom_pair_filtered)
+            has_field = bool(self._source.nhfield)
+            contacts = CONTACTS_PER_HEIGHT_FIELD if has_field else CONTACTS_PER_PAIR
+            contacts *= pairs
+        constraints = largest_constraints(self._source, contacts)
+        with self._scope():
+            self._data = self._engine.make_data(
+                self._source,
+                nworld=rows,
+                nconmax=contacts,
+                njmax=constraints,
+                njmax_nnz=constraints * self._source.nv,
+            )
+
+    def _advance(self) -> None:
+        """One control step of all rows, replayed as a graph from the second one on."""
+        if self._graph is not None:
+            with self._scope():
+                self._warp.capture_launch(self._graph)
+            return
+        with self._scope():
+            self._substeps()
+        can_capture = self.device.type == "cuda" and self.is_capturing
+        if can_capture and self._warp.is_mempool_enabled(self._place):
+            # kernels are compiled by now; torch's own stream cannot be captured
+            self._warp.synchronize_device(self._place)
+            with self._warp.ScopedCapture(device=self._place) as capture:
+                self._substeps()
+            self._graph = capture.graph
+
+    def _substeps(self) -> None:
+        for _ in range(self.scene.substeps):
+            self._engine.step(self._model, self._data)
