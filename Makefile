@@ -20,11 +20,11 @@ MADE_FROM := $(shell { pwd; cat pyproject.toml $(CONSTRAINTS); } | cksum | cut -
 STAMP := $(VENV)/.installed-$(MADE_FROM)
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-12s %s\n", $$1, $$2 }' Makefile
 
 setup: $(STAMP) ## make .venv, the only step before any `.venv/bin/nerd ...`
 
@@ -56,6 +56,9 @@ test-slow: $(STAMP) ## the tests that take minutes
 
 test-gpu: $(STAMP) ## the tests that need a CUDA device
 	$(PYTEST) -m gpu $(ARGS)
+
+bench-check: $(STAMP) ## whether anything got slower, against a baseline of ratios
+	$(PY) benchmarks/bench_check.py $(ARGS)
 
 format: $(STAMP) ## repair what ruff can repair
 	$(PY) -m ruff check --fix .

@@ -37,26 +37,57 @@ class Rate:
     warm_up_s: float
 
 
-def rates(
-    contenders: list[Contender], task: Task, batch: int, rounds: int, seed: int
-) -> dict[str, Rate]:
-    """Race from states at random moments of passive true motion.
+@dataclass(frozen=True)
+class Turn:
+    """Control steps of all rows per second in one turn: alone, and through the env."""
+
+    steps_per_s: float
+    envs_per_s: float
+
+
+class Race:
+    """Contenders at the start, warm, from states at random moments of passive true motion.
 
     Args:
         contenders: who.
         task: its starts, observation, reward and resets.
         batch: rows.
-        rounds: turns of each.
         seed: of the moments and of the envs.
     """
-    state = states_on_the_way(task, batch, seed)
-    steppers = {c.name: _stepper(c, task, state) for c in contenders}
-    envs = {c.name: _env_stepper(c, task, batch, seed) for c in contenders}
-    warm = {name: _seconds(run, 2) for name, run in steppers.items()}
-    alone, whole = (_race(runs, rounds) for runs in (steppers, envs))
+
+    def __init__(
+        self, contenders: list[Contender], task: Task, batch: int, seed: int
+    ) -> None:
+        self.batch = batch
+        state = states_on_the_way(task, batch, seed)
+        steppers = {c.name: _stepper(c, task, state) for c in contenders}
+        envs = {c.name: _env_stepper(c, task, batch, seed) for c in contenders}
+        self.warm_up_s = {name: _seconds(run, 2) for name, run in steppers.items()}
+        self._runs = {
+            name: (_Runner(steppers[name]), _Runner(envs[name])) for name in steppers
+        }
+
+    def round(self) -> dict[str, Turn]:
+        """One turn of each contender, by its name."""
+        return {
+            name: Turn(*(self.batch * runner.steps_per_s() for runner in runners))
+            for name, runners in self._runs.items()
+        }
+
+
+def rates(
+    contenders: list[Contender], task: Task, batch: int, rounds: int, seed: int
+) -> dict[str, Rate]:
+    """Medians of a `Race` over so many rounds; arguments as there."""
+    race = Race(contenders, task, batch, seed)
+    turns = [race.round() for _ in range(rounds)]
     return {
-        name: Rate(batch * alone[name], batch * whole[name], warm[name])
-        for name in warm
+        name: Rate(
+            median(turn[name].steps_per_s for turn in turns),
+            median(turn[name].envs_per_s for turn in turns),
+            warm_up_s,
+        )
+        for name, warm_up_s in race.warm_up_s.items()
     }
 
 
@@ -99,7 +130,7 @@ def _env_stepper(
     collected: dict[int, Collector] = {}
 
     def run(steps: int) -> None:
-        if steps not in collected:  # made where it is not timed: see _race
+        if steps not in collected:  # made where it is not timed: see _Runner
             collected.clear()
             collected[steps] = Collector(
                 env,
@@ -119,14 +150,14 @@ def _seconds(run: Callable[[int], None], steps: int) -> float:
     return time.perf_counter() - began
 
 
-def _race(runs: dict[str, Callable[[int], None]], rounds: int) -> dict[str, float]:
-    """Steps per second of each, median over turns."""
-    lengths, times = {}, {name: [] for name in runs}
-    for name, run in runs.items():
+class _Runner:
+    """Runs for about as long as a visit lasts."""
+
+    def __init__(self, run: Callable[[int], None]) -> None:
+        self._run = run
         _seconds(run, 2)
-        lengths[name] = max(2, round(2 * VISIT / _seconds(run, 2)))
-        run(lengths[name])
-    for _ in range(rounds):
-        for name, run in runs.items():
-            times[name].append(_seconds(run, lengths[name]))
-    return {name: lengths[name] / median(seconds) for name, seconds in times.items()}
+        self._length = max(2, round(2 * VISIT / _seconds(run, 2)))
+        run(self._length)
+
+    def steps_per_s(self) -> float:
+        return self._length / _seconds(self._run, self._length)

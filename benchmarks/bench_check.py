@@ -1,0 +1,196 @@
+"""Whether anything got slower: ratios of speeds against a baseline that is committed.
+
+    python benchmarks/bench_check.py            # what `make bench-check` does
+    python benchmarks/bench_check.py --write    # on an idle machine, after a wanted change
+
+Ratios say the same on a fast machine and on a slow one: learned against MuJoCo, streaming
+against the window, compiled against eager, the whole env against its dynamics. All take
+turns in one process; a ratio is the median over rounds, of which there are more until its
+spread is small. Exits with 1 and a sentence for each ratio that got worse.
+"""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import quantiles
+from typing import Any
+
+import mujoco
+import torch
+import tyro
+from tqdm import tqdm
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.bench.contenders import Contender, learned_contenders
+from torchrl_nerd.evaluation.bench.rates import Race, Turn
+from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.tasks import make_task
+
+BASELINE = Path(__file__).with_name("bench_baseline.json")
+TOLERANCE = 0.2
+"""Share by which a ratio may fall: on a busy machine the same code's fell by up to 17%
+between two runs, by 12% beyond its spread; most stayed within 8%."""
+LEAST_ROUNDS = 5
+TRUTH = "MuJoCo"
+
+
+@dataclass
+class Options:
+    """What to race, for how long, and against what."""
+
+    tasks: tuple[str, ...] = ("cartpole/swingup", "double_pendulum/passive", "ant/run")
+    rows: int = 512
+    spread: float = 0.05
+    """Rounds go on until every ratio's median is known to this share..."""
+    rounds: int = 60
+    """...or so many are done."""
+    seed: int = 0
+    threads: int = 1
+    """Of torch and of MuJoCo: more would make ratios depend on the machine."""
+    write: bool = False
+    """Write the baseline instead of comparing with it."""
+    baseline: Path = BASELINE
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Of two speeds, more is better; ``spread``: how well the median is known, a share."""
+
+    value: float
+    spread: float
+
+
+def summarize(samples: list[float]) -> Ratio:
+    """Median over rounds and half the width of its notch, 1.57 IQR / sqrt(n), a share."""
+    low, middle, high = quantiles(samples, n=4)
+    return Ratio(middle, 1.57 * (high - low) / len(samples) ** 0.5 / middle)
+
+
+def ratios(turns: Mapping[str, Turn]) -> dict[str, float]:
+    """Ratios of one round, by what they compare."""
+    truth, found = turns[TRUTH], {}
+    for name in turns:
+        if "," in name or name == TRUTH:
+            continue
+        alone = turns[name].steps_per_s
+        found[f"{name} / MuJoCo"] = alone / truth.steps_per_s
+        found[f"{name}: env / dynamics"] = turns[name].envs_per_s / alone
+        if f"{name}, window" in turns:
+            window = turns[f"{name}, window"].steps_per_s
+            found[f"{name}: streaming / window"] = alone / window
+        compiled = turns[f"{name}, compiled"].steps_per_s
+        found[f"{name}: compiled / eager"] = compiled / alone
+    return found
+
+
+def compare(
+    found: Mapping[str, Ratio], baseline: Mapping[str, float], tolerance: float
+) -> list[str]:
+    """A sentence for each ratio that is worse than its baseline; none where all is well.
+
+    A ratio is worse if even its median and spread together are below the baseline by
+    more than ``tolerance`` (a share), or if it is in one of the two only.
+    """
+    said = []
+    for name in sorted(found.keys() | baseline.keys()):
+        if name not in found or name not in baseline:
+            where = "measured" if name in found else "in the baseline"
+            said.append(f"{name} is only {where}: write a new baseline.")
+            continue
+        now, before = found[name], baseline[name]
+        if now.value * (1.0 + now.spread) < before * (1.0 - tolerance):
+            said.append(
+                f"{name} fell from {before:.3g} to {now.value:.3g} "
+                f"(+-{now.spread:.0%}), by more than {tolerance:.0%}."
+            )
+    return said
+
+
+def runners(scene: Scene, threads: int) -> list[Contender]:
+    """MuJoCo at the scene's own substeps, and the shipped models."""
+    learned = learned_contenders(scene, is_compiling=True)
+    return [
+        Contender(TRUTH, False, lambda here: MujocoDynamics(here, threads)),
+        *(c for c in learned if not c.name.endswith(", bf16")),
+    ]
+
+
+def measure(options: Options) -> dict[str, Ratio]:
+    """Race every task until the ratios are known, or the rounds are done."""
+    found = {}
+    for task_id in options.tasks:
+        task = make_task(task_id)
+        race = Race(
+            runners(task.scene, options.threads), task, options.rows, options.seed
+        )
+        rounds: list[dict[str, float]] = []
+        known: dict[str, Ratio] = {}
+        for _ in tqdm(range(options.rounds), task_id, disable=None):
+            rounds.append(ratios(race.round()))
+            if len(rounds) < LEAST_ROUNDS:
+                continue
+            known = {
+                name: summarize([one[name] for one in rounds]) for name in rounds[0]
+            }
+            if max(ratio.spread for ratio in known.values()) <= options.spread:
+                break
+        found |= known
+    return found
+
+
+def conditions(options: Options) -> dict[str, Any]:
+    """What a baseline holds for: another task, batch, thread or network is another race."""
+    models = {
+        c.name: asdict(c.make(make_task(task_id).scene).model.config)  # pyright: ignore
+        for task_id in options.tasks
+        for c in learned_contenders(make_task(task_id).scene, is_compiling=False)
+        if "," not in c.name
+    }
+    return {"rows": options.rows, "threads": options.threads, "networks": models}
+
+
+def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, float]:
+    """Its ratios.
+
+    Raises:
+        ValueError: no such file, or one for other conditions (named).
+    """
+    baseline = read_json(path)
+    for name, value in conditions.items():
+        if baseline.get(name) != value:
+            raise ValueError(f"{path} has other {name}: write a new baseline")
+    return {name: row["value"] for name, row in baseline["ratios"].items()}
+
+
+def main(options: Options) -> list[str]:
+    """Print every ratio; return what got worse, nothing where the baseline is written.
+
+    Raises:
+        ValueError: a setting out of range, or a baseline that does not fit.
+    """
+    expect_at_least(LEAST_ROUNDS, rounds=options.rounds)
+    expect_at_least(1, rows=options.rows, threads=options.threads)
+    torch.set_num_threads(options.threads)
+    race = conditions(options)
+    before = {} if options.write else read_baseline(options.baseline, race)
+    found = measure(options)
+    for name, ratio in found.items():
+        was = f", was {before[name]:.3g}" if name in before else ""
+        print(f"{name:<55}{ratio.value:>9.3g} +-{ratio.spread:.0%}{was}")
+    if options.write:
+        versions = {"torch": torch.__version__, "mujoco": mujoco.__version__}
+        rows = {name: asdict(ratio) for name, ratio in found.items()}
+        write_json(options.baseline, race | versions | {"ratios": rows})
+        return []
+    return compare(found, before, TOLERANCE)
+
+
+if __name__ == "__main__":
+    try:
+        WORSE = main(tyro.cli(Options))
+    except ValueError as error:
+        sys.exit(str(error))
+    sys.exit("\n".join(WORSE) if WORSE else 0)
