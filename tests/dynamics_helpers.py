@@ -18,9 +18,10 @@ from torchrl_nerd.dynamics import (
     DMControlDynamics,
     Dynamics,
     MujocoDynamics,
+    MujocoWarpDynamics,
     NeRDDynamics,
 )
-from torchrl_nerd.dynamics.mujoco_warp import MujocoWarpDynamics, is_warp_installed
+from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import Scene

@@ -6,7 +6,7 @@ import pytest
 
 from torchrl_nerd import load_scene, make_env
 from torchrl_nerd.dynamics import MujocoWarpDynamics
-from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
+from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.ground_truth import GROUND_TRUTH
 
 SENTENCE = r"needs the package mujoco-warp.*: pip install 'torchrl-nerd\[warp\]'"

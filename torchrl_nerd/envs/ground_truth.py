@@ -12,7 +12,7 @@ from torchrl_nerd.dynamics import (
     MujocoDynamics,
     MujocoWarpDynamics,
 )
-from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
+from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task, make_task

@@ -83,7 +83,7 @@ def test_a_small_race_agrees_with_the_baseline_it_wrote(small):
     small.write = True
     assert main(small) == []
     written = read_json(small.baseline)
-    assert set(written["networks"]) == {"cartpole"} and written["ratios"]
+    assert "cartpole" in written["networks"] and written["ratios"]
     assert all(row["value"] > 0.0 for row in written["ratios"].values())
     small.write = False
     said = main(small)  # rounding apart, a busy machine may say that something fell
