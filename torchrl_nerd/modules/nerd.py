@@ -24,6 +24,9 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
+    "mlp-nano": MLPConfig(depth=1, width=16),
+    "mlp-micro": MLPConfig(depth=1, width=32),
+    "mlp-tiny": MLPConfig(depth=2, width=32),
     "mlp": MLPConfig(),
     "mlp-wide": MLPConfig(depth=4, width=120),
     "mlp-large": MLPConfig(depth=4, width=128),
