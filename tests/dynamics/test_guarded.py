@@ -53,6 +53,29 @@ def test_what_training_never_saw_is_not_trusted_and_left_to_mujoco(scene, genera
         assert torch.equal(after[key][rows].nan_to_num(), true[key].nan_to_num())
 
 
+def test_a_row_goes_back_to_the_model_once_it_has_calmed_down(scene, generator):
+    model = random_model(scene, generator)
+    state, torque, terrain, is_wild = mixed_rows(scene, generator)
+    guarded = GuardedDynamics(NeRDDynamics(model), "fallback", patience=2)
+    plain, truth = NeRDDynamics(model), MujocoDynamics(scene)
+    guarded.step(state, torque, terrain)
+    calm = state.clone()
+    for key in ("qpos", "qvel"):
+        calm[key][is_wild] = state[key][~is_wild][: int(is_wild.sum())]
+    rest = plain.step(calm, torque, terrain), truth.step(calm, torque, terrain)
+    trusted = GuardedDynamics(NeRDDynamics(model)).step(calm, torque, terrain)["trust"]
+    rows = is_wild & (trusted[:, 0] == 1.0)
+    for expected in (rest[1], rest[1], rest[0]):  # two trusted steps, then the model
+        after = guarded.step(calm, torque, terrain)
+        torch.testing.assert_close(
+            after["qvel"][rows], expected["qvel"][rows], equal_nan=True
+        )
+    guarded.step(state, torque, terrain)
+    guarded.reset(calm, is_wild)  # a fresh row owes nothing to the one before
+    after = guarded.step(calm, torque, terrain)
+    torch.testing.assert_close(after["qvel"][rows], rest[0]["qvel"][rows])
+
+
 def test_a_row_that_is_no_number_has_no_trust(scene, generator):
     model = random_model(scene, generator)
     state, torque, terrain, _ = mixed_rows(scene, generator)
@@ -98,6 +121,8 @@ def test_bad_arguments_are_named(scene, generator):
         GuardedDynamics(learned, "hope")  # pyright: ignore
     with pytest.raises(ValueError, match=r"expected a least_trust in \(0, 1\], got 0"):
         GuardedDynamics(learned, least_trust=0)
+    with pytest.raises(ValueError, match="expected a patience of at least 0, got -1"):
+        GuardedDynamics(learned, patience=-1)
     ignorant = NeRDDynamics(NeRD(scene, NETWORKS["mlp"]))
     with pytest.raises(ValueError, match="knows what it was trained on"):
         GuardedDynamics(ignorant)

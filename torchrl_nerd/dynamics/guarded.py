@@ -112,5 +112,7 @@ class GuardedDynamics:
         """Rows ``(num_envs,)`` that are untrusted or were so lately; counts this step."""
         if len(self._calm) != len(untrusted):
             self._calm = torch.full_like(untrusted, self.patience, dtype=torch.long)
-        self._calm = (self._calm + 1).clamp_max(self.patience).masked_fill(untrusted, 0)
-        return untrusted | (self._calm < self.patience)
+        is_late = self._calm < self.patience
+        calm = (self._calm + 1).clamp_max(self.patience)
+        self._calm = calm.masked_fill(untrusted, 0)
+        return untrusted | is_late
