@@ -127,9 +127,12 @@ def read_checkpoint(
             raise ValueError(
                 f"the network in {folder} cannot be built: {error}"
             ) from None
-    if not any(key.startswith(COVERAGE) for key in tensors):  # weights of before 0.2
-        state = model.state_dict()
-        tensors |= {k: v for k, v in state.items() if k.startswith(COVERAGE)}
+    for (
+        key,
+        value,
+    ) in model.state_dict().items():  # weights of before 0.2 have no bounds
+        if key.startswith(COVERAGE):
+            tensors.setdefault(key, value)
     what = f"weights in {folder}"
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
     expect_fit(weights, model.state_dict(), what, f"scene '{scene.name}'")

@@ -132,7 +132,9 @@ class NeRD(nn.Module):
         """Next ``qpos`` and ``qvel`` from the network's normalised output."""
         change = self.coverage.clamp_target(output.to(qpos.dtype))
         delta = self.normalize.denormalize(TARGET, change)
-        return self.state_delta.integrate(qpos, qvel, delta, self.coverage.limit_speed)
+        limit = self.coverage.limit_speed
+        after = self.state_delta.integrate(qpos, qvel, delta, limit)
+        return self.coverage.stop_joints(*after)
 
     def over(self, scene: Scene) -> "NeRD":
         """The same weights for the same robot over another ground.

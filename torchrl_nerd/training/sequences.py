@@ -171,4 +171,5 @@ def cover(model: NeRD, data: TensorDict) -> None:
         data: transitions, ``[trajectories, steps]``.
     """
     tokens, targets = (x.flatten(0, -2) for x in normalised(model, data))
-    model.coverage.fit(tokens, targets, data[NEXT_QVEL].flatten(0, -2))
+    seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
+    model.coverage.fit(tokens, targets, *seen)

@@ -18,7 +18,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     passive_errors,
 )
 from torchrl_nerd.files import read_json, writable_folder, write_json
-from torchrl_nerd.keys import NEXT_QVEL
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
@@ -151,9 +151,11 @@ class Trainer:
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
         tokens, targets = self.sequences.tokens, self.sequences.targets
-        qvel = self.sequences.data[NEXT_QVEL].flatten(0, -2)
+        seen = (
+            self.sequences.data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL)
+        )
         coverage = model.coverage.to(self.device)
-        coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), qvel)
+        coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), *seen)
         self.model = model.to(self.device)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
