@@ -30,7 +30,7 @@ class Config:
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # of the branches: nerd or a checkpoint folder
-    frames: int = 10_000  # true transitions
+    frames: int = 4096  # true transitions
     num_envs: int = 8  # true rows
     horizon: int = 8  # true transitions of every row in a round
     branch: int = 5  # learned steps from every replayed state; 0 for none

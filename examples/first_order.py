@@ -37,7 +37,8 @@ class Config:
     task: str = "franka/reach"  # what to learn
     num_envs: int = 64  # rows that it learns from together
     window: int = 16  # actions that the gradient goes through
-    updates: int = 400  # gradient steps, one a window
+    episode: int = 128  # actions before all rows begin anew
+    updates: int = 300  # gradient steps, one a window
     lr: float = 3e-3  # Adam's step size
     episodes: int = 256  # of the evaluation
     seed: int = 0
@@ -59,7 +60,7 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
         seen = env.rollout(cfg.window, break_when_any_done=False)["observation"]
     policy.standardize.fit(seen)
     actor, optimizer = make_actor(policy), Adam(policy.parameters(), cfg.lr)
-    windows, rewards = env.task.horizon // cfg.window, []
+    windows, rewards = cfg.episode // cfg.window, []
     for update in trange(cfg.updates, unit="window"):
         if update % windows == 0:
             start = env.reset()

@@ -32,7 +32,7 @@ class Config:
 
     dynamics: str = "nerd"  # what plans: nerd, mujoco, a checkpoint folder
     num_envs: int = 4  # cart-poles to swing up, all at once
-    actions: int = 75  # of an episode
+    actions: int = 50  # that are played: 3.3 s
     horizon: int = 12  # actions that the planner looks ahead
     candidates: int = 128  # sequences that it tries in one go
     best: int = 12  # of them, that the next go is drawn around
@@ -41,7 +41,7 @@ class Config:
 
 
 class HeldSwingup(CartpoleSwingup):
-    """The swing-up with each action held: a quarter of the decisions, the same 5 s."""
+    """The swing-up with each action held: a quarter of the decisions."""
 
     steps_per_action = 4
     horizon = CartpoleSwingup.horizon // 4
