@@ -2,7 +2,7 @@
 
     python examples/collect.py
 
-`Collector`, `MultiCollector` (synchronous and asynchronous) and `ParallelEnv` take learned
+`Collector`, `MultiSyncCollector`, `MultiAsyncCollector` and `ParallelEnv` take learned
 and true dynamics alike, and in the last rows both at once: one worker steps NeRD, the
 other MuJoCo. Rows of one env share each call of the dynamics, so on one device a single
 env of many rows is the fast way; more processes pay where there are more cores.
@@ -17,7 +17,12 @@ from functools import partial
 import torch
 import tyro
 from tensordict import TensorDictBase
-from torchrl.collectors import BaseCollector, Collector, MultiCollector
+from torchrl.collectors import (
+    BaseCollector,
+    Collector,
+    MultiAsyncCollector,
+    MultiSyncCollector,
+)
 from torchrl.envs import ParallelEnv
 
 from torchrl_nerd import make_env
@@ -60,28 +65,39 @@ def make_policy(cfg: Config) -> Actor:
 
 def one_process(cfg: Config, dynamics: Sequence[str]) -> Collector:
     """Of the first dynamics alone."""
-    return Collector(makers(cfg, dynamics)[0], make_policy(cfg), **frames(cfg, 1))
+    env = makers(cfg, dynamics)[0]()
+    frames = cfg.num_envs * cfg.horizon
+    return Collector(
+        env,
+        make_policy(cfg),
+        frames_per_batch=frames,
+        total_frames=cfg.batches * frames,
+    )
 
 
 def processes(
-    cfg: Config, dynamics: Sequence[str], sync: bool = True
-) -> MultiCollector:
+    cfg: Config, dynamics: Sequence[str], is_sync: bool = True
+) -> BaseCollector:
     """A worker for each dynamics; batches of all of them, or of whoever is ready."""
-    workers = makers(cfg, dynamics)
-    count = frames(cfg, len(workers) if sync else 1)
-    return MultiCollector(workers, make_policy(cfg), sync=sync, **count)
+    collector = MultiSyncCollector if is_sync else MultiAsyncCollector
+    frames = cfg.num_envs * cfg.horizon * (len(dynamics) if is_sync else 1)
+    return collector(
+        makers(cfg, dynamics),
+        make_policy(cfg),
+        frames_per_batch=frames,
+        total_frames=cfg.batches * frames,
+    )
 
 
 def parallel_envs(cfg: Config, dynamics: Sequence[str]) -> Collector:
     """One collector whose env steps an env in each of several processes."""
-    env = ParallelEnv(len(dynamics), makers(cfg, dynamics))
-    return Collector(env, make_policy(cfg), **frames(cfg, len(dynamics)))
-
-
-def frames(cfg: Config, workers: int) -> dict[str, int]:
-    """Frames of a batch, and of all batches."""
-    count = workers * cfg.num_envs * cfg.horizon
-    return {"frames_per_batch": count, "total_frames": cfg.batches * count}
+    frames = len(dynamics) * cfg.num_envs * cfg.horizon
+    return Collector(
+        ParallelEnv(len(dynamics), makers(cfg, dynamics)),
+        make_policy(cfg),
+        frames_per_batch=frames,
+        total_frames=cfg.batches * frames,
+    )
 
 
 def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
@@ -95,14 +111,11 @@ def batches(collector: BaseCollector) -> Iterator[TensorDictBase]:
 
 def measure(name: str, dynamics: Sequence[str], collector: BaseCollector) -> None:
     """Print the shape of a batch and the frames per second after the first one."""
-    count, began = 0, 0.0
-    for number, batch in enumerate(batches(collector)):
-        if number == 0:
-            began = time.perf_counter()
-        else:
-            count += batch.numel()
+    arriving = batches(collector)
+    first, began = next(arriving), time.perf_counter()
+    count = sum(batch.numel() for batch in arriving)
     rate = count / (time.perf_counter() - began)
-    shape = "x".join(map(str, batch.shape))
+    shape = "x".join(map(str, first.shape))
     print(f"{name:<22}{' + '.join(dynamics):<18}{shape:<12}{rate:>12,.0f} frames/s")
 
 
@@ -112,8 +125,8 @@ def main(cfg: Config) -> None:
     for name in ("nerd", "mujoco"):
         measure("Collector", [name], one_process(cfg, [name]))
     for pair in (("nerd", "nerd"), ("mujoco", "mujoco"), ("nerd", "mujoco")):
-        measure("MultiCollector, sync", pair, processes(cfg, pair))
-        measure("MultiCollector, async", pair, processes(cfg, pair, sync=False))
+        measure("MultiSyncCollector", pair, processes(cfg, pair))
+        measure("MultiAsyncCollector", pair, processes(cfg, pair, is_sync=False))
         measure("ParallelEnv", pair, parallel_envs(cfg, pair))
 
 

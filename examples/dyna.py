@@ -90,7 +90,7 @@ def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer, TensorDictReplayB
             learned.extend(transitions(ahead, is_true=False))
         for _ in range(cfg.updates):
             mix = [true.sample()] + ([learned.sample()] if num_learned else [])
-            agent.update(torch.cat(mix))
+            agent.update(torch.cat(mix))  # pyright: ignore[reportArgumentType]
     return agent, true, learned
 
 

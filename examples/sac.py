@@ -58,7 +58,7 @@ class Agent:
             MLP(size + num_actions, 1, num_cells=[128, 128]),
             in_keys=["observation", "action"],
         )
-        spec = env.action_spec[0]
+        spec = env.action_spec[0]  # pyright: ignore[reportIndexIssue]
         self.loss = SACLoss(self.actor, critic, action_spec=spec, alpha_init=0.02)
         self.loss.make_value_estimator(gamma=gamma)
         self.targets = SoftUpdate(self.loss, tau=0.02)

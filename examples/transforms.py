@@ -12,13 +12,22 @@ contacts and once without.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
 import tyro
+from dm_control.mujoco import Physics
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.optim import Adam
-from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.data import (
+    Composite,
+    LazyTensorStorage,
+    ReplayBuffer,
+    TensorSpec,
+    Unbounded,
+)
 from torchrl.envs import Compose, DMControlEnv, EnvBase, Transform, TransformedEnv
 from torchrl.modules import MLP
 from tqdm import trange
@@ -52,36 +61,32 @@ class Config:
 class PhysicsState(Transform):
     """``qpos``, ``qvel`` and ``joint_torque``, which a `DMControlEnv` keeps to itself."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, physics: Physics) -> None:
         super().__init__(in_keys=[], out_keys=["qpos", "qvel", "joint_torque"])
-        self.controller, self.num_torques = scene.controller, len(scene.actuated)
+        self.physics, self.controller = physics, scene.controller
+        self.sizes = (scene.model.nq, scene.model.nv, len(scene.actuated))
 
-    def _read(self, tensordict: TensorDictBase) -> TensorDictBase:
-        data = self.parent.base_env._env.physics.data
-        for key in ("qpos", "qvel"):  # copies: MuJoCo goes on writing into its own
-            tensordict[key] = torch.tensor(getattr(data, key))
-        return tensordict
+    def _read(self, tensordict: TensorDictBase, torque: Tensor) -> TensorDictBase:
+        data = self.physics.data  # copied: MuJoCo goes on writing into its own
+        qpos, qvel = torch.tensor(data.qpos), torch.tensor(data.qvel)
+        return tensordict.update({"qpos": qpos, "qvel": qvel, "joint_torque": torque})
 
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
         state = (tensordict[key] for key in ("action", "qpos", "qvel"))
-        next_tensordict["joint_torque"] = self.controller(*state)
-        return self._read(next_tensordict)
+        return self._read(next_tensordict, self.controller(*state))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        tensordict_reset["joint_torque"] = torch.zeros(self.num_torques).double()
-        return self._read(tensordict_reset)
+        return self._read(tensordict_reset, torch.zeros(self.sizes[-1]).double())
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the three."""
-        model = self.parent.base_env._env.physics.model
-        sizes = (model.nq, model.nv, self.num_torques)
-        spec = observation_spec.clone()
-        for key, size in zip(self.out_keys, sizes, strict=True):
-            spec[key] = Unbounded((size,), dtype=torch.float64)
+        spec = cast(Composite, observation_spec.clone())
+        for key, size in zip(self.out_keys, self.sizes, strict=True):
+            spec[key] = Unbounded(torch.Size((size,)), dtype=torch.float64)
         return spec
 
 
@@ -92,8 +97,10 @@ def make_features(scene: Scene) -> list[Transform]:
 
 def make_suite_env(cfg: Config, scene: Scene) -> EnvBase:
     """The suite's env with its state, and beside the suite's observation our features."""
-    env = DMControlEnv(*cfg.name.split("-", 1))
-    env = TransformedEnv(env, Compose(PhysicsState(scene), *make_features(scene)))
+    base = DMControlEnv(*cfg.name.split("-", 1))
+    physics = cast(Any, base._env).physics
+    parts = PhysicsState(scene, physics), *make_features(scene)
+    env = TransformedEnv(base, Compose(*parts))  # pyright: ignore[reportArgumentType]
     env.set_seed(cfg.seed)
     return env
 
@@ -110,7 +117,7 @@ def make_buffer(
     return buffer
 
 
-def fit(buffer: ReplayBuffer, keys: Sequence[str], cfg: Config) -> nn.Module:
+def fit(buffer: ReplayBuffer, keys: Sequence[NestedKey], cfg: Config) -> nn.Module:
     """A network from the features of those keys to the change of the state."""
     batch = buffer.sample()
     size = sum(batch[key].shape[-1] for key in keys)
@@ -125,7 +132,7 @@ def fit(buffer: ReplayBuffer, keys: Sequence[str], cfg: Config) -> nn.Module:
 
 
 def unexplained(
-    network: nn.Module, batch: TensorDictBase, keys: Sequence[str]
+    network: nn.Module, batch: TensorDictBase, keys: Sequence[NestedKey]
 ) -> Tensor:
     """Squared error of the normalised change: the share of its variance not foreseen."""
     inputs = torch.cat([batch[key] for key in keys], -1).float()
@@ -140,9 +147,10 @@ def main(cfg: Config) -> dict[str, float]:
     data = env.rollout(cfg.frames, break_when_any_done=False)
     other = env.rollout(cfg.frames // 4, break_when_any_done=False)
 
-    features = Compose(*make_features(scene))
+    parts = make_features(scene)
+    features = Compose(*parts)  # pyright: ignore[reportArgumentType]
     seen = features(data.select(*RAW).clone())
-    robot, contacts = ("robot_state", "robot_torque"), features[1].out_keys
+    robot, contacts = ("robot_state", "robot_torque"), parts[1].out_keys
     keys = (*robot, *contacts, STATE_DELTA)
     features.append(Normalize({key: Stats.of(seen[key]) for key in keys}))
     test = features(other.select(*RAW))

@@ -108,6 +108,7 @@ def test_transforms_say_the_same_in_a_foreign_env_and_in_a_buffer(example):
     data = env.rollout(cfg.frames, break_when_any_done=False)
     features = transforms.Compose(*transforms.make_features(scene))
     buffer = transforms.make_buffer(data, features, cfg)
+    assert torch.equal(data["position"], data["qpos"][:, 1:])
     seen = buffer[torch.arange(len(buffer))]
     for key in ("robot_state", "contact_distance", "contact_velocity"):
         assert torch.equal(seen[key], data[key])
