@@ -1,6 +1,6 @@
 """Dyna: few true transitions, many short learned branches that start from them.
 
-    python examples/dyna.py                # 3 learned transitions for each true one
+    python examples/dyna.py                # batches of 3 learned transitions to 1 true
     python examples/dyna.py --branch 0     # the same without the learned ones
 
 Sutton's Dyna with the branches of Janner et al., "When to trust your model"
