@@ -34,6 +34,7 @@ WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
 LARGEST_SIZE = 2**14  # of any number in a network's configuration
 COVERAGE = "coverage."
+NEWEST = {"coverage.qpos_low", "coverage.qpos_high"}
 KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
     "mlp": MLPConfig,
@@ -127,9 +128,10 @@ def read_checkpoint(
             raise ValueError(
                 f"the network in {folder} cannot be built: {error}"
             ) from None
-    if not any(key.startswith(COVERAGE) for key in tensors):  # weights of before 0.2
-        state = model.state_dict()
-        tensors |= {k: v for k, v in state.items() if k.startswith(COVERAGE)}
+    bounds = {k: v for k, v in model.state_dict().items() if k.startswith(COVERAGE)}
+    missing = bounds.keys() - tensors.keys()
+    if missing in (bounds.keys(), NEWEST):  # weights of before 0.2
+        tensors |= {key: bounds[key] for key in missing}
     what = f"weights in {folder}"
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
     expect_fit(weights, model.state_dict(), what, f"scene '{scene.name}'")

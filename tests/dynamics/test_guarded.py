@@ -53,6 +53,29 @@ def test_what_training_never_saw_is_not_trusted_and_left_to_mujoco(scene, genera
         assert torch.equal(after[key][rows].nan_to_num(), true[key].nan_to_num())
 
 
+def test_a_row_goes_back_to_the_model_once_it_has_calmed_down(scene, generator):
+    model = random_model(scene, generator)
+    state, torque, terrain, is_wild = mixed_rows(scene, generator)
+    guarded = GuardedDynamics(NeRDDynamics(model), "fallback", patience=2)
+    learned = NeRDDynamics(model)
+    calm = state.clone()
+    for key in ("qpos", "qvel"):
+        calm[key][is_wild] = state[key][~is_wild][: int(is_wild.sum())]
+    fresh = GuardedDynamics(NeRDDynamics(model)).step(calm, torque, terrain)
+    true = MujocoDynamics(scene).step(calm, torque, terrain)
+    rows = is_wild & (fresh["trust"][:, 0] == 1.0)
+    for dynamics in (guarded, learned):
+        dynamics.step(state, torque, terrain)
+    for is_true in (True, True, False):  # two trusted steps, then the model
+        after, mine = (d.step(calm, torque, terrain) for d in (guarded, learned))
+        expected = true if is_true else mine
+        assert torch.equal(after["qvel"][rows], expected["qvel"][rows])
+    guarded.step(state, torque, terrain)
+    guarded.reset(calm, is_wild)  # a fresh row owes nothing to the one before
+    after = guarded.step(calm, torque, terrain)
+    torch.testing.assert_close(after["qvel"][rows], fresh["qvel"][rows])
+
+
 def test_a_row_that_is_no_number_has_no_trust(scene, generator):
     model = random_model(scene, generator)
     state, torque, terrain, _ = mixed_rows(scene, generator)
@@ -98,6 +121,8 @@ def test_bad_arguments_are_named(scene, generator):
         GuardedDynamics(learned, "hope")  # pyright: ignore
     with pytest.raises(ValueError, match=r"expected a least_trust in \(0, 1\], got 0"):
         GuardedDynamics(learned, least_trust=0)
+    with pytest.raises(ValueError, match="expected a patience of at least 0, got -1"):
+        GuardedDynamics(learned, patience=-1)
     ignorant = NeRDDynamics(NeRD(scene, NETWORKS["mlp"]))
     with pytest.raises(ValueError, match="knows what it was trained on"):
         GuardedDynamics(ignorant)

@@ -18,6 +18,11 @@ def test_training_data_are_left_as_they_are(scene, generator):
     assert torch.equal(model.coverage.clamp_target(targets), targets)
     qvel = data["next", "qvel"]
     assert torch.equal(model.coverage.limit_speed(qvel), qvel)
+    qpos = data["next", "qpos"]
+    for kept, given in zip(
+        model.coverage.stop_joints(qpos, qvel), (qpos, qvel), strict=True
+    ):
+        assert torch.equal(kept, given)
 
 
 def test_one_training_state_in_a_hundred_is_called_unfamiliar(scene, generator):
@@ -39,6 +44,23 @@ def test_whatever_comes_in_speeds_stay_bounded(scene, generator):
             now = dynamics.step(now, torque, terrain)
             assert now["qpos"].isfinite().all()
             assert (model.coverage._sizes(now["qvel"]) <= limit).all()
+
+
+def test_joints_with_limits_stop_where_the_data_end(scene, generator):
+    coverage, layout = random_model(scene, generator).coverage, scene.layout
+    shape = (ROWS, layout.nq + layout.nv)
+    wild = 100.0 * torch.randn(shape, dtype=torch.float64, generator=generator)
+    qpos, qvel = wild.split((layout.nq, layout.nv), -1)
+    place, speed = coverage.stop_joints(qpos, qvel)
+    for q, v in coverage.limited:
+        low, high = coverage.qpos_low[q], coverage.qpos_high[q]
+        assert ((place[:, q] >= low) & (place[:, q] <= high)).all()
+        assert (speed[:, v][qpos[:, q] > high] <= 0.0).all()
+        assert (speed[:, v][qpos[:, q] < low] >= 0.0).all()
+    free_q = [q for q in range(layout.nq) if q not in dict(coverage.limited)]
+    free_v = [v for v in range(layout.nv) if v not in dict(coverage.limited).values()]
+    assert torch.equal(place[:, free_q], qpos[:, free_q])
+    assert torch.equal(speed[:, free_v], qvel[:, free_v])
 
 
 def test_beyond_the_box_is_beyond_trust(scene, generator):

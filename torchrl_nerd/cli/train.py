@@ -12,6 +12,7 @@ from torchrl_nerd.data.generate import CARD, generate, load_data
 from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.files import folder_name, read_json, writable_folder
 from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.training import ranks
 from torchrl_nerd.training.recipes import recipe_of
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
 
@@ -21,7 +22,8 @@ class Train:
     """Train a NeRD; without options, exactly as the shipped model of the scene.
 
     Robots of others get one recipe for all, validated from their own sampling ranges.
-    Missing data are generated first. A killed run goes on where it stopped.
+    Missing data are generated first. A killed run goes on where it stopped. On several
+    processors or GPUs: torchrun --nproc-per-node 2 -m torchrl_nerd.cli train SCENE
 
     Example: nerd train cartpole --out runs/cartpole --network mlp
     """
@@ -51,8 +53,10 @@ class Train:
         recipe, name = recipe_of(self.scene), folder_name(self.scene)
         out = writable_folder(self.out or Path("runs") / name)
         folder = self.data or Path("datasets") / name
-        if not (folder / CARD).exists():
+        ranks.join(torch.device(self.device))
+        if ranks.rank() == 0 and not (folder / CARD).exists():
             generate(scene, recipe.data, folder, self.quiet, recipe.draw(scene))
+        ranks.wait()
         if self.threads:
             torch.set_num_threads(self.threads)
         protocol = protocol_of(scene)
@@ -70,7 +74,9 @@ class Train:
         trainer.run()
         made = out / recipe.exports
         card = read_json(made / "card.json")
-        if self.export is not None:
+        is_first = ranks.rank() == 0
+        ranks.leave()
+        if self.export is not None and is_first:
             save_checkpoint(load_checkpoint(made, scene), self.export, card)
         print(f"{recipe.exports} checkpoint in {made}: {_curve(card)}")
         return card

@@ -15,6 +15,9 @@ Guard = Literal["flag", "truncate", "raise", "fallback"]
 as ``truncated``; refuse to go on; or let MuJoCo step it."""
 
 
+PATIENCE = 24  # control steps
+
+
 class UntrustedError(RuntimeError):
     """An input too far from what the model was trained on."""
 
@@ -25,39 +28,52 @@ class GuardedDynamics:
     ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
     the inverse of `Coverage.distance`: 0.5 is twice as far out. A row that is not finite
     has trust 0. Rows below ``least_trust`` are untrusted. In ``"fallback"`` MuJoCo steps
-    them for as long as they stay so; the network sees their true states, so that it
-    takes over again with a true history.
+    them until they have been trusted for ``patience`` steps in a row: a swing that is too
+    fast at its bottom looks familiar at its top. The network sees their true states, so
+    that it takes over again with a true history.
 
     Args:
         learned: what steps the trusted rows.
         guard: what to do with the others.
         least_trust: in (0, 1]; 1 distrusts about one training state in a hundred.
+        patience: control steps, for ``"fallback"``; 0 hands back at once.
 
     Raises:
-        ValueError: an unknown guard, a least trust outside (0, 1], or a model that does
-            not know what it was trained on.
+        ValueError: an unknown guard, a least trust outside (0, 1], a patience below 0, or
+            a model that does not know what it was trained on.
     """
 
     def __init__(
-        self, learned: NeRDDynamics, guard: Guard = "flag", least_trust: float = 1.0
+        self,
+        learned: NeRDDynamics,
+        guard: Guard = "flag",
+        least_trust: float = 1.0,
+        patience: int = PATIENCE,
     ) -> None:
         if guard not in get_args(Guard):
             expected = ", ".join(get_args(Guard))
             raise ValueError(f"expected a guard of {expected}, got '{guard}'")
         if not 0.0 < least_trust <= 1.0:
             raise ValueError(f"expected a least_trust in (0, 1], got {least_trust}")
+        if patience < 0:
+            raise ValueError(f"expected a patience of at least 0, got {patience}")
         if not learned.model.coverage.is_fitted:
             raise ValueError(
                 "expected a model that knows what it was trained on, got weights of an "
                 "older version: train or fine-tune it again"
             )
         self.scene, self.learned = learned.scene, learned
-        self.guard, self.least_trust = guard, least_trust
+        self.guard, self.least_trust, self.patience = guard, least_trust, patience
+        self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
         self.truth = MujocoDynamics(self.scene) if guard == "fallback" else None
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """See `Dynamics.reset`."""
         self.learned.reset(state, rows)
+        if rows is None:
+            self._calm = self._calm[:0]
+        elif len(self._calm) == rows.numel():
+            self._calm = self._calm.masked_fill(rows.reshape(-1), self.patience)
 
     def step(
         self,
@@ -81,6 +97,8 @@ class GuardedDynamics:
                 f"{len(rows)} rows beyond them, first row {int(rows.nonzero()[0])}, "
                 f"least trust {worst:.2g}"
             )
+        if self.truth is not None:
+            rows = self._not_yet_calm(rows)
         if self.truth is not None and rows.any():
             ground = None if terrain is None else terrain[rows]
             some = state.select(QPOS, QVEL)[rows]
@@ -89,3 +107,12 @@ class GuardedDynamics:
             for key in (QPOS, QVEL):
                 after[key] = after[key].index_put((rows,), true[key])
         return after.set(TRUST, trust[:, None].to(torch.float32))
+
+    def _not_yet_calm(self, untrusted: Tensor) -> Tensor:
+        """Rows ``(num_envs,)`` that are untrusted or were so lately; counts this step."""
+        if len(self._calm) != len(untrusted):
+            self._calm = torch.full_like(untrusted, self.patience, dtype=torch.long)
+        is_late = self._calm < self.patience
+        calm = (self._calm + 1).clamp_max(self.patience)
+        self._calm = calm.masked_fill(untrusted, 0)
+        return untrusted | is_late

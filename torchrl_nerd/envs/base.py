@@ -174,6 +174,8 @@ class SceneEnv(EnvBase):
         if set_state:
             fresh |= self._given_state(tensordict, rows)
         old = self._state()
+        if rows.all():  # nothing of the past is left: no gradients of it either
+            old = old.detach()
         self._set({k: torch.where(rows[:, None], fresh[k], old[k]) for k in fresh})
         self._episode = self._episode + rows
         self._age = self._age.masked_fill(rows, 0)

@@ -2,14 +2,16 @@
 
 A network says something of any input, far from its training data too. Here inputs are
 taken back to the box that the data filled, changes of the state stay within the largest
-ones seen, and speeds within twice the largest: nothing inside the box is touched, and
-whatever is outside stays finite and bounded. How far an input lies outside is a number
+ones seen, speeds within twice the largest, and joints stop where the data end beyond
+their limits: nothing inside the box is touched, and whatever is outside stays finite and
+bounded. How far an input lies outside is a number
 that can be looked at, see `Coverage.distance`.
 """
 
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
 from torchrl_nerd.scenes.scene import Scene
 
 MARGIN = 0.1  # of a range's width, on either side
@@ -34,6 +36,9 @@ class Coverage(nn.Module):
     target_low: Tensor
     target_high: Tensor
     speed: Tensor
+    qpos_low: Tensor
+    is_limited: Tensor
+    qpos_high: Tensor
     center: Tensor
     whitening: Tensor
     reach: Tensor
@@ -41,11 +46,19 @@ class Coverage(nn.Module):
     def __init__(self, scene: Scene, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
         self.vectors = _vectors(scene)
+        self.limited = _limited(scene)
+        self.joint_of = [0] * scene.model.nv  # qpos of each dof's joint, if limited
+        is_limited = torch.zeros(scene.model.nv, dtype=torch.float64)
+        for q, v in self.limited:
+            self.joint_of[v], is_limited[v] = q, 1.0
+        self.register_buffer("is_limited", is_limited, persistent=False)
         one = torch.ones((), dtype=torch.float64)
         for name, size in (("token", num_inputs), ("target", num_outputs)):
             self.register_buffer(f"{name}_low", one.new_full((size,), -UNLIMITED))
             self.register_buffer(f"{name}_high", one.new_full((size,), UNLIMITED))
         self.register_buffer("speed", one.new_full((scene.model.nv,), UNLIMITED))
+        self.register_buffer("qpos_low", one.new_full((scene.model.nq,), -UNLIMITED))
+        self.register_buffer("qpos_high", one.new_full((scene.model.nq,), UNLIMITED))
         self.register_buffer("center", one.new_zeros(num_inputs))
         self.register_buffer("whitening", one.new_zeros(num_inputs, num_inputs))
         self.register_buffer("reach", one)
@@ -56,14 +69,19 @@ class Coverage(nn.Module):
         return bool((self.token_high < UNLIMITED).all())
 
     @torch.no_grad()
-    def fit(self, tokens: Tensor, targets: Tensor, qvel: Tensor) -> None:
+    def fit(self, tokens: Tensor, targets: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Take in a data set, in place of any before.
 
         Args:
             tokens: normalised, ``(samples, F)``.
             targets: normalised, ``(samples, D)``.
+            qpos: ``(samples, nq)``.
             qvel: ``(samples, nv)``.
         """
+        for q, _ in self.limited:
+            low, high = qpos[:, q].amin(), qpos[:, q].amax()
+            margin = MARGIN * (high - low)
+            self.qpos_low[q], self.qpos_high[q] = low - margin, high + margin
         for name, x in (("token", tokens), ("target", targets)):
             low, high = x.amin(0), x.amax(0)
             margin = MARGIN * (high - low)
@@ -91,6 +109,20 @@ class Coverage(nn.Module):
     def limit_speed(self, qvel: Tensor) -> Tensor:
         """Velocities ``(*batch, nv)``, slowed to the limit where they are beyond it."""
         return qvel * (self.speed / torch.maximum(self._sizes(qvel), self.speed))
+
+    def stop_joints(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
+        """The state with limited joints no farther than any went, and none going on.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+        """
+        if not self.limited:
+            return qpos, qvel
+        within = qpos.clamp(self.qpos_low, self.qpos_high)
+        push = (within - qpos)[..., self.joint_of] * self.is_limited
+        slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
+        return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
 
     def mahalanobis(self, token: Tensor) -> Tensor:
         """Distance ``(*batch,)`` from the mean token in units of the data's spread."""
@@ -126,3 +158,13 @@ def _vectors(scene: Scene) -> tuple[int, ...]:
     """Where in ``qvel`` the three numbers of a vector begin."""
     linear = [scene.base.dof_address] if scene.base.is_floating else []
     return (*linear, *(v for _, v in scene.layout.rotations))
+
+
+def _limited(scene: Scene) -> tuple[tuple[int, int], ...]:
+    """Addresses in ``qpos`` and ``qvel`` of every hinge and slide with limits."""
+    model = scene.model
+    return tuple(
+        (int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+        for joint in range(model.njnt)
+        if model.jnt_limited[joint] and int(model.jnt_type[joint]) in (HINGE, SLIDE)
+    )

@@ -24,6 +24,9 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
+    "mlp-nano": MLPConfig(depth=1, width=16),
+    "mlp-micro": MLPConfig(depth=1, width=32),
+    "mlp-tiny": MLPConfig(depth=2, width=32),
     "mlp": MLPConfig(),
     "mlp-wide": MLPConfig(depth=4, width=120),
     "mlp-large": MLPConfig(depth=4, width=128),
@@ -129,7 +132,9 @@ class NeRD(nn.Module):
         """Next ``qpos`` and ``qvel`` from the network's normalised output."""
         change = self.coverage.clamp_target(output.to(qpos.dtype))
         delta = self.normalize.denormalize(TARGET, change)
-        return self.state_delta.integrate(qpos, qvel, delta, self.coverage.limit_speed)
+        limit = self.coverage.limit_speed
+        after = self.state_delta.integrate(qpos, qvel, delta, limit)
+        return self.coverage.stop_joints(*after)
 
     def over(self, scene: Scene) -> "NeRD":
         """The same weights for the same robot over another ground.

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneTokens
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training import ranks
 from torchrl_nerd.training.images import Images, telling_rows
 from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_contact
 from torchrl_nerd.transforms import StateDelta, Stats
@@ -141,15 +142,17 @@ def raw_tokens(
 
 
 def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
-    """Exact statistics of tokens and targets over a data set."""
+    """Exact statistics of tokens and targets over a data set, each rank's part of it."""
     tokens, state_delta = SceneTokens(scene), StateDelta(scene)
-    parts = [raw_tokens(tokens, state_delta, part) for part in data.split(PART)]
+    size = min(PART, -(-len(data) // ranks.world()))
+    mine = data.split(size)[ranks.rank() :: ranks.world()]
+    parts = [raw_tokens(tokens, state_delta, part) for part in mine]
     stats: dict[NestedKey, Stats] = {}
     for index, key in enumerate((TOKEN, TARGET)):
         merged, *rest = (Stats.of(part[index]) for part in parts)
         for other in rest:
             merged = merged.merge(other)
-        stats[key] = merged
+        stats[key] = ranks.merge_stats(merged)
     return stats
 
 
@@ -171,4 +174,5 @@ def cover(model: NeRD, data: TensorDict) -> None:
         data: transitions, ``[trajectories, steps]``.
     """
     tokens, targets = (x.flatten(0, -2) for x in normalised(model, data))
-    model.coverage.fit(tokens, targets, data[NEXT_QVEL].flatten(0, -2))
+    seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
+    model.coverage.fit(tokens, targets, *seen)

@@ -4,6 +4,7 @@ import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 from tensordict import TensorDict
@@ -18,11 +19,12 @@ from torchrl_nerd.evaluation.rollout_error import (
     passive_errors,
 )
 from torchrl_nerd.files import read_json, writable_folder, write_json
-from torchrl_nerd.keys import NEXT_QVEL
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
+from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
@@ -100,6 +102,8 @@ class TrainConfig:
 class Trainer:
     """Trains a model on one data set; `run` goes on from where the folder stopped.
 
+    Under `torchrun` every rank does its share of each batch, see `training.ranks`.
+
     The folder holds ``last`` and ``best`` checkpoints (averaged weights), ``state`` (all
     that a resumed run needs for the same bits), ``log.csv`` and, if it is installed,
     TensorBoard files.
@@ -134,7 +138,8 @@ class Trainer:
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.horizons, self.random_actions = horizons, random_actions
-        self.quiet = quiet
+        self.quiet = quiet or ranks.rank() > 0
+        ranks.expect_shares(rows=config.rows, rollout_rows=config.rollout_rows)
         longest = max(
             config.length, config.rollout_length if config.rollout_steps else 1
         )
@@ -151,9 +156,11 @@ class Trainer:
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
         tokens, targets = self.sequences.tokens, self.sequences.targets
-        qvel = self.sequences.data[NEXT_QVEL].flatten(0, -2)
+        seen = (
+            self.sequences.data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL)
+        )
         coverage = model.coverage.to(self.device)
-        coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), qvel)
+        coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), *seen)
         self.model = model.to(self.device)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
@@ -179,7 +186,8 @@ class Trainer:
             desc=f"train {self.scene.name}",
             disable=self.quiet,
         )
-        log = TrainingLog(self.folder, self.step)
+        is_first = ranks.rank() == 0
+        log = TrainingLog(self.folder, self.step) if is_first else None
         began = time.monotonic() - self.seconds
         loss = torch.zeros(())
         while self.step < last:
@@ -187,15 +195,16 @@ class Trainer:
             self.step += 1
             self.errors = {}
             is_last = self.step == self.config.total_steps
-            if self.step % self.config.validate_every == 0 or is_last:
+            if log and (self.step % self.config.validate_every == 0 or is_last):
                 figures = self.validate()
                 log.write({"step": self.step, "loss": float(loss), **figures})
                 bar.set_postfix({k: f"{v:.2g}" for k, v in figures.items()})
-            if self.step % self.config.save_every == 0 or is_last:
+            if log and (self.step % self.config.save_every == 0 or is_last):
                 self.seconds = time.monotonic() - began
                 self.save()
             bar.update()
         bar.close()
+        ranks.wait()  # for what the first one writes
         return self.averaged_model()
 
     def update(self) -> Tensor:
@@ -210,16 +219,20 @@ class Trainer:
         self.model.train()
         with torch.enable_grad(), self._autocast():
             if self.step < config.steps:
-                tokens, targets = self._batch(generator)
+                tokens, targets = map(ranks.share, self._batch(generator))
                 outputs = self.model.network(tokens).float()
                 loss = one_step_loss(outputs, targets, config.softening)
             else:
-                batch = self.sequences.rollout(
+                *states, terrain = self.sequences.rollout(
                     config.rollout_rows, config.rollout_length, generator
                 )
-                loss = rollout_loss(self.model, *batch, config.softening)
+                qpos, qvel, torque = map(ranks.share, cast(list[Tensor], states))
+                ground = None if terrain is None else ranks.share(terrain)
+                mine = qpos, qvel, torque, ground
+                loss = rollout_loss(self.model, *mine, config.softening)
         loss.backward()
-        parameters = self.model.network.parameters()
+        parameters = list(self.model.network.parameters())
+        ranks.average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, config.clip)
         if norm.isfinite():
             for optimizer in self.optimizers.values():

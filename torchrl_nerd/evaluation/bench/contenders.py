@@ -4,12 +4,13 @@ import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import cast
 
 import mujoco
 import torch
 
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.modules.baselines import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
@@ -78,6 +79,7 @@ def learned_contenders(scene: Scene, is_compiling: bool) -> Iterator[Contender]:
             continue
         model = from_pretrained(name, scene)
         yield _learned(name, model)
+        yield Contender(f"{name}, guarded", True, _guarded(model))
         if is_compiling:
             yield _learned(f"{name}, compiled", model, compile=True)
         if not isinstance(model.config, MLPConfig):  # an MLP has no window to recompute
@@ -91,6 +93,11 @@ def _learned(name: str, model: NeRD, **how: object) -> Contender:
         return NeRDDynamics(here, **how)  # pyright: ignore
 
     return Contender(name, True, make)
+
+
+def _guarded(model: NeRD) -> Callable[[Scene], Dynamics]:
+    plain = _learned("", model).make
+    return lambda scene: GuardedDynamics(cast(NeRDDynamics, plain(scene)))
 
 
 @cache

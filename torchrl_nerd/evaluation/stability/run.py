@@ -93,14 +93,16 @@ def as_table(results: list[Result]) -> str:
     ]
     for result in results:
         name = result.case
-        for figure, value in result.learned.items():
-            line = result.lines.get(figure)
-            kept = "" if line is None else ("met" if value <= line else "**not met**")
-            limit = "" if line is None else f"{line:g}"
-            true = result.true.get(figure)
-            shown = "" if true is None else f"{true:.2g}"
-            lines.append(
-                f"| {name} | {figure} | {shown} | {value:.2g} | {limit} | {kept} |"
-            )
+        for figure in result.learned | result.true:
+            line, value = result.lines.get(figure), result.learned.get(figure)
+            kept = ""
+            if line is not None and value is not None:
+                kept = "met" if value <= line else "**not met**"
+            cells = [_shown(x) for x in (result.true.get(figure), value, line)]
+            lines.append(f"| {name} | {figure} | {' | '.join(cells)} | {kept} |")
             name = ""
     return "\n".join(lines) + "\n"
+
+
+def _shown(value: float | None) -> str:
+    return "" if value is None else f"{value:.2g}"

@@ -1,0 +1,55 @@
+"""Gradients through rollouts of an env, window after window."""
+
+import pytest
+import torch
+from dynamics_helpers import random_model
+
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.tasks import make_task
+
+ROWS, STEPS = 3, 4
+
+
+@pytest.fixture
+def env(generator) -> SceneEnv:
+    task = make_task("cartpole/swingup")
+    model = random_model(task.scene, generator).requires_grad_(False)
+    return SceneEnv(task, NeRDDynamics(model, differentiable=True), ROWS)
+
+
+def window(env: SceneEnv, gain: torch.Tensor, start) -> torch.Tensor:
+    """Mean reward of a linear policy."""
+    path = env.rollout(
+        STEPS,
+        lambda td: td.set("action", (td["observation"] @ gain).tanh()),
+        auto_reset=False,
+        tensordict=start,
+        break_when_any_done=False,
+    )
+    return path["next", "reward"].mean()
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_windows_follow_on_each_other(env, goes_on, generator):
+    """A reset of all rows leaves no graph behind, wherever it starts."""
+    gain = torch.randn(4, 1, generator=generator).requires_grad_()
+    start = env.reset()
+    for _ in range(3):
+        (gradient,) = torch.autograd.grad(window(env, gain, start), gain)
+        assert gradient.isfinite().all() and gradient.any()
+        where = env.state.detach()
+        start = env.reset(where, set_state=True) if goes_on else env.reset()
+        assert not any(value.requires_grad for value in start.values())
+        assert torch.equal(start["qpos"], where["qpos"]) == goes_on
+
+
+def test_gradient_of_other_rows_outlives_a_partial_reset(env, generator):
+    gain = torch.randn(4, 1, generator=generator).requires_grad_()
+    window(env, gain, env.reset())
+    rows = torch.tensor([[True], [False], [False]])
+    after = env.reset(env.state.set("_reset", rows))
+    (gradient,) = torch.autograd.grad(after["qpos"][1].sum(), gain, retain_graph=True)
+    assert gradient.any()
+    (gradient,) = torch.autograd.grad(after["qpos"][0].sum(), gain)
+    assert not gradient.any()

@@ -1,0 +1,48 @@
+"""The view of an env that TorchRL's planners take."""
+
+import pytest
+import torch
+from dynamics_helpers import EnvMaker
+
+from torchrl_nerd.envs import StatelessEnv
+
+STATES, CANDIDATES, STEPS = 2, 3, 4
+each_pair = pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+
+
+@each_pair
+def test_any_batch_is_stepped_from_its_own_state(task_id, dynamics, generator):
+    """As rows of an env that was set to these states; history goes on on the way."""
+    make = EnvMaker(task_id, dynamics, generator)
+    env = StatelessEnv(make(STATES * CANDIDATES))
+    start = make(STATES, seed=5).reset().unsqueeze(-1).expand(STATES, CANDIDATES)
+    start = start.to_tensordict()
+    shape = (STEPS, STATES, CANDIDATES, *env.action_spec.shape)
+    actions = 2.0 * torch.rand(shape, generator=generator) - 1.0
+
+    def roll(one, batch, td):
+        moves = iter(actions)
+        policy = lambda td: td.set("action", next(moves).reshape(*batch, shape[-1]))  # noqa: E731
+        return one.rollout(
+            STEPS, policy, auto_reset=False, tensordict=td, break_when_any_done=False
+        )
+
+    batch = (STATES, CANDIDATES)
+    path = roll(env, batch, start.clone())
+    assert path.shape == (*batch, STEPS)
+    again = roll(env, batch, start.clone())  # whatever the env did in between
+    rows = make(STATES * CANDIDATES)
+    flat = rows.reset(start.reshape(-1), set_state=True)
+    expected = roll(rows, (STATES * CANDIDATES,), flat)
+    for key in ("qpos", "qvel", "reward", "observation"):
+        alone = expected["next", key].reshape(path["next", key].shape)
+        assert torch.equal(path["next", key], alone)
+        assert torch.equal(path["next", key], again["next", key])
+
+
+def test_specs_are_those_of_one_row(generator):
+    one = EnvMaker("cartpole/swingup", "mujoco", generator)(1)
+    env = StatelessEnv(one)
+    assert env.action_spec.shape == one.action_spec.shape[1:]
+    assert set(env.observation_spec.keys()) == set(one.observation_spec.keys())
+    assert not env.batch_locked and env.batch_size == torch.Size([])

@@ -1,0 +1,181 @@
+"""TorchRL pipelines of `examples/` with tiny budgets: each has to show what it claims."""
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from dynamics_helpers import unequal_keys
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_nerd import load_scene, make_env
+from torchrl_nerd.transforms import Stats
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture
+def example(monkeypatch, seed):
+    """Imports an example by its name."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_sac_learns_from_the_asked_share_of_true_transitions(example, share):
+    sac: ModuleType = example("sac")
+    cfg = sac.Config(
+        true_share=share, frames=128, num_envs=8, horizon=4, updates=1, batch_size=16
+    )
+    agent, buffer = sac.train(cfg)
+    stored = buffer[torch.arange(len(buffer))]
+    assert len(buffer) == cfg.frames
+    assert int(stored["is_true"].sum()) == share * cfg.frames
+    for name in ("mujoco", "nerd"):
+        rows = stored[stored["is_true"] == (name == "mujoco")]
+        assert not len(rows) or step_error(name, rows) == 0.0
+    assert all(weight.isfinite().all() for weight in agent.loss.parameters())
+
+
+def step_error(dynamics: str, rows: TensorDict) -> float:
+    """How far from what they say these first steps of episodes lead in ``dynamics``.
+
+    Of first steps alone, since learned dynamics may remember what came before.
+    """
+    env = make_env("cartpole/swingup", dynamics, len(rows))
+    env.reset(rows.select("qpos", "qvel"), set_state=True)
+    after = env.step(rows.select("action"))["next"]
+    return float((after["qvel"] - rows["next", "qvel"]).abs().min())
+
+
+def test_sac_lowers_its_critics_error(example):
+    sac = example("sac")
+    env = make_env("cartpole/swingup", "nerd", 64)
+    agent = sac.Agent(env)
+    with torch.no_grad():
+        batch = env.rollout(4, agent.actor, break_when_any_done=False).reshape(-1)
+
+    def error() -> float:
+        scaled = batch.clone()
+        scaled["next", "reward"] *= 1 - agent.gamma
+        with torch.no_grad():
+            return float(agent.loss(scaled)["loss_qvalue"])
+
+    before = error()
+    for _ in range(30):
+        agent.update(batch.clone())
+    assert error() < 0.5 * before
+
+
+def test_dyna_branches_start_at_replayed_states(example):
+    dyna = example("dyna")
+    cfg = dyna.Config(frames=32, num_envs=4, horizon=4, branch=2, starts=8, updates=1)
+    agent, true, learned = dyna.train(cfg)
+    assert (len(true), len(learned)) == (32, 2 * 8 * 2)
+    true, learned = (b[torch.arange(len(b))] for b in (true, learned))
+    assert true["is_true"].all() and not learned["is_true"].any()
+    starts = learned.reshape(-1, cfg.branch)[:, 0]
+    is_replayed = (starts["qpos"][:, None] == true["qpos"]).all(-1).any(-1)
+    assert is_replayed.all()
+    assert step_error("nerd", starts) == 0.0 < step_error("mujoco", starts)
+
+    env = make_env(cfg.task, "mujoco", len(starts))
+    path = dyna.branches(env, agent, starts, steps=2)
+    kept = path.clone()
+    dyna.branches(env, agent, starts, steps=2)
+    assert not unequal_keys(path, kept)  # a later branch writes into no earlier one
+
+
+def test_planning_in_learned_dynamics_beats_no_action(example):
+    plan = example("plan")
+    cfg = plan.Config(
+        num_envs=2, actions=8, horizon=10, candidates=32, best=4, rounds=2
+    )
+    planned = plan.play(plan.make_planner(cfg), cfg)
+    idle = plan.play(plan.idle, cfg)
+    assert planned.shape == idle.shape == (2, 8)
+    assert planned.sum() > idle.sum()
+
+
+def test_transforms_say_the_same_in_a_foreign_env_and_in_a_buffer(example):
+    transforms = example("transforms")
+    cfg = transforms.Config(frames=24)
+    scene = load_scene(f"dm_control/{cfg.name}")
+    env = transforms.make_suite_env(cfg, scene)
+    check_env_specs(env)
+    data = env.rollout(cfg.frames, break_when_any_done=False)
+    features = transforms.Compose(*transforms.make_features(scene))
+    buffer = transforms.make_buffer(data, features, cfg)
+    assert torch.equal(data["position"], data["qpos"][:, 1:])
+    seen = buffer[torch.arange(len(buffer))]
+    for key in ("robot_state", "contact_distance", "contact_velocity"):
+        assert torch.equal(seen[key], data[key])
+        assert Stats.of(seen[key]).std.max() > 0.0
+    assert torch.equal(seen["state_delta"], data["next", "state_delta"])
+
+    mujoco = make_env(f"dm_control/{cfg.name}", "dm_control", cfg.frames)
+    mujoco.reset(data.select("qpos", "qvel"), set_state=True)
+    after = mujoco.step(TensorDict(action=data["action"].float()).auto_batch_size_(1))
+    torch.testing.assert_close(
+        after["next", "joint_torque"],
+        data["next", "joint_torque"],
+        rtol=1e-5,
+        atol=1e-5,
+    )
+
+
+def test_a_model_learned_through_the_transforms_foresees_the_change(example):
+    transforms = example("transforms")
+    errors = transforms.main(transforms.Config(frames=200, updates=50, batch_size=64))
+    assert set(errors) == {"robot", "robot and contacts"}
+    assert all(error < 0.9 for error in errors.values())
+
+
+slow = pytest.mark.slow  # four processes more; tests/envs has a ParallelEnv of both
+
+
+@pytest.mark.parametrize(
+    "way", ["processes", pytest.param("parallel_envs", marks=slow)]
+)
+def test_collectors_mix_both_dynamics(example, way):
+    collect = example("collect")
+    cfg = collect.Config(num_envs=3, horizon=4, batches=2)
+    alone = {}
+    for name in ("nerd", "mujoco"):
+        collector = collect.one_process(cfg, [name])
+        alone[name] = next(iter(collect.batches(collector)))
+    collector = getattr(collect, way)(cfg, ("nerd", "mujoco"))
+    first, second = collect.batches(collector)
+    kept = first.clone()
+    assert first.shape == (2, cfg.num_envs, cfg.horizon)
+    assert torch.equal(first["next", "qpos"][:, :, -1], second["qpos"][:, :, 0])
+    assert not unequal_keys(first, kept)
+    for part in alone.values():
+        for key in part.exclude("collector").keys(True, True):
+            assert first[key].shape[1:] == part[key].shape, key
+            assert first[key].dtype == part[key].dtype, key
+    for index, name in enumerate(("nerd", "mujoco")):
+        assert step_error(name, first[index, :, 0]) == 0.0
+        assert step_error(name, first[1 - index, :, 0]) > 0.0
+
+
+def test_gradients_through_learned_dynamics_help_in_true_ones(example):
+    first_order = example("first_order")
+    cfg = first_order.Config(num_envs=16, window=8, episode=8, updates=12, lr=1e-2)
+    policy, rewards = first_order.train(cfg)
+    assert len(rewards) == cfg.updates
+    env = make_env(cfg.task, "mujoco", 64)
+    start = env.reset()
+    earned = []
+    for actor in (first_order.make_actor(policy), idle_policy(7)):
+        td = env.reset(start.select(*env.state.keys()), set_state=True)
+        with torch.no_grad():
+            earned.append(float(first_order.window_reward(env, actor, td, 24)))
+    assert earned[0] > earned[1] + 0.01
+
+
+def idle_policy(num_actions: int):
+    """No action at all."""
+    return lambda td: td.set("action", torch.zeros(*td.shape, num_actions))

@@ -1,0 +1,70 @@
+"""Two processes that share every batch end where one does, up to rounding."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from torchrl_nerd.data.generate import DataConfig, generate
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.training import ranks
+from torchrl_nerd.training.trainer import TrainConfig
+from torchrl_nerd.transforms import Stats
+
+BRIEF = (
+    *("--steps", "12", "--rollout-steps", "3", "--rows", "8", "--length", "4"),
+    *("--rollout-rows", "4", "--rollout-length", "3", "--warmup", "2"),
+    *("--save-every", "5", "--validate-every", "50", "--quiet", "--threads", "1"),
+)
+
+
+def train(name: str, data: Path, out: Path, count: int, *more: str) -> str:
+    """``nerd train`` in so many processes."""
+    command = [sys.executable, "-m", "torchrl_nerd.cli"]
+    if count > 1:
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+        command += ["--nproc-per-node", str(count), "-m", "torchrl_nerd.cli"]
+    command += ["train", name, "--data", str(data), "--out", str(out), *BRIEF, *more]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, timeout=300
+    )
+    assert done.returncode == 0 or "expected" in done.stderr, done.stderr[-2000:]
+    return done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [("double_pendulum", ()), ("cube", ("--network", "mlp-micro", "--use-symmetry"))],
+)
+def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
+    generate(load_scene(name), DataConfig(60, 8), tmp_path / "data", quiet=True)
+    states = []
+    for count in (1, 2):
+        out = tmp_path / f"run_{count}"
+        train(name, tmp_path / "data", out, count, *more)
+        states.append(load_file(out / "state.safetensors"))
+    assert states[0]["step"] == states[1]["step"] == 15
+    for key, value in states[0].items():
+        if key.startswith(("model.", "average.")):
+            torch.testing.assert_close(states[1][key], value, atol=2e-4, rtol=1e-3)
+
+
+def test_shares_that_are_not_equal_are_refused(tmp_path):
+    name = "cartpole"
+    generate(load_scene(name), DataConfig(20, 8), tmp_path / "data", quiet=True)
+    said = train(name, tmp_path / "data", tmp_path / "run", 2, "--rows", "9")
+    assert "expected rows to be a multiple of the 2 ranks, got 9" in said
+
+
+def test_alone_nothing_changes(generator):
+    assert (ranks.rank(), ranks.world()) == (0, 1)
+    x = torch.randn(6, 2, generator=generator)
+    assert torch.equal(ranks.share(x), x)
+    stats = Stats.of(x)
+    assert ranks.merge_stats(stats) is stats
+    ranks.expect_shares(rows=TrainConfig().rows)

@@ -1,0 +1,64 @@
+"""An env without a state of its own, as planners want it."""
+
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_nerd.envs.base import SceneEnv
+
+
+class StatelessEnv(EnvBase):
+    """Steps from the state that the tensordict holds, whatever its batch size.
+
+    TorchRL's planners (`CEMPlanner`, `MPPIPlanner`) try many actions from one state and so
+    need an env that takes any batch and remembers nothing; a `SceneEnv` has a fixed number
+    of rows, each with its state. This is a view of one: a tensordict of another state
+    than the env was left in sets that state, so its history is empty; one that the env
+    itself has just returned goes on, with its history. A reset begins episodes as in
+    ``env``; without a tensordict it gives all its rows.
+
+    Args:
+        env: what steps; its ``num_envs`` is the number of rows of every tensordict, as
+            states to plan for times candidates.
+
+    Examples:
+        >>> from torchrl_nerd.envs import make_env
+        >>> env = StatelessEnv(make_env("cartpole/swingup", num_envs=6))
+        >>> start = env.reset().reshape(2, 3)
+        >>> env.rollout(5, auto_reset=False, tensordict=start)["next", "qpos"].shape
+        torch.Size([2, 3, 5, 2])
+    """
+
+    batch_locked = False  # pyright: ignore
+
+    def __init__(self, env: SceneEnv) -> None:
+        super().__init__(device=env.device, batch_size=torch.Size([]))
+        self.env = env
+        self.observation_spec = env.observation_spec[0]
+        self.action_spec = cast(Bounded, env.action_spec)[0]
+        self.reward_spec = cast(Unbounded, env.reward_spec)[0]
+        self.full_done_spec = env.full_done_spec[0]
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.env._set_seed(seed)
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDictBase:
+        given = None if tensordict is None else tensordict.reshape(-1)
+        after = self.env.reset(given)
+        return after if tensordict is None else after.reshape(tensordict.shape)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        given = tensordict.reshape(-1)
+        if not self._is_here(given):
+            self.env.reset(given.exclude("_reset"), set_state=True)
+        return self.env._step(given).reshape(tensordict.shape)
+
+    def _is_here(self, given: TensorDictBase) -> bool:
+        """Whether the env stands where ``given`` does."""
+        state = self.env._state()
+        return all(torch.equal(given[key], state[key]) for key in state.keys())

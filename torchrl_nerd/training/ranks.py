@@ -1,0 +1,95 @@
+"""Several processes that train one model: every rank does its share of each batch.
+
+All ranks draw the same batch, each computes on every n-th row of it, and gradients are
+averaged, so that the result is that of one process up to rounding. Statistics come from
+shares of the data, too, and are merged exactly. Outside `torchrun` there is one rank.
+"""
+
+import os
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, distributed
+
+from torchrl_nerd.transforms import Stats
+
+
+def join(device: torch.device) -> None:
+    """Meet the other processes that `torchrun` started; nothing to do without it."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not distributed.is_initialized():
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        if backend == "nccl":
+            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+        distributed.init_process_group(backend)
+
+
+def leave() -> None:
+    """Wait for the others, then part."""
+    if distributed.is_initialized():
+        distributed.barrier()
+        distributed.destroy_process_group()
+
+
+def rank() -> int:
+    """Number of this process, from 0; 0 writes files."""
+    return distributed.get_rank() if distributed.is_initialized() else 0
+
+
+def world() -> int:
+    """How many processes there are."""
+    return distributed.get_world_size() if distributed.is_initialized() else 1
+
+
+def wait() -> None:
+    """Until all ranks are here."""
+    if distributed.is_initialized():
+        distributed.barrier()
+
+
+def share(x: Tensor) -> Tensor:
+    """This rank's rows of a batch ``(rows, ...)``."""
+    return x[rank() :: world()]
+
+
+def expect_shares(**rows: int) -> None:
+    """Refuse batches that the ranks cannot share equally.
+
+    Raises:
+        ValueError: naming the number of rows.
+    """
+    for name, count in rows.items():
+        if count % world():
+            raise ValueError(
+                f"expected {name} to be a multiple of the {world()} ranks, got {count}"
+            )
+
+
+@torch.no_grad()
+def average_gradients(parameters: Iterable[Tensor]) -> None:
+    """Replace every gradient by its mean over the ranks, in one message."""
+    if world() == 1:
+        return
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    flat = torch.cat([gradient.flatten() for gradient in gradients])
+    distributed.all_reduce(flat)
+    flat /= world()
+    parts = flat.split([gradient.numel() for gradient in gradients])
+    for gradient, part in zip(gradients, parts, strict=True):
+        gradient.copy_(part.view_as(gradient))
+
+
+def merge_stats(mine: Stats) -> Stats:
+    """Statistics of all ranks' samples together, the same bits on every rank."""
+    if world() == 1:
+        return mine
+    count = torch.tensor([mine.count], dtype=torch.float64)
+    packed = torch.cat((count, mine.mean.cpu(), mine.m2.cpu()))
+    device = torch.device("cuda" if distributed.get_backend() == "nccl" else "cpu")
+    packed = packed.to(device)
+    found = [torch.empty_like(packed) for _ in range(world())]
+    distributed.all_gather(found, packed)
+    parts = [Stats(int(x[0]), *x[1:].cpu().chunk(2)) for x in found if x[0] > 0]
+    merged, *rest = parts
+    for other in rest:
+        merged = merged.merge(other)
+    return merged
