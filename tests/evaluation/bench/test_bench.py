@@ -76,7 +76,7 @@ def test_another_number_of_substeps_is_the_same_control_step(name, generator):
 def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
     """Without contact Euler's error is of first order."""
     ground = courses(PROTOCOLS["cartpole"](), 16, seed, 1, steps=30)
-    rows = {who.name: who for who in mujoco_contenders(1)}
+    rows = {who.name: who for who in mujoco_contenders(ground[0].scene, 1)}
     coarse, fine = (
         contender_errors(rows[f"MuJoCo x{n}"], ground)["hinge"].mean for n in (2, 8)
     )

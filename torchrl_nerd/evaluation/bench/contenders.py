@@ -50,11 +50,14 @@ def contenders(
         threads: of MuJoCo's pool.
         is_compiling: let learned models also run compiled.
     """
-    return [*mujoco_contenders(threads), *learned_contenders(scene, is_compiling)]
+    return [
+        *mujoco_contenders(scene, threads),
+        *learned_contenders(scene, is_compiling),
+    ]
 
 
-def mujoco_contenders(threads: int) -> Iterator[Contender]:
-    """MuJoCo with few substeps to many, and with its other integrators."""
+def mujoco_contenders(scene: Scene, threads: int) -> Iterator[Contender]:
+    """MuJoCo with few substeps to many, its own among them, and other integrators."""
 
     def row(name: str, substeps: int, integrator: int | None = None) -> Contender:
         return Contender(
@@ -65,7 +68,7 @@ def mujoco_contenders(threads: int) -> Iterator[Contender]:
             ),
         )
 
-    for substeps in SUBSTEPS:
+    for substeps in sorted({*SUBSTEPS, scene.substeps}):
         yield row(f"MuJoCo x{substeps}", substeps)
     for name, integrator in INTEGRATORS.items():
         for substeps in (1, 4):
