@@ -20,8 +20,7 @@ from torch.optim import Adam
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import trange
 
-from torchrl_nerd import from_pretrained, make_env
-from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd import NeRDEnv, from_pretrained, make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import Policy, make_actor
@@ -49,8 +48,7 @@ def make_differentiable(cfg: Config) -> SceneEnv:
     """An env in learned dynamics whose weights stay as they are."""
     task = make_task(cfg.task)
     model = from_pretrained(task.scene.name).requires_grad_(False)
-    dynamics = NeRDDynamics(model, differentiable=True)
-    return SceneEnv(task, dynamics, cfg.num_envs, seed=cfg.seed)
+    return NeRDEnv(task, model, cfg.num_envs, cfg.seed, differentiable=True)
 
 
 def train(cfg: Config) -> tuple[Policy, list[float]]:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from dynamics_helpers import random_model
 
-from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.envs import NeRDEnv, make_env
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.tasks import make_task
 
@@ -15,7 +15,7 @@ ROWS, STEPS = 3, 4
 def env(generator) -> SceneEnv:
     task = make_task("cartpole/swingup")
     model = random_model(task.scene, generator).requires_grad_(False)
-    return SceneEnv(task, NeRDDynamics(model, differentiable=True), ROWS)
+    return NeRDEnv(task, model, ROWS, differentiable=True)
 
 
 def window(env: SceneEnv, gain: torch.Tensor, start) -> torch.Tensor:
@@ -53,3 +53,25 @@ def test_gradient_of_other_rows_outlives_a_partial_reset(env, generator):
     assert gradient.any()
     (gradient,) = torch.autograd.grad(after["qpos"][0].sum(), gain)
     assert not gradient.any()
+
+
+@pytest.mark.parametrize("dynamics", ["mujoco", "dm_control"])
+def test_true_dynamics_have_no_gradients(dynamics):
+    with pytest.raises(ValueError, match=f"for gradients, got '{dynamics}'"):
+        make_env("cartpole/swingup", dynamics, differentiable=True)
+
+
+def test_a_compiled_env_steps_as_an_eager_one(seed):
+    generator = torch.Generator().manual_seed(seed)
+    actions = 2.0 * torch.rand(STEPS, ROWS, 1, generator=generator) - 1.0
+    envs = [
+        make_env("cartpole/swingup", "nerd", ROWS, seed=1, compile=is_compiled)
+        for is_compiled in (False, True)
+    ]
+    ends = []
+    for env in envs:
+        td = env.reset()
+        for action in actions:
+            td = env.step(td.set("action", action))["next"]
+        ends.append(td["qpos"])
+    torch.testing.assert_close(ends[0], ends[1], atol=1e-5, rtol=1e-5)

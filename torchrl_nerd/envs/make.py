@@ -25,6 +25,8 @@ def make_env(
     device: torch.device | str = "cpu",
     guard: Guard | None = None,
     fault_folder: Path | None = None,
+    compile: bool = False,
+    differentiable: bool = False,
 ) -> SceneEnv:
     """A batched env of a task in the dynamics of your choice.
 
@@ -38,12 +40,18 @@ def make_env(
         guard: what to do with steps that the model was not trained for, see
             `GuardedDynamics`; true dynamics have nothing to guard against.
         fault_folder: where the first fault of each kind leaves a dump for `nerd replay`.
+        compile: run learned dynamics through `torch.compile`; true ones are compiled.
+        differentiable: record gradients through every step of learned dynamics.
 
     Raises:
-        ValueError: unknown task or dynamics, named in one sentence.
+        ValueError: unknown task or dynamics, or gradients of true ones, in one sentence.
         ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
     """
     if dynamics in ENGINES:
+        if differentiable:
+            raise ValueError(
+                f"expected learned dynamics for gradients, got '{dynamics}'"
+            )
         engine = cast(Engine, dynamics)
         return GroundTruthEnv(task, engine, num_envs, seed, device, fault_folder)
     model = None if dynamics == "nerd" else dynamics
@@ -52,5 +60,14 @@ def make_env(
             f"unknown dynamics '{dynamics}', expected nerd, "
             f"{', '.join(GROUND_TRUTH)} or a checkpoint folder"
         )
-    more = {"guard": guard, "fault_folder": fault_folder}
-    return NeRDEnv(task, model, num_envs, seed, device, **more)
+    return NeRDEnv(
+        task,
+        model,
+        num_envs,
+        seed,
+        device,
+        compile=compile,
+        guard=guard,
+        fault_folder=fault_folder,
+        differentiable=differentiable,
+    )

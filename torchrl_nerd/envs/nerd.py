@@ -26,6 +26,8 @@ class NeRDEnv(SceneEnv):
         guard: what to do with steps far from the training data, see `GuardedDynamics`;
             None steps all alike.
         fault_folder: see `SceneEnv`.
+        differentiable: record gradients through every step, to actions and states, and to
+            the weights where they ask for them.
 
     Examples:
         >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
@@ -44,10 +46,16 @@ class NeRDEnv(SceneEnv):
         compile: bool = False,
         guard: Guard | None = None,
         fault_folder: Path | None = None,
+        differentiable: bool = False,
     ) -> None:
         task = make_task(task) if isinstance(task, str) else task
         if not isinstance(model, NeRD):
             model = from_pretrained(model or task.scene.name, task.scene)
-        learned = NeRDDynamics(model.to(device), inference=inference, compile=compile)
+        learned = NeRDDynamics(
+            model.to(device),
+            inference=inference,
+            compile=compile,
+            differentiable=differentiable,
+        )
         dynamics = learned if guard is None else GuardedDynamics(learned, guard)
         super().__init__(task, dynamics, num_envs, seed, device, fault_folder)
