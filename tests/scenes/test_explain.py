@@ -132,12 +132,15 @@ def test_where_a_floating_base_stands_and_faces_is_ignored(scene):
     assert all(effect.is_ignored for effect in base)
 
 
-def test_heading_matters_where_gravity_leans(rng):
+def test_heading_is_about_gravity_wherever_it_leans_and_matters_in_wind(rng):
     floater = HANDMADE["floater"]
     model = copy.copy(floater.model)
     model.opt.gravity[:2] = rng.uniform(1.0, 2.0, 2)
-    ignored = {e.name for e in base_effects(model, floater.base, 2) if e.is_ignored}
-    assert ignored == {"base x", "base y", "base z"}
+    places = {"base x", "base y", "base z"}
+    for extra in ({"base heading"}, set()):
+        found = base_effects(model, floater.base, 2)
+        assert {e.name for e in found if e.is_ignored} == places | extra
+        model.opt.wind[:], model.opt.density = (3.0, 1.0, 0.0), 100.0
 
 
 def test_looking_for_symmetries_leaves_the_model_alone(scene, generator):

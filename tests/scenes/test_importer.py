@@ -93,7 +93,7 @@ REFUSED = {
         + BODY.replace("<geom", '<geom name="g"'),
         '<contact><pair name="m" geom1="f" geom2="g"/></contact>'),
     "a floating base whose": ('<body><freejoint/><geom size="1"/></body>',
-        '<option gravity="1 0 -9"/>'),
+        '<option wind="3 1 0" density="100"/>'),
     "is a ellipsoid": ('<geom type="plane" size="1 1 1"/><body><joint/>'
         '<geom name="m" type="ellipsoid" size="1 2 1"/></body>', ""),
     "2 moving trees": (BODY + BODY.replace('"a"', '"b"'), ""),

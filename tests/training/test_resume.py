@@ -161,7 +161,7 @@ def test_a_finished_run_is_left_as_it_is(whole):
     model = trainer.run()
     tensors = load_file(whole / "last" / "model.safetensors")
     state = model.state_dict()
-    assert all(torch.equal(state[key], value) for key, value in tensors.items())
+    assert all(torch.equal(tensors[key], value) for key, value in state.items())
     after = {p: p.read_bytes() for p in whole.rglob("*") if p.is_file()}
     boards = [p for p in after if "tensorboard" in p.parts]
     assert {k: v for k, v in after.items() if k not in boards} == {

@@ -112,7 +112,7 @@ def test_features_are_mujocos_distances_and_velocities(scene, generator):
         now = gate * np.maximum(points.radii - distance, 0.0)
         np.testing.assert_allclose(features[CONTACT_DEPTH][index, :, 0], now, 0.0, 1e-9)
         seen += (gate > 0.0).sum()
-    assert seen > 10
+    assert seen >= 5  # or the draw has shown nothing
 
 
 @touching_scene

@@ -17,6 +17,7 @@ from torchrl_nerd.scenes.scene import Scene
 MARGIN = 0.1  # of a range's width, on either side
 SPEED_MARGIN = 2.0  # times the largest speed in the data
 UNLIMITED = 1e300  # m/s and rad/s: finite, so that a share of it is a number
+LOST = 1e6  # m and rad: no joint that overshot, but a state gone wrong
 RIDGE = 1e-3  # variance added to every normalised feature before the inverse
 QUANTILE = 0.99  # of training inputs that are called familiar
 LARGEST_SAMPLE = 200_000  # tokens for covariance and quantile
@@ -120,6 +121,7 @@ class Coverage(nn.Module):
         if not self.limited:
             return qpos, qvel
         within = qpos.clamp(self.qpos_low, self.qpos_high)
+        within = torch.where(qpos.abs() < LOST, within, qpos)  # a fault stays one
         push = (within - qpos)[..., self.joint_of] * self.is_limited
         slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
         return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
