@@ -129,7 +129,7 @@ def test_resets_follow_the_seed_and_travel(name, generator):
 def test_feet_feel_in_learned_dynamics_what_mujoco_says(generator):
     """At the state and action that led to it: the suite's own after a step is older."""
     task = make_task("dm_control/hopper-stand")
-    truth = make_env(task, dynamics="mujoco", num_envs=4, seed=1)
+    truth = make_env(task, dynamics="mujoco", num_envs=32, seed=1)
     truth.reset()
     action = random_actions(truth, 60, generator)
     state = act_all(truth, action)[:, -1]
@@ -137,7 +137,7 @@ def test_feet_feel_in_learned_dynamics_what_mujoco_says(generator):
     seen = task.observation(dict(state.items()) | {"action": action[-1]})
     theirs = suite_env("hopper-stand")
     theirs.reset()
-    for row in range(4):
+    for row in range(32):
         with theirs.physics.reset_context():
             theirs.physics.data.qpos[:] = state["qpos"][row]
             theirs.physics.data.qvel[:] = state["qvel"][row]

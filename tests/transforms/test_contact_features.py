@@ -28,7 +28,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.transforms import ContactFeatures, RobotCentric, StateDelta
 
-ROWS, FADE = 60, 0.25
+ROWS, FADE = 150, 0.25
 TOUCHING = [*(load_scene(name) for name in SCENES), *HANDMADE.values()]
 TOUCHING = {scene.name: scene for scene in TOUCHING if scene.terrain is not None}
 touching_scene = pytest.mark.parametrize("scene", TOUCHING.values(), ids=TOUCHING)
@@ -112,7 +112,7 @@ def test_features_are_mujocos_distances_and_velocities(scene, generator):
         now = gate * np.maximum(points.radii - distance, 0.0)
         np.testing.assert_allclose(features[CONTACT_DEPTH][index, :, 0], now, 0.0, 1e-9)
         seen += (gate > 0.0).sum()
-    assert seen >= 5  # or the draw has shown nothing
+    assert seen > 10
 
 
 @touching_scene
