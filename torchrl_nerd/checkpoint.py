@@ -63,6 +63,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
         "format": 1,
         "scene": scene.name,
         "scene_hash": scene.hash,
+        "refinement": scene.refinement,
         "control_step": scene.control_step,
         "network": {"kind": kind, **asdict(cast(Any, config))},
         "training_ranges": scene.sampling.ranges(),
@@ -80,7 +81,8 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
 def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
     """Write weights, with a few steps to check them by, then card: each whole or not."""
     folder = writable_folder(folder)
-    write_tensors(folder / WEIGHTS, model.state_dict() | stored_steps(model))
+    steps = stored_steps(model, _teacher(card, model.scene))
+    write_tensors(folder / WEIGHTS, model.state_dict() | steps)
     write_json(folder / CARD, card)
     return folder
 
@@ -117,7 +119,8 @@ def read_checkpoint(
         )
     card = read_json(folder / CARD)
     scene = scene or _scene_of(card, folder)
-    _compare(card, scene, folder)
+    teacher = _teacher(card, scene)
+    _compare(card, teacher, folder)
     config, tensors = _network_config(card, folder), read_tensors(folder / WEIGHTS)
     # its first weights are drawn, then replaced
     with torch.random.fork_rng(devices=[]):
@@ -136,9 +139,9 @@ def read_checkpoint(
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
     expect_fit(weights, model.state_dict(), what, f"scene '{scene.name}'")
     model.load_state_dict(weights)
-    if card.get("scene_hash") != scene.hash:
+    if card.get("scene_hash") != teacher.hash:
         return model.eval(), None
-    return model, self_check(model.eval(), tensors, str(folder / WEIGHTS))
+    return model, self_check(model.eval(), teacher, tensors, str(folder / WEIGHTS))
 
 
 def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> NeRD:
@@ -177,6 +180,11 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
         return load_scene(name)
     except ValueError as error:
         raise ValueError(f"the scene of the card in {folder}: {error}") from None
+
+
+def _teacher(card: dict[str, Any], scene: Scene) -> Scene:
+    """The scene as the model's data were stepped."""
+    return scene.fine if card.get("refinement", 1) != 1 else scene
 
 
 def _network_config(

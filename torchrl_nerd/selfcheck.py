@@ -16,6 +16,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.scenes import Scene
 
 PREFIX = "check."  # of the names of what is stored
 ROWS = 8
@@ -41,23 +42,30 @@ class SelfCheck:
         return self.true <= TRUE_TOLERANCE and self.learned <= LEARNED_TOLERANCE
 
 
-def stored_steps(model: NeRD) -> dict[str, Tensor]:
-    """A few steps of this machine, to be kept among the model's weights."""
-    scene = model.scene
+def stored_steps(model: NeRD, scene: Scene) -> dict[str, Tensor]:
+    """A few steps of this machine, to be kept among the model's weights.
+
+    Args:
+        model: the weights' owner.
+        scene: its own, as the data were stepped, see `Scene.fine`.
+    """
     start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
     high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
     torque = (scale * high).clone()
     given = {QPOS: start[QPOS], QVEL: start[QVEL], "joint_torque": torque}
     if TERRAIN in start:
         given[TERRAIN] = start[TERRAIN]
-    return {PREFIX + k: v for k, v in (given | _steps(model, given)).items()}
+    return {PREFIX + k: v for k, v in (given | _steps(model, scene, given)).items()}
 
 
-def self_check(model: NeRD, tensors: dict[str, Tensor], where: str) -> SelfCheck | None:
+def self_check(
+    model: NeRD, scene: Scene, tensors: dict[str, Tensor], where: str
+) -> SelfCheck | None:
     """Step the stored states again; None where there are none.
 
     Args:
         model: as it was loaded.
+        scene: its own, as the data were stepped, see `Scene.fine`.
         tensors: that were stored with its weights; others than steps are passed over.
         where: they were read from, for the sentence.
 
@@ -72,7 +80,7 @@ def self_check(model: NeRD, tensors: dict[str, Tensor], where: str) -> SelfCheck
     if not stored:
         return None
     try:
-        made = _steps(model, stored)
+        made = _steps(model, scene, stored)
         worst = {key: _difference(value, stored[key]) for key, value in made.items()}
     except (KeyError, RuntimeError, TypeError, ValueError, IndexError) as error:
         raise ValueError(
@@ -97,12 +105,12 @@ def warn_of_differences(check: SelfCheck, folder: Path) -> None:
         )
 
 
-def _steps(model: NeRD, given: dict[str, Tensor]) -> dict[str, Tensor]:
+def _steps(model: NeRD, scene: Scene, given: dict[str, Tensor]) -> dict[str, Tensor]:
     """One step of MuJoCo and of the model."""
     state = TensorDict({key: given[key] for key in (QPOS, QVEL)}, [len(given[QPOS])])
     torque, terrain = given["joint_torque"], given.get(TERRAIN)
     worlds = {
-        "true": MujocoDynamics(model.scene, num_threads=1),
+        "true": MujocoDynamics(scene, num_threads=1),
         "learned": NeRDDynamics(model),
     }
     made = {}

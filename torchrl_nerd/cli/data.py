@@ -6,13 +6,19 @@ from typing import Annotated, Any
 
 import tyro
 
-from torchrl_nerd.cli.options import Flat, Positional, real_scene
+from torchrl_nerd.cli.options import (
+    Flat,
+    Positional,
+    real_scene,
+    run_name,
+    scene_of,
+)
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
 from torchrl_nerd.data.recorded import write_tosses
 from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
-from torchrl_nerd.files import folder_name, read_json
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.files import read_json
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.recipes import recipe_of
 
 
@@ -32,6 +38,9 @@ class Data:
     or an MJCF file."""
     out: Path | None = None
     """Folder of the data set; datasets/SCENE by default."""
+    fine: bool = False
+    """A finer teacher: MuJoCo's RK4 at four times the scene's substeps, in
+    datasets/SCENE-fine."""
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
@@ -55,8 +64,8 @@ class Data:
             print("\n".join(card["checks"]))
             print(f"{card['trajectories']} recorded tosses in {out}: they fit physics")
             return card
-        scene = load_scene(self.scene)
-        out = self.out or Path("datasets") / folder_name(self.scene)
+        scene = scene_of(self.scene, self.fine)
+        out = self.out or Path("datasets") / run_name(self.scene, self.fine)
         draw = recipe_of(self.scene).draw(scene)
         generate(scene, self.config, out, self.quiet, draw)
         card = read_json(out / CARD)

@@ -3,10 +3,22 @@
 import tyro
 
 from torchrl_nerd.data.recorded import REAL
+from torchrl_nerd.files import folder_name
 from torchrl_nerd.scenes import Scene, load_scene
 
 Positional = tyro.conf.Positional
 Flat = tyro.conf.OmitArgPrefixes
+
+
+def scene_of(name: str, fine: bool) -> Scene:
+    """A scene by its name, as it is or with the finer teacher, see `Scene.fine`."""
+    scene = load_scene(name)
+    return scene.fine if fine else scene
+
+
+def run_name(name: str, fine: bool) -> str:
+    """The folder under ``datasets`` and ``runs`` that belongs to it."""
+    return folder_name(name) + "-fine" * fine
 
 
 def real_scene(name: str) -> Scene:

@@ -7,11 +7,10 @@ from typing import Any
 import torch
 
 from torchrl_nerd.checkpoint import load_checkpoint, save_checkpoint
-from torchrl_nerd.cli.options import Flat, Positional
+from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
 from torchrl_nerd.data.generate import CARD, generate, load_data
 from torchrl_nerd.evaluation.protocols import protocol_of
-from torchrl_nerd.files import folder_name, read_json, writable_folder
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.recipes import recipe_of
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
@@ -35,6 +34,9 @@ class Train:
     """Folder of the run; runs/SCENE by default."""
     data: Path | None = None
     """Folder of the data set; datasets/SCENE by default."""
+    fine: bool = False
+    """Learn from a finer teacher: MuJoCo's RK4 at four times the scene's substeps;
+    runs/SCENE-fine and datasets/SCENE-fine by default."""
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
     """Copy the recipe's checkpoint, best or last, to this folder when done."""
@@ -49,8 +51,8 @@ class Train:
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the recipe takes."""
-        scene = load_scene(self.scene)
-        recipe, name = recipe_of(self.scene), folder_name(self.scene)
+        scene = scene_of(self.scene, self.fine)
+        recipe, name = recipe_of(self.scene), run_name(self.scene, self.fine)
         out = writable_folder(self.out or Path("runs") / name)
         folder = self.data or Path("datasets") / name
         ranks.join(torch.device(self.device))

@@ -166,13 +166,16 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
     return torch.cat(tokens), torch.cat(targets)
 
 
-def cover(model: NeRD, data: TensorDict) -> None:
+def cover(
+    model: NeRD, data: TensorDict, samples: tuple[Tensor, Tensor] | None = None
+) -> None:
     """Tell a model what it learns from, for its bounds and its trust.
 
     Args:
         model: whose `Coverage` is filled.
         data: transitions, ``[trajectories, steps]``.
+        samples: their normalised tokens and targets, where they are there already.
     """
-    tokens, targets = (x.flatten(0, -2) for x in normalised(model, data))
+    tokens, targets = samples or normalised(model, data)
     seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
-    model.coverage.fit(tokens, targets, *seen)
+    model.coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), *seen)

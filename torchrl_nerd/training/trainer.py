@@ -19,7 +19,6 @@ from torchrl_nerd.evaluation.rollout_error import (
     passive_errors,
 )
 from torchrl_nerd.files import read_json, writable_folder, write_json
-from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
@@ -28,7 +27,7 @@ from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
-from torchrl_nerd.training.sequences import Sequences, Symmetry, data_stats
+from torchrl_nerd.training.sequences import Sequences, Symmetry, cover, data_stats
 
 VALIDATION_SEED = 1_000_003
 VALIDATION_ROWS = 256
@@ -155,13 +154,9 @@ class Trainer:
             stats = symmetry.complete(stats)
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
-        tokens, targets = self.sequences.tokens, self.sequences.targets
-        seen = (
-            self.sequences.data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL)
-        )
-        coverage = model.coverage.to(self.device)
-        coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), *seen)
         self.model = model.to(self.device)
+        samples = self.sequences.tokens, self.sequences.targets
+        cover(self.model, self.sequences.data, samples)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
             "muon": Muon(matrices, lr=config.lr),

@@ -2,10 +2,9 @@
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
 zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out; where
-all there is is one plane that all rows share and that is level (gravity is normal to
-it), or that a fixed base
-cannot turn against, n follows from gravity and pose and is left out too. Of several
-surfaces each point sees the nearest, so that a model fits any number of them.
+all there is is one plane that all rows share, and it is level (gravity is normal to it)
+or a fixed base cannot turn against it, n follows from gravity and pose and is left out
+too. Of several surfaces each point sees the nearest, so that a model fits any number.
 
 Added is what decides an impact: the point's velocity, and how deep it will be if it goes
 on: whether a point touches within the step is a threshold, which a network learns slowly
@@ -71,7 +70,7 @@ class ContactFeatures(FeatureTransform):
 
     def __init__(self, scene: Scene) -> None:
         count, terrain = len(scene.contacts), scene.terrain
-        glances = min(scene.substeps, MAX_GLANCES)
+        glances = min(scene.substeps // scene.refinement, MAX_GLANCES)
         sizes: dict[NestedKey, int] = {}
         in_keys: list[NestedKey] = []
         if terrain is not None:

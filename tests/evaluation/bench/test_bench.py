@@ -12,7 +12,6 @@ from torchrl_nerd.evaluation.bench.contenders import (
     contenders,
     mujoco_contenders,
     truth,
-    with_substeps,
 )
 from torchrl_nerd.evaluation.bench.errors import (
     PERTURBATIONS,
@@ -63,10 +62,10 @@ def test_a_whole_race(name, tmp_path):
 def test_another_number_of_substeps_is_the_same_control_step(name, generator):
     scene = load_scene(name)
     for substeps in (1, 3, 16):
-        other = with_substeps(scene, substeps)
+        other = scene.with_substeps(substeps)
         assert other.control_step == pytest.approx(scene.control_step, rel=1e-12)
         assert other.substeps == substeps
-    same = with_substeps(scene, scene.substeps)
+    same = scene.with_substeps(scene.substeps)
     task = next(iter(PROTOCOLS[name]().cases.values()))
     start = states_on_the_way(task, 5, 1)
     paths = [open_loop(MujocoDynamics(s), start, 3) for s in (task.scene, same)]

@@ -2,8 +2,7 @@
 
 import copy
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from typing import cast
 
 import mujoco
@@ -64,7 +63,7 @@ def mujoco_contenders(scene: Scene, threads: int) -> Iterator[Contender]:
             name,
             False,
             lambda scene: MujocoDynamics(
-                with_substeps(scene, substeps, integrator), num_threads=threads
+                scene.with_substeps(substeps, integrator), num_threads=threads
             ),
         )
 
@@ -103,17 +102,7 @@ def _guarded(model: NeRD) -> Callable[[Scene], Dynamics]:
     return lambda scene: GuardedDynamics(cast(NeRDDynamics, plain(scene)))
 
 
-@cache
-def with_substeps(scene: Scene, substeps: int, integrator: int | None = None) -> Scene:
-    """The same scene, its control step cut into another number of substeps."""
-    model = copy.copy(scene.model)
-    model.opt.timestep = scene.control_step / substeps
-    if integrator is not None:
-        model.opt.integrator = integrator
-    return replace(scene, model=model, substeps=substeps)
-
-
 def truth(scene: Scene, threads: int) -> MujocoDynamics:
     """MuJoCo at so many substeps that the rest of the error no longer counts."""
     substeps = max(FINEST, 4 * scene.substeps)
-    return MujocoDynamics(with_substeps(scene, substeps), num_threads=threads)
+    return MujocoDynamics(scene.with_substeps(substeps), num_threads=threads)

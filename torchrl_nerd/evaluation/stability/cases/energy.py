@@ -1,12 +1,10 @@
 """Energy of an undamped robot with a fixed base that touches nothing."""
 
-import mujoco
 import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.bench.contenders import with_substeps
 from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.measures import largest
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, starts
@@ -30,7 +28,7 @@ def _applies(scene: Scene) -> bool:
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
-    scene, rk4 = world.scene, int(mujoco.mjtIntegrator.mjINT_RK4)
+    scene = world.scene
     start = clear_of_ground(scene, starts(scene, ROWS, generator))
     start[QVEL] = 0.0 * start[QVEL]  # or a cart would roll off to the end of its rail
     steps = max(EVERY, round(scale * STEPS))
@@ -43,9 +41,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
         LATE: largest(drift.mean(0)),
     }
     if world.is_true:  # the scene's own integrator may not keep it: physics does
-        fine = DynamicsWorld(
-            MujocoDynamics(with_substeps(scene, 4 * scene.substeps, rk4))
-        )
+        fine = DynamicsWorld(MujocoDynamics(scene.fine))
         path = fine.roll(start, min(steps, EARLY), every=EVERY)
         figures[FINE] = largest(_drift(scene, path).mean(0))
     return figures
