@@ -19,7 +19,7 @@ from torchrl_nerd.evaluation.traces import energy as traced_energy
 SCALE = 0.001
 SLOW = (
     *("adversary", "chaos", "drop", "sliding", "resting", "margin", "horizon"),
-    *("stiff_contact", "execution"),
+    *("stiff_contact", "execution", "slope"),
 )
 SHORT = [name for name in CASES if name not in SLOW]
 INDEPENDENT = (

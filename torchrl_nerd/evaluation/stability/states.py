@@ -1,5 +1,7 @@
 """Where cases begin: the training ranges, at rest, or up in the air."""
 
+import copy
+from dataclasses import replace
 from functools import cache
 from typing import cast
 
@@ -11,6 +13,7 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.sampling import sample_torque
 
 SETTLE, STILL = 5.0, 1e-3  # s; m/s and rad/s
@@ -81,3 +84,15 @@ def turned(scene: Scene, states: TensorDict, turn: Tensor) -> TensorDict:
     qpos[..., q + 3 : q + 7] = quat_multiply(turn, qpos[..., q + 3 : q + 7])
     qvel[..., v : v + 3] = rotate(turn, qvel[..., v : v + 3])
     return states
+
+
+def ground_turned(scene: Scene, turn: Tensor) -> Scene:
+    """The robot over its ground, turned by a quaternion ``(4,)`` about the origin."""
+    model = copy.copy(scene.model)
+    for geom in ground_geoms(model):
+        position = torch.from_numpy(scene.model.geom_pos[geom].copy())
+        quat = torch.from_numpy(scene.model.geom_quat[geom].copy())
+        model.geom_pos[geom] = rotate(turn, position).numpy()
+        model.geom_quat[geom] = quat_multiply(turn, quat).numpy()
+        model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's frame for it
+    return replace(scene, model=model)

@@ -1,8 +1,5 @@
 """Gravity and the floor tilted together."""
 
-import copy
-from dataclasses import replace
-
 import torch
 from torch import Generator, Tensor
 
@@ -10,12 +7,15 @@ from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.cases.translation import applies
 from torchrl_nerd.evaluation.stability.measures import apart, largest
-from torchrl_nerd.evaluation.stability.states import starts, turned
+from torchrl_nerd.evaluation.stability.states import (
+    ground_turned,
+    starts,
+    turned,
+)
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.frames import rotate
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.contact_points import ground_geoms
 
 ROWS, STEPS = 16, 10
 APART = "apart after 10 steps, m or rad"
@@ -23,16 +23,10 @@ APART = "apart after 10 steps, m or rad"
 
 def tilted(scene: Scene, turn: Tensor) -> Scene:
     """The robot in a world that is turned by a quaternion ``(4,)``, its floor too."""
-    model = copy.copy(scene.model)
+    there = ground_turned(scene, turn)
     gravity = torch.from_numpy(scene.model.opt.gravity.copy())
-    model.opt.gravity[:] = rotate(turn, gravity).numpy()
-    for geom in ground_geoms(model):
-        position = torch.from_numpy(scene.model.geom_pos[geom].copy())
-        quat = torch.from_numpy(scene.model.geom_quat[geom].copy())
-        model.geom_pos[geom] = rotate(turn, position).numpy()
-        model.geom_quat[geom] = quat_multiply(turn, quat).numpy()
-        model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's frame for it
-    return replace(scene, model=model)
+    there.model.opt.gravity[:] = rotate(turn, gravity).numpy()
+    return there
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
