@@ -4,8 +4,8 @@ A network says something of any input, far from its training data too. Here inpu
 taken back to the box that the data filled, changes of the state stay within the largest
 ones seen, speeds within twice the largest, and joints stop where the data end beyond
 their limits: nothing inside the box is touched, and whatever is outside stays finite and
-bounded. How far an input lies outside is a number
-that can be looked at, see `Coverage.distance`.
+bounded. What is as good as still stays where it is. How far an input lies outside is a
+number that can be looked at, see `Coverage.distance`.
 """
 
 import torch
@@ -40,13 +40,14 @@ class Coverage(nn.Module):
     qpos_low: Tensor
     is_limited: Tensor
     qpos_high: Tensor
+    still: Tensor
     center: Tensor
     whitening: Tensor
     reach: Tensor
 
     def __init__(self, scene: Scene, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
-        self.vectors = _vectors(scene)
+        self.vectors, self.can_rest = _vectors(scene), scene.terrain is not None
         self.limited = _limited(scene)
         self.joint_of = [0] * scene.model.nv  # qpos of each dof's joint, if limited
         is_limited = torch.zeros(scene.model.nv, dtype=torch.float64)
@@ -60,6 +61,7 @@ class Coverage(nn.Module):
         self.register_buffer("speed", one.new_full((scene.model.nv,), UNLIMITED))
         self.register_buffer("qpos_low", one.new_full((scene.model.nq,), -UNLIMITED))
         self.register_buffer("qpos_high", one.new_full((scene.model.nq,), UNLIMITED))
+        self.register_buffer("still", one.new_zeros(scene.model.nv))
         self.register_buffer("center", one.new_zeros(num_inputs))
         self.register_buffer("whitening", one.new_zeros(num_inputs, num_inputs))
         self.register_buffer("reach", one)
@@ -88,7 +90,7 @@ class Coverage(nn.Module):
             margin = MARGIN * (high - low)
             getattr(self, f"{name}_low").copy_(low - margin)
             getattr(self, f"{name}_high").copy_(high + margin)
-        self.speed.copy_(SPEED_MARGIN * self._sizes(qvel).amax(0))
+        self.speed.copy_(SPEED_MARGIN * self.sizes(qvel).amax(0))
         some = tokens[:: max(1, len(tokens) // LARGEST_SAMPLE)].double()
         center = some.mean(0)
         spread = (some - center).T @ (some - center) / len(some)
@@ -109,7 +111,7 @@ class Coverage(nn.Module):
 
     def limit_speed(self, qvel: Tensor) -> Tensor:
         """Velocities ``(*batch, nv)``, slowed to the limit where they are beyond it."""
-        return qvel * (self.speed / torch.maximum(self._sizes(qvel), self.speed))
+        return qvel * (self.speed / torch.maximum(self.sizes(qvel), self.speed))
 
     def stop_joints(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """The state with limited joints no farther than any went, and none going on.
@@ -125,6 +127,26 @@ class Coverage(nn.Module):
         push = (within - qpos)[..., self.joint_of] * self.is_limited
         slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
         return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
+
+    def stay(
+        self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """The state after, or the one before at rest, where both are as good as still.
+
+        Still is what is slower than the model moves a robot that rests: that motion is
+        its noise, which would carry a robot away in time. Found by `training.rest`; zero,
+        and so nothing stays, for a model that has seen no rest.
+
+        Args:
+            before: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
+            after: the same.
+        """
+        if not self.can_rest:
+            return after
+        speed = torch.maximum(self.sizes(before[1]), self.sizes(after[1]))
+        is_still = (speed < self.still).all(-1, keepdim=True)
+        qpos = torch.where(is_still, before[0], after[0])
+        return qpos, after[1].masked_fill(is_still, 0.0)
 
     def mahalanobis(self, token: Tensor) -> Tensor:
         """Distance ``(*batch,)`` from the mean token in units of the data's spread."""
@@ -147,7 +169,7 @@ class Coverage(nn.Module):
         spread, excess = self.mahalanobis(token) / self.reach, self.excess(token)
         return torch.where(excess > 0.0, 1.0 + spread + excess.sqrt(), spread)
 
-    def _sizes(self, qvel: Tensor) -> Tensor:
+    def sizes(self, qvel: Tensor) -> Tensor:
         """Magnitude of each velocity, of whole vectors for free and ball joints."""
         sizes = qvel.abs()
         for start in self.vectors:

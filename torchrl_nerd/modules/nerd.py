@@ -134,7 +134,7 @@ class NeRD(nn.Module):
         delta = self.normalize.denormalize(TARGET, change)
         limit = self.coverage.limit_speed
         after = self.state_delta.integrate(qpos, qvel, delta, limit)
-        return self.coverage.stop_joints(*after)
+        return self.coverage.stay((qpos, qvel), self.coverage.stop_joints(*after))
 
     def over(self, scene: Scene) -> "NeRD":
         """The same weights for the same robot over another ground.

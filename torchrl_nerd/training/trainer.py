@@ -27,6 +27,7 @@ from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
+from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.sequences import Sequences, Symmetry, cover, data_stats
 
 VALIDATION_SEED = 1_000_003
@@ -154,7 +155,7 @@ class Trainer:
             stats = symmetry.complete(stats)
         model = NeRD(scene, network_config(config.network), stats)
         self.sequences = Sequences(model, data, self.device, symmetry)
-        self.model = model.to(self.device)
+        self.model, self.resting = model.to(self.device), resting(self.sequences.data)
         samples = self.sequences.tokens, self.sequences.targets
         cover(self.model, self.sequences.data, samples)
         matrices, others = split_parameters(self.model.network)
@@ -266,11 +267,12 @@ class Trainer:
         return nullcontext()
 
     def averaged_model(self) -> NeRD:
-        """A copy of the model that holds the averaged weights."""
+        """A copy of the model that holds the averaged weights, and knows rest."""
         model = NeRD(self.scene, self.model.config).to(self.device)
         model.load_state_dict(self.model.state_dict())
         model.network.load_state_dict(self.average)
-        return model.eval()
+        find_rest(model.eval(), self.resting)
+        return model
 
     def validate(self) -> dict[str, float]:
         """Mean open-loop error of the averaged model at every horizon.

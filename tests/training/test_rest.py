@@ -1,0 +1,94 @@
+"""What a model moves at rest is its noise, and stays; whatever moves is left alone."""
+
+import pytest
+import torch
+from dynamics_helpers import random_model
+from tensordict import TensorDict
+
+from torchrl_nerd import load_scene
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.training.rest import LARGEST, ROWS, STILL, find_rest, resting
+
+GROUNDED = [name for name in SCENES if load_scene(name).terrain is not None]
+each_grounded = pytest.mark.parametrize("name", GROUNDED)
+
+
+def states_at_rest(scene, generator, rows=32):
+    """States that a perfect model would leave as they are."""
+    start, _ = scene.sample_initial(rows, generator)
+    state = TensorDict(start, [rows])
+    state[QVEL] = torch.zeros_like(state[QVEL])
+    state[JOINT_TORQUE] = torch.zeros(rows, len(scene.actuated), dtype=torch.float64)
+    return state
+
+
+def sluggish_model(scene, generator, size):
+    """Keeps every velocity but for noise of a size, in m/s and rad/s."""
+    model = NeRD(scene, network_config("mlp-micro")).eval()
+    with torch.no_grad():
+        for weight in model.network.head.parameters():
+            weight.copy_(size * torch.randn(weight.shape, generator=generator))
+    return model
+
+
+@each_grounded
+def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
+    scene = load_scene(name)
+    model, states = (
+        sluggish_model(scene, generator, 1e-5),
+        states_at_rest(scene, generator),
+    )
+    assert not torch.equal(after(model, states, 50)[QPOS], states[QPOS])
+    find_rest(model, states)
+    assert (model.coverage.still > 0.0).all()
+    end = after(model, states, 50)
+    assert torch.equal(end[QPOS], states[QPOS]) and not end[QVEL].any()
+
+
+@each_grounded
+def test_what_moves_is_left_alone(name, generator):
+    scene = load_scene(name)
+    model, states = (
+        sluggish_model(scene, generator, 1e-5),
+        states_at_rest(scene, generator),
+    )
+    states[QVEL] += 2 * LARGEST
+    before = after(model, states, 3)
+    find_rest(model, states_at_rest(scene, generator))
+    assert torch.equal(after(model, states, 3)[QPOS], before[QPOS])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_model_that_does_not_rest_stays_as_it_is(name, generator):
+    scene = load_scene(name)
+    model = random_model(scene, generator)
+    find_rest(model, states_at_rest(scene, generator))
+    assert not model.coverage.still.any()
+    few = sluggish_model(scene, generator, 1e-5)
+    find_rest(few, states_at_rest(scene, generator, 3))
+    assert not few.coverage.still.any()
+
+
+def test_states_at_rest_are_found(generator):
+    rows, steps = 30, 40
+    speed = torch.rand(rows, steps, 1, generator=generator).double() * 0.01
+    data = TensorDict(
+        {QVEL: speed, ("next", QVEL): speed.roll(-1, 1)}, batch_size=[rows, steps]
+    )
+    found = resting(data)
+    assert 0 < len(found) <= ROWS
+    for key in (QVEL, ("next", QVEL)):
+        assert (found[key] < STILL).all()
+    assert len(resting(data[:, :0])) == 0
+
+
+def after(model, states, steps):
+    """States after so many steps without torque."""
+    dynamics, now = NeRDDynamics(model), states.select(QPOS, QVEL)
+    dynamics.reset(now)
+    for _ in range(steps):
+        now = dynamics.step(now, states[JOINT_TORQUE], states.get(TERRAIN, None))
+    return now
