@@ -1,7 +1,7 @@
 """Control steps per second, all contenders in turn, so that noise hits all alike."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from statistics import median
 from typing import cast
@@ -13,12 +13,14 @@ from torchrl.collectors import Collector
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.evaluation.bench.contenders import Contender
+from torchrl_nerd.evaluation.bench.cost import Cost
 from torchrl_nerd.evaluation.rollout_error import initial_states
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 
 VISIT = 0.1  # s: one contender's turn lasts about as long
 LONGEST = 64  # control steps to the latest moment that states are taken at
+MATRIX = 1024  # rows and columns of the product that measures the machine
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,13 @@ class Rate:
     | ``steps_per_s`` | control steps of all rows per second, median over turns |
     | ``envs_per_s`` | the same through env and collector, with random actions |
     | ``warm_up_s`` | of the first two steps, which compile where there is a compiler |
+    | ``matrix_share`` | of the machine's matrix rate that its matrix products reach |
     """
 
     steps_per_s: float
     envs_per_s: float
     warm_up_s: float
+    matrix_share: float | None
 
 
 @dataclass(frozen=True)
@@ -76,19 +80,42 @@ class Race:
 
 
 def rates(
-    contenders: list[Contender], task: Task, batch: int, rounds: int, seed: int
-) -> dict[str, Rate]:
-    """Medians of a `Race` over so many rounds; arguments as there."""
-    race = Race(contenders, task, batch, seed)
-    turns = [race.round() for _ in range(rounds)]
-    return {
+    contenders: list[Contender],
+    task: Task,
+    batch: int,
+    rounds: int,
+    seed: int,
+    costs: Mapping[str, Cost],
+) -> tuple[dict[str, Rate], float]:
+    """Medians of a `Race` over so many rounds; arguments as there.
+
+    Returns:
+        Name -> speed, and the machine's matrix rate, FLOP/s: of large float32 products
+        that take turns with the contenders.
+    """
+    race, matrix = Race(contenders, task, batch, seed), _Runner(_multiply)
+    turns, products = [], []
+    for _ in range(rounds):
+        turns.append(race.round())
+        products.append(2.0 * MATRIX**3 * matrix.steps_per_s())
+
+    def share(name: str) -> float | None:
+        if name not in costs:
+            return None
+        pairs = zip(turns, products, strict=True)
+        reached = (turn[name].steps_per_s / flop_per_s for turn, flop_per_s in pairs)
+        return costs[name].flop * median(reached)
+
+    found = {
         name: Rate(
             median(turn[name].steps_per_s for turn in turns),
             median(turn[name].envs_per_s for turn in turns),
             warm_up_s,
+            share(name),
         )
         for name, warm_up_s in race.warm_up_s.items()
     }
+    return found, median(products)
 
 
 def states_on_the_way(task: Task, batch: int, seed: int) -> TensorDict:
@@ -104,6 +131,12 @@ def states_on_the_way(task: Task, batch: int, seed: int) -> TensorDict:
     if terrain is not None:
         there[TERRAIN] = terrain
     return there
+
+
+def _multiply(steps: int) -> None:
+    matrix = torch.full((MATRIX, MATRIX), 0.5)
+    for _ in range(steps):
+        matrix @ matrix
 
 
 def _stepper(
