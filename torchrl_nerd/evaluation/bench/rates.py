@@ -135,8 +135,9 @@ def states_on_the_way(task: Task, batch: int, seed: int) -> TensorDict:
 
 def _multiply(steps: int) -> None:
     matrix = torch.full((MATRIX, MATRIX), 0.5)
+    product = torch.empty_like(matrix)
     for _ in range(steps):
-        matrix @ matrix
+        torch.mm(matrix, matrix, out=product)
 
 
 def _stepper(
