@@ -14,7 +14,7 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.evaluation.bench.contenders import Contender
 from torchrl_nerd.evaluation.bench.cost import Cost
-from torchrl_nerd.evaluation.rollout_error import initial_states
+from torchrl_nerd.evaluation.rollout_error import Source, initial_states, scene_of
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 
@@ -68,7 +68,7 @@ class Race:
         envs = {c.name: _env_stepper(c, task, batch, seed) for c in contenders}
         self.warm_up_s = {name: _seconds(run, 2) for name, run in steppers.items()}
         self._runs = {
-            name: (_Runner(steppers[name]), _Runner(envs[name])) for name in steppers
+            name: (Runner(steppers[name]), Runner(envs[name])) for name in steppers
         }
 
     def round(self) -> dict[str, Turn]:
@@ -93,7 +93,7 @@ def rates(
         Name -> speed, and the machine's matrix rate, FLOP/s: of large float32 products
         that take turns with the contenders.
     """
-    race, matrix = Race(contenders, task, batch, seed), _Runner(_multiply)
+    race, matrix = Race(contenders, task, batch, seed), Runner(_multiply)
     turns, products = [], []
     for _ in range(rounds):
         turns.append(race.round())
@@ -118,13 +118,13 @@ def rates(
     return found, median(products)
 
 
-def states_on_the_way(task: Task, batch: int, seed: int) -> TensorDict:
+def states_on_the_way(source: Source, batch: int, seed: int) -> TensorDict:
     """States ``[batch]`` at random moments of passive true motion, with their ground."""
-    start = initial_states(task, batch, seed)
-    terrain, idle = start.get(TERRAIN, None), len(task.scene.actuated)
+    start, scene = initial_states(source, batch, seed), scene_of(source)
+    terrain, idle = start.get(TERRAIN, None), len(scene.actuated)
     torque = torch.zeros(batch, LONGEST, idle, dtype=torch.float64)
     state = start.select(QPOS, QVEL)
-    path = MujocoDynamics(task.scene).rollout(state, torque, terrain)
+    path = MujocoDynamics(scene).rollout(state, torque, terrain)
     generator = torch.Generator().manual_seed(seed)
     moment = torch.randint(LONGEST, (batch,), generator=generator)
     there = cast(TensorDict, path[torch.arange(batch), moment])
@@ -164,7 +164,7 @@ def _env_stepper(
     collected: dict[int, Collector] = {}
 
     def run(steps: int) -> None:
-        if steps not in collected:  # made where it is not timed: see _Runner
+        if steps not in collected:  # made where it is not timed: see Runner
             collected.clear()
             collected[steps] = Collector(
                 env,
@@ -184,8 +184,12 @@ def _seconds(run: Callable[[int], None], steps: int) -> float:
     return time.perf_counter() - began
 
 
-class _Runner:
-    """Runs for about as long as a visit lasts."""
+class Runner:
+    """Runs for about as long as a visit lasts.
+
+    Args:
+        run: makes that many steps; two of them warm it up.
+    """
 
     def __init__(self, run: Callable[[int], None]) -> None:
         self._run = run
@@ -194,4 +198,5 @@ class _Runner:
         run(self._length)
 
     def steps_per_s(self) -> float:
+        """Of one visit."""
         return self._length / _seconds(self._run, self._length)
