@@ -6,9 +6,11 @@
 Every registered scene and dm_control's humanoid. MuJoCo makes the scene's own substeps; the
 network is untrained and of the scene's sizes, since its speed does not depend on weights:
 **how far it would err is another question**. Both step the same states, again and again,
-taken at random moments of passive motion from the scene's sampling ranges. All take turns.
+taken at random moments of passive motion from the scene's sampling ranges. All take turns,
+on one thread each; the processor's time counts, which other work disturbs little.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -45,8 +47,6 @@ class Options:
     """Compile the learned step: minutes for each scene with contact."""
     rounds: int = 5
     seed: int = 0
-    threads: int | None = None
-    """Of torch and of MuJoCo; torch's own choice by default."""
     json: Path | None = None
     """Write the figures to this file."""
 
@@ -61,7 +61,7 @@ class Point:
     | ``dofs``, ``substeps`` | of the scene |
     | ``points`` | contact points that the network is told of |
     | ``contacts`` | mean number that MuJoCo found in the states that were stepped |
-    | ``mujoco_us``, ``learned_us`` | time of a control step of one row, medians |
+    | ``mujoco_us``, ``learned_us`` | processor time of a control step of one row, medians |
     | ``ratio`` | learned rate over MuJoCo's, median over rounds |
     | ``state_bytes`` | of a row |
     """
@@ -110,8 +110,8 @@ def measure(scene: Scene, batch: int, options: Options) -> Point:
     state = states_on_the_way(scene, batch, options.seed)
     model = NeRD(scene, network_config(options.network))
     learned = NeRDDynamics(model, compile=options.compile)
-    true = MujocoDynamics(scene, num_threads=torch.get_num_threads())
-    runners = [Runner(stepper(dynamics, state)) for dynamics in (true, learned)]
+    true = MujocoDynamics(scene, num_threads=1)
+    runners = [Runner(stepper(x, state), time.process_time) for x in (true, learned)]
     rounds = [[x.steps_per_s() for x in runners] for _ in range(options.rounds)]
     true_us, learned_us = (
         1e6 / (batch * median(rates)) for rates in zip(*rounds, strict=True)
@@ -149,8 +149,7 @@ def main(options: Options) -> list[Point]:
     expect_at_least(
         1, rounds=options.rounds, **{f"batch {b}": b for b in options.batches}
     )
-    if options.threads:
-        torch.set_num_threads(options.threads)
+    torch.set_num_threads(1)
     print(
         f"{'scene':<26}{'rows':>6}{'dofs':>6}{'substeps':>10}{'points':>8}"
         f"{'contacts':>10}{'MuJoCo, us':>12}{f'{options.network}, us':>15}{'ratio':>7}"
@@ -170,7 +169,7 @@ def main(options: Options) -> list[Point]:
     if options.json is not None:
         figures: dict[str, Any] = {"points": [asdict(p) for p in points]}
         asked = {"network": options.network, "compiled": options.compile}
-        asked |= {"threads": torch.get_num_threads(), "memory_bytes": memory}
+        asked |= {"threads": 1, "memory_bytes": memory}
         write_json(options.json, asked | figures)
     return points
 
