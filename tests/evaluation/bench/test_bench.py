@@ -48,6 +48,10 @@ def test_a_whole_race(name, tmp_path):
         assert set(by_name) == expected
         for rate in by_name.values():
             assert min(rate.steps_per_s, rate.envs_per_s, rate.warm_up_s) > 0.0
+        for row, cost in report.costs.items():
+            share = by_name[row].matrix_share
+            assert cost.flop > 0.0 and share is not None and 0.0 < share < 1.0
+    assert set(report.costs) == {row for row in expected if "MuJoCo" not in row}
     for errors in report.errors.values():
         assert all(math.isfinite(error.mean) for error in errors.values())
     text = bench_table(report)

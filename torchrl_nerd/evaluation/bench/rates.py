@@ -1,7 +1,7 @@
 """Control steps per second, all contenders in turn, so that noise hits all alike."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from statistics import median
 from typing import cast
@@ -13,12 +13,14 @@ from torchrl.collectors import Collector
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.evaluation.bench.contenders import Contender
-from torchrl_nerd.evaluation.rollout_error import initial_states
+from torchrl_nerd.evaluation.bench.cost import Cost
+from torchrl_nerd.evaluation.rollout_error import Source, initial_states, scene_of
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 
 VISIT = 0.1  # s: one contender's turn lasts about as long
 LONGEST = 64  # control steps to the latest moment that states are taken at
+MATRIX = 1024  # rows and columns of the product that measures the machine
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,13 @@ class Rate:
     | ``steps_per_s`` | control steps of all rows per second, median over turns |
     | ``envs_per_s`` | the same through env and collector, with random actions |
     | ``warm_up_s`` | of the first two steps, which compile where there is a compiler |
+    | ``matrix_share`` | of the machine's matrix rate that its matrix products reach |
     """
 
     steps_per_s: float
     envs_per_s: float
     warm_up_s: float
+    matrix_share: float | None
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class Race:
         envs = {c.name: _env_stepper(c, task, batch, seed) for c in contenders}
         self.warm_up_s = {name: _seconds(run, 2) for name, run in steppers.items()}
         self._runs = {
-            name: (_Runner(steppers[name]), _Runner(envs[name])) for name in steppers
+            name: (Runner(steppers[name]), Runner(envs[name])) for name in steppers
         }
 
     def round(self) -> dict[str, Turn]:
@@ -76,34 +80,64 @@ class Race:
 
 
 def rates(
-    contenders: list[Contender], task: Task, batch: int, rounds: int, seed: int
-) -> dict[str, Rate]:
-    """Medians of a `Race` over so many rounds; arguments as there."""
-    race = Race(contenders, task, batch, seed)
-    turns = [race.round() for _ in range(rounds)]
-    return {
+    contenders: list[Contender],
+    task: Task,
+    batch: int,
+    rounds: int,
+    seed: int,
+    costs: Mapping[str, Cost],
+) -> tuple[dict[str, Rate], float]:
+    """Medians of a `Race` over so many rounds; arguments as there.
+
+    Returns:
+        Name -> speed, and the machine's matrix rate, FLOP/s: of large float32 products
+        that take turns with the contenders.
+    """
+    race, matrix = Race(contenders, task, batch, seed), Runner(_multiply)
+    turns, products = [], []
+    for _ in range(rounds):
+        turns.append(race.round())
+        products.append(2.0 * MATRIX**3 * matrix.steps_per_s())
+
+    def share(name: str) -> float | None:
+        if name not in costs:
+            return None
+        pairs = zip(turns, products, strict=True)
+        reached = (turn[name].steps_per_s / flop_per_s for turn, flop_per_s in pairs)
+        return costs[name].flop * median(reached)
+
+    found = {
         name: Rate(
             median(turn[name].steps_per_s for turn in turns),
             median(turn[name].envs_per_s for turn in turns),
             warm_up_s,
+            share(name),
         )
         for name, warm_up_s in race.warm_up_s.items()
     }
+    return found, median(products)
 
 
-def states_on_the_way(task: Task, batch: int, seed: int) -> TensorDict:
+def states_on_the_way(source: Source, batch: int, seed: int) -> TensorDict:
     """States ``[batch]`` at random moments of passive true motion, with their ground."""
-    start = initial_states(task, batch, seed)
-    terrain, idle = start.get(TERRAIN, None), len(task.scene.actuated)
+    start, scene = initial_states(source, batch, seed), scene_of(source)
+    terrain, idle = start.get(TERRAIN, None), len(scene.actuated)
     torque = torch.zeros(batch, LONGEST, idle, dtype=torch.float64)
     state = start.select(QPOS, QVEL)
-    path = MujocoDynamics(task.scene).rollout(state, torque, terrain)
+    path = MujocoDynamics(scene).rollout(state, torque, terrain)
     generator = torch.Generator().manual_seed(seed)
     moment = torch.randint(LONGEST, (batch,), generator=generator)
     there = cast(TensorDict, path[torch.arange(batch), moment])
     if terrain is not None:
         there[TERRAIN] = terrain
     return there
+
+
+def _multiply(steps: int) -> None:
+    matrix = torch.full((MATRIX, MATRIX), 0.5)
+    product = torch.empty_like(matrix)
+    for _ in range(steps):
+        torch.mm(matrix, matrix, out=product)
 
 
 def _stepper(
@@ -130,7 +164,7 @@ def _env_stepper(
     collected: dict[int, Collector] = {}
 
     def run(steps: int) -> None:
-        if steps not in collected:  # made where it is not timed: see _Runner
+        if steps not in collected:  # made where it is not timed: see Runner
             collected.clear()
             collected[steps] = Collector(
                 env,
@@ -144,20 +178,34 @@ def _env_stepper(
     return run
 
 
-def _seconds(run: Callable[[int], None], steps: int) -> float:
-    began = time.perf_counter()
+Clock = Callable[[], float]
+"""s: `time.perf_counter`, or `time.process_time`, which other work disturbs less."""
+
+
+def _seconds(
+    run: Callable[[int], None], steps: int, clock: Clock = time.perf_counter
+) -> float:
+    began = clock()
     run(steps)
-    return time.perf_counter() - began
+    return clock() - began
 
 
-class _Runner:
-    """Runs for about as long as a visit lasts."""
+class Runner:
+    """Runs for about as long as a visit lasts.
 
-    def __init__(self, run: Callable[[int], None]) -> None:
-        self._run = run
+    Args:
+        run: makes that many steps; two of them warm it up.
+        clock: what times it.
+    """
+
+    def __init__(
+        self, run: Callable[[int], None], clock: Clock = time.perf_counter
+    ) -> None:
+        self._run, self._clock = run, clock
         _seconds(run, 2)
-        self._length = max(2, round(2 * VISIT / _seconds(run, 2)))
+        self._length = max(2, round(2 * VISIT / _seconds(run, 2, clock)))
         run(self._length)
 
     def steps_per_s(self) -> float:
-        return self._length / _seconds(self._run, self._length)
+        """Of one visit."""
+        return self._length / _seconds(self._run, self._length, self._clock)

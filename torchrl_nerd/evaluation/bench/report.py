@@ -9,6 +9,7 @@ import mujoco
 import torch
 
 from torchrl_nerd.evaluation.bench.contenders import contenders
+from torchrl_nerd.evaluation.bench.cost import Cost, step_cost
 from torchrl_nerd.evaluation.bench.errors import (
     Errors,
     chaos_floor,
@@ -16,11 +17,13 @@ from torchrl_nerd.evaluation.bench.errors import (
     courses,
 )
 from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
-from torchrl_nerd.evaluation.bench.rates import Rate, rates
+from torchrl_nerd.evaluation.bench.rates import Rate, rates, states_on_the_way
 from torchrl_nerd.evaluation.protocols import PROTOCOLS, Protocol
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
+
+COUNTED = 8  # rows of the step whose arithmetic is counted
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,8 @@ class BenchReport:
     | ``errors`` | row -> quantity -> summary, against the finest truth |
     | ``floors`` | the same of the truth itself from starts a little off |
     | ``rates`` | batch -> row -> speed |
+    | ``costs`` | learned row -> arithmetic and memory of a step |
+    | ``matrix_flop_per_s`` | batch -> rate of large float32 products in the same run |
     | ``published`` | quantity -> the paper's mean error over cases, where there is one |
     | ``machine`` | processor, threads, versions |
     """
@@ -43,6 +48,8 @@ class BenchReport:
     errors: dict[str, Errors]
     floors: dict[str, Errors]
     rates: dict[int, dict[str, Rate]]
+    costs: dict[str, Cost]
+    matrix_flop_per_s: dict[int, float]
     published: dict[str, float]
     machine: dict[str, Any]
 
@@ -129,8 +136,13 @@ def bench(
     errors = {who.name: contender_errors(who, ground) for who in everyone}
     floors = chaos_floor(ground, threads, seed)
     tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
+    state = states_on_the_way(tasks[-1], COUNTED, seed)
+    here = tasks[-1].scene
+    counted = {who.name: step_cost(who.make(here), state) for who in everyone}
+    costs = {name: cost for name, cost in counted.items() if cost is not None}
     speeds = {
-        batch: rates(everyone, tasks[-1], batch, rounds, seed) for batch in batches
+        batch: rates(everyone, tasks[-1], batch, rounds, seed, costs)
+        for batch in batches
     }
     horizon = ground[0].steps
     return BenchReport(
@@ -139,7 +151,9 @@ def bench(
         rows=rows,
         errors=errors,
         floors=floors,
-        rates=speeds,
+        rates={batch: found for batch, (found, _) in speeds.items()},
+        costs=costs,
+        matrix_flop_per_s={batch: flop for batch, (_, flop) in speeds.items()},
         published=_published(protocol, horizon),
         machine={
             "processor": platform.processor() or platform.machine(),

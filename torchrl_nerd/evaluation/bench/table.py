@@ -41,6 +41,7 @@ def bench_table(report: BenchReport) -> str:
             cells += f"{rate.steps_per_s:>12,.0f}{mark}{rate.envs_per_s:>11,.0f}"
         warm = max(by_name[name].warm_up_s for by_name in report.rates.values())
         lines.append(f"{name:<34}{cells}{warm:>12.1f}")
+    lines += ["", *_costs(report)]
     budget = report.paper_budget
     if budget is not None:
         lines.append("")
@@ -48,3 +49,22 @@ def bench_table(report: BenchReport) -> str:
             choice = report.choice(batch, budget) or "none"
             lines.append(f"fastest within the paper's error, {batch} rows: {choice}")
     return "\n".join(lines)
+
+
+def _costs(report: BenchReport) -> list[str]:
+    """Arithmetic and memory of the learned rows, and how well they use the machine."""
+    measured = ", ".join(
+        f"{1e-9 * rate:.1f} GFLOP/s ({batch} rows)"
+        for batch, rate in report.matrix_flop_per_s.items()
+    )
+    heads = "".join(f"{f'{batch} rows':>13}" for batch in report.rates)
+    lines = [
+        f"share of the machine's matrix rate, {measured}",
+        f"{'a step of one row':<34}{'FLOP':>12}{'state, B':>11}{'memory, B':>11}{heads}",
+    ]
+    for name, cost in report.costs.items():
+        shares = (rates[name].matrix_share or 0.0 for rates in report.rates.values())
+        cells = "".join(f"{share:>13.1%}" for share in shares)
+        counts = f"{cost.flop:>12,.0f}{cost.state_bytes:>11,}{cost.memory_bytes:>11,}"
+        lines.append(f"{name:<34}{counts}{cells}")
+    return lines

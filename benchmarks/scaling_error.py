@@ -1,0 +1,133 @@
+"""Open-loop error against the size of the data and of the model, Cartpole by default.
+
+    python benchmarks/scaling_error.py
+
+Starts the same training for every size of data at one network, then for every network at
+one size of data; what is finished is read, so that a run that was cut short goes on.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+import tyro
+from tensordict import TensorDict
+from torch import Generator
+
+from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.training.recipes import recipe_of
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+
+TEST_SEED = 500  # of starts; never one of training or validation
+STEPS = 100  # of a trajectory
+
+
+@dataclass
+class Options:
+    """What to train, and how long."""
+
+    scene: str = "cartpole"
+    trajectories: tuple[int, ...] = (20, 100, 500, 2500)
+    """Sizes of data, of 100 transitions each; the largest is that of all networks."""
+    networks: tuple[str, ...] = ("mlp-nano", "mlp-tiny", "mlp")
+    """Beside the first one, which sees all sizes of data."""
+    first: str = "mlp-micro"
+    updates: int = 3_000
+    """On 1,024 single states each."""
+    rows: int = 256
+    """Trajectories of the test."""
+    horizons: tuple[int, ...] = (100, 500)
+    """Control steps of its errors."""
+    seed: int = 0
+    out: Path = Path("runs/scaling_error")
+    json: Path | None = None
+    """Write the figures to this file."""
+
+
+def measure(
+    data: TensorDict, network: str, trajectories: int, options: Options
+) -> dict[str, Any]:
+    """Figures of one training, made as far as they are not there."""
+    folder = options.out / options.scene / f"{network}_{trajectories}_{options.seed}"
+    settings = {"updates": options.updates, "rows": options.rows}
+    settings |= {"horizons": list(options.horizons)}
+    path = folder / "figures.json"
+    if path.exists() and read_json(path)["settings"] == settings:
+        return read_json(path)
+    scene, recipe = load_scene(options.scene), recipe_of(options.scene)
+    config = TrainConfig(
+        network=network,
+        steps=options.updates,
+        rollout_steps=0,
+        single_share=1.0,
+        softening=recipe.train.softening,
+        validate_every=options.updates,
+        seed=options.seed,
+    )
+    some = cast(TensorDict, data[:trajectories])
+    source, horizons = recipe.source(scene), options.horizons
+    Trainer(scene, some, source, config, folder, horizons=horizons).run()
+    model = load_checkpoint(folder / "last", scene)
+    errors = passive_errors(
+        source,
+        NeRDDynamics(model),
+        MujocoDynamics(scene),
+        list(horizons),
+        options.rows,
+        TEST_SEED,
+    )
+    figures = {
+        "network": network,
+        "parameters": sum(w.numel() for w in model.network.parameters()),
+        "transitions": some.numel(),
+        "errors": {
+            str(horizon): {name: asdict(e) for name, e in by_name.items()}
+            for horizon, by_name in errors.items()
+        },
+        "settings": settings,
+    }
+    write_json(path, figures)
+    return figures
+
+
+def run(options: Options) -> Iterator[dict[str, Any]]:
+    """Figures of every size of data, then of every size of network."""
+    largest = max(options.trajectories)
+    generator = Generator().manual_seed(options.seed)
+    data = simulate(load_scene(options.scene), largest, STEPS, generator)
+    data = cast(TensorDict, data[is_sound(data)])
+    for trajectories in options.trajectories:
+        yield measure(data, options.first, trajectories, options)
+    for network in options.networks:
+        yield measure(data, network, largest, options)
+
+
+def main(options: Options) -> list[dict[str, Any]]:
+    """Print and return the figures."""
+    found = []
+    for figures in run(options):
+        found.append(figures)
+        errors = "  ".join(
+            f"{name} {e['mean']:.4f} {e['unit']} at {horizon}"
+            for horizon, by_name in figures["errors"].items()
+            for name, e in by_name.items()
+        )
+        sizes = (
+            f"{figures['parameters']:>9,} weights {figures['transitions']:>9,} steps"
+        )
+        print(f"{figures['network']:<10}{sizes}  {errors}", flush=True)
+        if options.json is not None:
+            threads = torch.get_num_threads()
+            write_json(options.json, {"threads": threads, "models": found})
+    return found
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,53 @@
+"""The scaling curves at a tiny budget: one point each, and what is done is not redone."""
+
+import pytest
+import scaling
+import scaling_error
+import torch
+from tensordict import TensorDict
+
+from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.scenes import load_scene
+
+
+def test_every_scene_and_batch_is_a_point(seed, tmp_path):
+    sizes = dict(scenes=("cartpole", "cube"), batches=(1, 3), rounds=1, seed=seed)
+    points = scaling.main(scaling.Options(**sizes, json=tmp_path / "curves.json"))
+    assert [(p.scene, p.rows) for p in points] == [
+        (scene, rows) for scene in ("cartpole", "cube") for rows in (1, 3)
+    ]
+    for p in points:
+        assert p.ratio == pytest.approx(p.mujoco_us / p.learned_us)
+        assert p.mujoco_us > 0.0 and p.dofs == load_scene(p.scene).model.nv
+    assert (tmp_path / "curves.json").exists()
+    assert scaling.memory_table().keys() == NETWORKS.keys()
+
+
+def test_contacts_are_those_of_mujoco(generator):
+    """A cube that stands on its plane has a contact at each of four corners."""
+    scene = load_scene("cube")
+    rows = int(torch.randint(1, 9, (), generator=generator))
+    low = torch.rand(rows, generator=generator) < 0.5
+    state, _ = scene.sample_initial(rows, generator)
+    state["qpos"][:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0]).double()
+    scene.set_down(state, torch.where(low, -1e-4, 0.5).double())
+    found = scaling.mean_contacts(scene, TensorDict(state, [rows]))
+    assert found == pytest.approx(4.0 * float(low.double().mean()))
+
+
+def test_a_size_that_was_measured_is_read(seed, tmp_path, monkeypatch):
+    options = scaling_error.Options(
+        trajectories=(2, 3), networks=("mlp-nano",), updates=1, rows=2, seed=seed
+    )
+    options.out, options.horizons = tmp_path, (1,)
+    first = scaling_error.main(options)
+    assert [(x["network"], x["transitions"]) for x in first] == [
+        ("mlp-micro", 200),
+        ("mlp-micro", 300),
+        ("mlp-nano", 300),
+    ]
+    monkeypatch.setattr(scaling_error, "Trainer", None)  # nothing is trained again
+    assert scaling_error.main(options) == first
+    options.updates = 2
+    with pytest.raises(TypeError):
+        scaling_error.main(options)
