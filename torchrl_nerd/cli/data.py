@@ -1,6 +1,7 @@
 """``nerd data``: random trajectories of the true dynamics, or recorded ones."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -8,6 +9,7 @@ import tyro
 
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
+from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.data.recorded import write_tosses
 from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
@@ -25,6 +27,8 @@ class Data:
     Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
 
     Example: nerd data cartpole --inspect
+
+    Example: nerd data ant --trajectories 1000000 --ray auto
     """
 
     scene: Positional[str]
@@ -37,6 +41,9 @@ class Data:
     config: Flat[DataConfig] = field(default_factory=DataConfig)
     inspect: bool = False
     """Write a page about the data set, made before or now, to report.html in its folder."""
+    ray: str | None = None
+    """Draw on the workers of a Ray cluster: its HOST:PORT, auto, or local for this machine
+    alone. The data are the same."""
     json: Path | None = None
     """Write the figures to this file."""
     quiet: bool = False
@@ -58,7 +65,8 @@ class Data:
         scene = load_scene(self.scene)
         out = self.out or Path("datasets") / folder_name(self.scene)
         draw = recipe_of(self.scene).draw(scene)
-        generate(scene, self.config, out, self.quiet, draw)
+        mapper = partial(ray_map, address=self.ray) if self.ray else map
+        generate(scene, self.config, out, self.quiet, draw, mapper)
         card = read_json(out / CARD)
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
