@@ -8,6 +8,7 @@ True physics is measured, never learned from. Policy and figures are written to 
 """
 
 import logging
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from tqdm import tqdm
 
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation import plots, policy_transfer
 from torchrl_nerd.evaluation.policy import (
     Policy,
@@ -53,12 +55,12 @@ class Run(PPOConfig):
     out: Path = Path("runs/ppo")  # folder for policy, numbers and figures
 
 
-def parse() -> Run:
+def parse(kind: type[Run] = Run) -> Run:
     """Settings from the command line; the task chooses the defaults of all others."""
-    known, _ = tyro.cli(Run, add_help=False, return_unknown_args=True)
+    known, _ = tyro.cli(kind, add_help=False, return_unknown_args=True)
     task = known.task
     return tyro.cli(
-        Run, default=Run(**vars(PPO_CONFIGS.get(task, PPOConfig())), task=task)
+        kind, default=kind(**vars(PPO_CONFIGS.get(task, PPOConfig())), task=task)
     )
 
 
@@ -92,8 +94,25 @@ def update(
             optimizer.step()
 
 
+def num_frames(cfg: Run) -> tuple[int, int]:
+    """Actions in a batch, and in all batches."""
+    frames = cfg.num_envs * cfg.horizon
+    return frames, cfg.total_frames // frames * frames
+
+
+def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:
+    """Batches ``[num_envs, horizon]`` of an actor that learns between them."""
+    frames, total = num_frames(cfg)
+    return Collector(
+        env, actor, frames_per_batch=frames, total_frames=total, track_traj_ids=False
+    )
+
+
+Collect = Callable[..., Iterable[TensorDictBase]]
+
+
 def train(
-    cfg: Run, task: str | Task | None = None
+    cfg: Run, task: str | Task | None = None, collect: Collect = collect
 ) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
     task = task or cfg.task
@@ -104,15 +123,11 @@ def train(
     loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
     loss.normalize_advantage = True
     optimizer = Adam(loss.parameters(), lr=cfg.lr)
-    frames = cfg.num_envs * cfg.horizon
-    total = cfg.total_frames // frames * frames
+    frames, total = num_frames(cfg)
     schedule = LinearLR(optimizer, 1.0, end_factor=0.0, total_iters=total // frames)
-    collector = Collector(
-        env, actor, frames_per_batch=frames, total_frames=total, track_traj_ids=False
-    )
     curve = []
     progress = tqdm(total=total, unit="frame", unit_scale=True)
-    for number, batch in enumerate(collector, 1):
+    for number, batch in enumerate(collect(cfg, env, actor), 1):
         update(batch, advantage, loss, optimizer, cfg)
         schedule.step()
         progress.update(frames)
@@ -132,10 +147,10 @@ def train(
     return policy, curve
 
 
-def main(cfg: Run) -> None:
+def main(cfg: Run, collect: Collect = collect) -> None:
     """Learn in one dynamics, measure in all of them, write down what came out."""
     torch.manual_seed(cfg.seed)
-    policy, curve = train(cfg)
+    policy, curve = train(cfg, collect=collect)
     save_policy(policy, cfg.out, {"task": cfg.task, "dynamics": cfg.dynamics})
     plots.plot_learning_curve(curve, cfg.out / "learning_curve.png")
 

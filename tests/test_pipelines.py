@@ -1,6 +1,8 @@
 """TorchRL pipelines of `examples/` with tiny budgets: each has to show what it claims."""
 
 import importlib
+import os
+import signal
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +13,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import load_scene, make_env
+from torchrl_nerd.evaluation.policy import make_actor
 from torchrl_nerd.transforms import Stats
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -159,6 +162,49 @@ def test_collectors_mix_both_dynamics(example, way):
     for index, name in enumerate(("nerd", "mujoco")):
         assert step_error(name, first[index, :, 0]) == 0.0
         assert step_error(name, first[1 - index, :, 0]) > 0.0
+
+
+@slow
+@pytest.mark.parametrize("moment", ["collecting", "learning"])
+def test_ppo_outlives_a_worker_of_ray(example, moment, monkeypatch, capsys):
+    """Killed while it collects, or while the policy learns; the next batch is whole."""
+    ray = pytest.importorskip("ray")
+    paths = [str(EXAMPLES), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))  # workers import it, too
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    ppo_ray, made = example("ppo_ray"), []
+
+    def die(batch: TensorDict) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    make_collector = ppo_ray.make_collector
+
+    def noted(*args):
+        made.append(make_collector(*args))
+        return made[-1]
+
+    monkeypatch.setattr(ppo_ray, "make_collector", noted)
+    cfg = ppo_ray.Run(dynamics="mujoco", num_envs=6, horizon=4, total_frames=72)
+    env = make_env(cfg.task, cfg.dynamics, cfg.num_envs)
+    policy, _ = example("ppo").make_policy_and_critic(env, cfg)
+    batches = []
+    for batch in ppo_ray.collect(cfg, env, make_actor(policy)):
+        batches.append(batch)
+        if len(batches) == 1:
+            with torch.no_grad():  # all that is collected from now on goes one way
+                policy.mlp[-1].bias.fill_(8.0)
+            victim = made[0].remote_collectors[1]
+            if moment == "learning":
+                pid = ray.get(victim.__ray_call__.remote(lambda self: os.getpid()))
+                os.kill(pid, signal.SIGKILL)
+            else:
+                ray.get(victim.set_post_collect_hook.remote(die))
+    assert [batch.shape for batch in batches] == [(6, 4)] * 3
+    assert len(made) == 2 and "a worker was lost" in capsys.readouterr().out
+    assert (batches[0]["action"] < 0).any()
+    assert all((batch["action"] > 0.9).all() for batch in batches[1:])
+    starts = [batch["qpos"][:, 0] for batch in batches[:2]]
+    assert not torch.equal(*starts)
 
 
 def test_gradients_through_learned_dynamics_help_in_true_ones(example):

@@ -22,8 +22,8 @@ BRIEF = (
 )
 
 
-def train(name: str, data: Path, out: Path, count: int, *more: str) -> str:
-    """``nerd train`` in so many processes."""
+def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str, str]:
+    """What ``nerd train`` says in so many processes, on its two streams."""
     command = [sys.executable, "-m", "torchrl_nerd.cli"]
     if count > 1:
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
@@ -34,7 +34,7 @@ def train(name: str, data: Path, out: Path, count: int, *more: str) -> str:
         command, capture_output=True, text=True, env=environment, timeout=300
     )
     assert done.returncode == 0 or "expected" in done.stderr, done.stderr[-2000:]
-    return done.stderr
+    return done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,8 @@ def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
     states = []
     for count in (1, 2):
         out = tmp_path / f"run_{count}"
-        train(name, tmp_path / "data", out, count, *more)
+        said, _ = train(name, tmp_path / "data", out, count, *more)
+        assert said.count("checkpoint in") == said.count("\n") == 1
         states.append(load_file(out / "state.safetensors"))
     assert states[0]["step"] == states[1]["step"] == 15
     for key, value in states[0].items():
@@ -57,7 +58,7 @@ def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
 def test_shares_that_are_not_equal_are_refused(tmp_path):
     name = "cartpole"
     generate(load_scene(name), DataConfig(20, 8), tmp_path / "data", quiet=True)
-    said = train(name, tmp_path / "data", tmp_path / "run", 2, "--rows", "9")
+    _, said = train(name, tmp_path / "data", tmp_path / "run", 2, "--rows", "9")
     assert "expected rows to be a multiple of the 2 ranks, got 9" in said
 
 

@@ -1,6 +1,7 @@
 """``nerd data``: random trajectories of the true dynamics, or recorded ones."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from torchrl_nerd.cli.options import (
     scene_of,
 )
 from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
+from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.data.recorded import write_tosses
 from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
@@ -31,6 +33,8 @@ class Data:
     Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
 
     Example: nerd data cartpole --inspect
+
+    Example: nerd data ant --trajectories 1000000 --ray auto
     """
 
     scene: Positional[str]
@@ -46,6 +50,9 @@ class Data:
     config: Flat[DataConfig] = field(default_factory=DataConfig)
     inspect: bool = False
     """Write a page about the data set, made before or now, to report.html in its folder."""
+    ray: str | None = None
+    """Draw on the workers of a Ray cluster: its HOST:PORT, auto, or local for this machine
+    alone. The data are the same."""
     json: Path | None = None
     """Write the figures to this file."""
     quiet: bool = False
@@ -67,7 +74,8 @@ class Data:
         scene = scene_of(self.scene, self.fine)
         out = self.out or Path("datasets") / run_name(self.scene, self.fine)
         draw = recipe_of(self.scene).draw(scene)
-        generate(scene, self.config, out, self.quiet, draw)
+        mapper = partial(ray_map, address=self.ray) if self.ray else map
+        generate(scene, self.config, out, self.quiet, draw, mapper)
         card = read_json(out / CARD)
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"

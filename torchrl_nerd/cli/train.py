@@ -12,6 +12,7 @@ from torchrl_nerd.data.generate import CARD, generate, load_data
 from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.training import ranks
+from torchrl_nerd.training.loggers import LoggerName
 from torchrl_nerd.training.recipes import recipe_of
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
 
@@ -42,6 +43,8 @@ class Train:
     """Copy the recipe's checkpoint, best or last, to this folder when done."""
     device: str = "cpu"
     """cpu or cuda."""
+    logger: LoggerName = "tensorboard"
+    """Where figures go beside log.csv: tensorboard, wandb, mlflow, or csv for nowhere."""
     threads: int | None = None
     """Processor threads; torch's own choice by default."""
     json: Path | None = None
@@ -72,15 +75,17 @@ class Train:
             horizons=protocol.horizons[:2],
             random_actions=bool(protocol.random_actions),
             quiet=self.quiet,
+            logger=self.logger,
         )
         trainer.run()
         made = out / recipe.exports
         card = read_json(made / "card.json")
         is_first = ranks.rank() == 0
         ranks.leave()
-        if self.export is not None and is_first:
-            save_checkpoint(load_checkpoint(made, scene), self.export, card)
-        print(f"{recipe.exports} checkpoint in {made}: {_curve(card)}")
+        if is_first:
+            if self.export is not None:
+                save_checkpoint(load_checkpoint(made, scene), self.export, card)
+            print(f"{recipe.exports} checkpoint in {made}: {_curve(card)}")
         return card
 
 

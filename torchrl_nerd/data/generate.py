@@ -7,7 +7,7 @@ JSON card beside it.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -40,6 +40,14 @@ CARD = "data.json"
 
 Draw = Callable[[int, int, Generator], TensorDict]
 """``(rows, steps, generator) -> trajectories [rows, steps]``, broken ones included."""
+
+Chunk = tuple[int, int]
+"""Number of a chunk, and how many trajectories it draws."""
+
+Mapper = Callable[
+    [Callable[[Chunk], TensorDict], Iterable[Chunk]], Iterable[TensorDict]
+]
+"""Python's ``map``, or what does the same elsewhere: results come in order."""
 
 
 @dataclass(frozen=True)
@@ -111,12 +119,20 @@ def is_sound(data: TensorDictBase) -> torch.Tensor:
     return (state.abs() < LARGEST).all(-1).all(-1)
 
 
+def draw_chunk(draw: Draw, config: DataConfig, chunk: Chunk) -> TensorDict:
+    """One chunk's trajectories; seed and number decide them, not who draws them."""
+    number, rows = chunk
+    generator = Generator().manual_seed((config.seed << 24) + number)
+    return draw(rows, config.steps, generator)
+
+
 def generate(
     scene: Scene,
     config: DataConfig,
     folder: Path,
     quiet: bool = False,
     strategy: tuple[str, Draw] | None = None,
+    mapper: Mapper = map,
 ) -> Path:
     """Write a data set, or go on with one that was cut short.
 
@@ -127,6 +143,7 @@ def generate(
         quiet: no progress bar.
         strategy: another way to draw trajectories than `simulate`, and its name, by
             which the card knows it.
+        mapper: where chunks are drawn: here, one after the other, or as `ray_map` does.
 
     Raises:
         ValueError: the folder cannot be written or holds data of another card.
@@ -134,7 +151,10 @@ def generate(
     name, draw = strategy or (None, partial(simulate, scene))
     card = _open_card(scene, config, writable_folder(folder), name)
     store = _open_store(draw, config, folder, card["chunks_done"])
-    chunks = -(-config.trajectories // CHUNK)
+    chunks = [
+        (number, min(CHUNK, config.trajectories - number * CHUNK))
+        for number in range(card["chunks_done"], -(-config.trajectories // CHUNK))
+    ]
     bar = tqdm(
         total=config.trajectories * config.steps,
         initial=min(card["chunks_done"] * CHUNK, config.trajectories) * config.steps,
@@ -143,16 +163,14 @@ def generate(
         desc=f"data {scene.name}",
         disable=quiet,
     )
-    for chunk in range(card["chunks_done"], chunks):
-        rows = min(CHUNK, config.trajectories - chunk * CHUNK)
-        generator = Generator().manual_seed((config.seed << 24) + chunk)
-        data = draw(rows, config.steps, generator)
+    drawn = mapper(partial(draw_chunk, draw, config), chunks)
+    for (number, rows), data in zip(chunks, drawn, strict=True):
         sound = is_sound(data)
         kept, first = data[sound], card["trajectories"]
         store[first : first + len(kept)] = kept
         card["trajectories"] += len(kept)
         card["dropped"] += int((~sound).sum())
-        card["chunks_done"] = chunk + 1
+        card["chunks_done"] = number + 1
         write_json(folder / CARD, card)
         bar.update(rows * config.steps)
     bar.close()

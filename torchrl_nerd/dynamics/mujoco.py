@@ -40,6 +40,18 @@ def feels_forces(scene: Scene) -> bool:
     return bool((stages == mujoco.mjtStage.mjSTAGE_ACC).any())
 
 
+def default_threads() -> int:
+    """``NERD_THREADS`` for workers that share a machine, otherwise all processors.
+
+    Raises:
+        ValueError: the variable holds no number of threads.
+    """
+    said = os.environ.get("NERD_THREADS") or str(os.cpu_count() or 1)
+    if not said.isdecimal() or int(said) < 1:
+        raise ValueError(f"expected NERD_THREADS to be a number, got {said!r}")
+    return int(said)
+
+
 class MujocoDynamics:
     """MuJoCo itself, substeps and threads in C, no Python loop over rows.
 
@@ -48,12 +60,13 @@ class MujocoDynamics:
 
     Args:
         scene: robot, ground and substeps.
-        num_threads: worker threads; all processors by default.
+        num_threads: worker threads; by default as many as the environment variable
+            ``NERD_THREADS`` says, or all processors.
     """
 
     def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
         self.scene = scene
-        self.num_threads = num_threads or os.cpu_count() or 1
+        self.num_threads = num_threads or default_threads()
         self._start()
 
     def _start(self) -> None:

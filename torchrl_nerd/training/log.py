@@ -1,10 +1,12 @@
-"""Figures of a training run: CSV always, TensorBoard where it is installed."""
+"""Figures of a training run: a table always, and one of TorchRL's loggers."""
 
 import csv
-from importlib.util import find_spec
 from pathlib import Path
 
+from torchrl.record.loggers.common import Logger
+
 from torchrl_nerd.files import write_atomically
+from torchrl_nerd.training.loggers import close
 
 
 class TrainingLog:
@@ -13,16 +15,12 @@ class TrainingLog:
     Args:
         folder: of the run.
         step: rows after it, left by a run that was killed, are dropped.
+        logger: takes the same figures; see `open_logger`.
     """
 
-    def __init__(self, folder: Path, step: int) -> None:
-        self.path = folder / "log.csv"
+    def __init__(self, folder: Path, step: int, logger: Logger | None = None) -> None:
+        self.path, self.logger = folder / "log.csv", logger
         self.rows = [row for row in self._read() if int(row["step"]) <= step]
-        self.board = None
-        if find_spec("tensorboard") is not None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            self.board = SummaryWriter(folder / "tensorboard", purge_step=step)
 
     def _read(self) -> list[dict[str, str]]:
         if not self.path.exists():
@@ -51,6 +49,12 @@ class TrainingLog:
         """Add a row; the file is whole after every call."""
         self.rows.append({key: repr(value) for key, value in figures.items()})
         write_atomically(self.path, self._write_rows)
-        if self.board is not None:
-            for key, value in figures.items():
-                self.board.add_scalar(key, value, int(figures["step"]))
+        if self.logger is not None:
+            step = int(figures["step"])
+            rest = {key: value for key, value in figures.items() if key != "step"}
+            self.logger.log_metrics(rest, step=step)
+
+    def close(self) -> None:
+        """End the logger's run."""
+        if self.logger is not None:
+            close(self.logger)

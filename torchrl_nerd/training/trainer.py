@@ -25,6 +25,7 @@ from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
+from torchrl_nerd.training.loggers import LoggerName, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
 from torchrl_nerd.training.rest import find_rest, resting
@@ -105,8 +106,8 @@ class Trainer:
     Under `torchrun` every rank does its share of each batch, see `training.ranks`.
 
     The folder holds ``last`` and ``best`` checkpoints (averaged weights), ``state`` (all
-    that a resumed run needs for the same bits), ``log.csv`` and, if it is installed,
-    TensorBoard files.
+    that a resumed run needs for the same bits) and ``log.csv``; `open_logger` says where
+    figures go besides.
 
     Args:
         scene: the robot.
@@ -118,6 +119,7 @@ class Trainer:
         horizons: control steps of the validation rollouts.
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
+        logger: ``tensorboard``, ``wandb``, ``mlflow``, or ``csv`` for the table alone.
 
     Raises:
         ValueError: the folder cannot be written or holds a run of another configuration.
@@ -134,7 +136,9 @@ class Trainer:
         horizons: tuple[int, ...] = (100, 500),
         random_actions: bool = False,
         quiet: bool = False,
+        logger: LoggerName = "tensorboard",
     ) -> None:
+        self.logger: LoggerName = logger
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.horizons, self.random_actions = horizons, random_actions
@@ -183,7 +187,7 @@ class Trainer:
             disable=self.quiet,
         )
         is_first = ranks.rank() == 0
-        log = TrainingLog(self.folder, self.step) if is_first else None
+        log = self._open_log() if is_first else None
         began = time.monotonic() - self.seconds
         loss = torch.zeros(())
         while self.step < last:
@@ -200,8 +204,15 @@ class Trainer:
                 self.save()
             bar.update()
         bar.close()
+        if log:
+            log.close()
         ranks.wait()  # for what the first one writes
         return self.averaged_model()
+
+    def _open_log(self) -> TrainingLog:
+        settings = {"scene": self.scene.name, **asdict(self.config)}
+        logger = open_logger(self.logger, self.folder, self.step, settings)
+        return TrainingLog(self.folder, self.step, logger)
 
     def update(self) -> Tensor:
         """One update; its batch depends on seed and step alone."""

@@ -1,0 +1,149 @@
+"""Figures of a run in TensorBoard, Weights & Biases and MLflow themselves, offline."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from torchrl_nerd.cli import main
+from torchrl_nerd.training.log import TrainingLog
+from torchrl_nerd.training.loggers import PROJECT, open_logger
+
+BLOCK = 32 * 1024  # of the files that Weights & Biases writes: LevelDB's log format
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """The folder of a run."""
+    folder = tmp_path / "some run"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def wandb(monkeypatch) -> Iterator[ModuleType]:
+    """The library, which reads the environment once, as if it were new."""
+    library = pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    library.teardown()
+    yield library
+    library.teardown()
+
+
+@pytest.fixture
+def figures(rng) -> dict[int, dict[str, float]]:
+    """By step, two of them."""
+    return {
+        step: {"loss": rng.normal(), "hinge_100": rng.normal()} for step in (10, 20, 35)
+    }
+
+
+def write(run: Path, name, settings, figures) -> None:
+    log = TrainingLog(run, 0, open_logger(name, run, 0, settings))
+    for step, row in figures.items():
+        log.write({"step": step, **row})
+    log.close()
+
+
+def wandb_records(path: Path) -> Iterator:
+    """What an offline run holds."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    data, place, parts = path.read_bytes(), 7, b""
+    while place + 7 <= len(data):
+        if BLOCK - place % BLOCK < 7:  # too little for a header: filled up
+            place += BLOCK - place % BLOCK
+        size, kind = (
+            int.from_bytes(data[place + 4 : place + 6], "little"),
+            data[place + 6],
+        )
+        parts += data[place + 7 : place + 7 + size]
+        place += 7 + size
+        if kind in (1, 4):  # whole, or the last part
+            record = Record()
+            record.ParseFromString(parts)
+            yield record
+            parts = b""
+
+
+def test_weights_and_biases_has_every_figure(wandb, run, figures, monkeypatch, seed):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    write(run, "wandb", {"scene": "cartpole", "seed": seed}, figures)
+    (path,) = run.glob("wandb/offline-run-*/run-*.wandb")
+    found, settings, names = {}, {}, set()
+    for record in wandb_records(path):
+        if record.WhichOneof("record_type") == "history":
+            row = {
+                item.key or item.nested_key[0]: json.loads(item.value_json)
+                for item in record.history.item
+            }
+            found[row["step"]] = {key: row[key] for key in ("loss", "hinge_100")}
+        for update in (*record.run.config.update, *record.config.update):
+            settings[update.key] = update.value_json
+        names |= {(record.run.project, record.run.display_name)}
+    assert found == figures
+    assert json.loads(settings["seed"]) == seed
+    assert (PROJECT, "some run") in names
+
+
+def test_who_has_no_key_is_told_so(wandb, run, tmp_path, monkeypatch):
+    for name in ("WANDB_API_KEY", "WANDB_MODE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(RuntimeError, match="No API key.*WANDB_MODE=offline"):
+        open_logger("wandb", run, 0, {})
+
+
+def test_tensorboard_forgets_what_a_killed_run_wrote_later(run, figures):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    write(run, "tensorboard", {}, figures)
+    log = TrainingLog(run, 10, open_logger("tensorboard", run, 10 + 1, {}))
+    log.write({"step": 20, "loss": 7.0})
+    log.close()
+    board = EventAccumulator(str(run / "tensorboard")).Reload()
+    rows = [(event.step, event.value) for event in board.Scalars("loss")]
+    assert rows == [(10, pytest.approx(figures[10]["loss"])), (20, 7.0)]
+
+
+def test_mlflow_has_every_figure(run, figures, monkeypatch, seed):
+    mlflow = pytest.importorskip("mlflow")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    write(run, "mlflow", {"scene": "cartpole", "seed": seed}, figures)
+    assert mlflow.active_run() is None
+    client = mlflow.MlflowClient(f"sqlite:///{run}/mlflow.db")
+    experiment = client.get_experiment_by_name(PROJECT)
+    (made,) = client.search_runs([experiment.experiment_id])
+    assert made.info.run_name == "some run" and made.info.status == "FINISHED"
+    assert made.data.params == {"scene": "cartpole", "seed": str(seed)}
+    for key in ("loss", "hinge_100"):
+        history = client.get_metric_history(made.info.run_id, key)
+        assert {m.step: m.value for m in history} == {
+            step: row[key] for step, row in figures.items()
+        }
+
+
+@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+def test_where_a_library_is_missing_the_extra_is_named(
+    name, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    sizes = ["--trajectories", "4", "--steps", "20", "--out", "d", "--quiet"]
+    assert main(["data", "cartpole", *sizes]) == 0
+    monkeypatch.setattr("torchrl_nerd.training.loggers.find_spec", lambda name: None)
+    argv = ["train", "cartpole", "--data", "d", "--out", "run", "--quiet"]
+    assert main([*argv, "--logger", name]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"nerd: --logger {name} needs the package {name}")
+    assert said.endswith(f"pip install 'torchrl-nerd[{name}]'\n")
+    assert said.count("\n") == 1
+
+
+def test_the_table_alone(run, figures):
+    write(run, "csv", {}, figures)
+    assert [path.name for path in run.iterdir()] == ["log.csv"]
+    assert open_logger("csv", run, 0, {}) is None
