@@ -27,7 +27,6 @@ from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.contenders import (
     FINEST,
     mujoco_contenders,
-    with_substeps,
 )
 from torchrl_nerd.evaluation.bench.errors import Course, courses
 from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way
@@ -203,9 +202,9 @@ def main(options: Options) -> dict[str, Any]:
     scene, threads = load_scene(options.scene), 1
     finest = max(FINEST, 4 * scene.substeps)
     generator = Generator().manual_seed(options.seed)
-    drawn = simulate(with_substeps(scene, finest), options.trajectories, 50, generator)
+    drawn = simulate(scene.with_substeps(finest), options.trajectories, 50, generator)
     data = cast(TensorDict, drawn[is_sound(drawn)].flatten(0, 1))
-    coarse = MujocoDynamics(with_substeps(scene, options.substeps), threads)
+    coarse = MujocoDynamics(scene.with_substeps(options.substeps), threads)
     state, terrain = data.select(QPOS, QVEL), data.get(TERRAIN, None)
     end = coarse.step(state, data[JOINT_TORQUE], terrain)
     whole = torch.cat((end[QPOS], end[QVEL]), -1).isfinite().all(-1)
