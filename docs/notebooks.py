@@ -1,0 +1,35 @@
+"""Notebooks of the tutorials as pages: a hook of MkDocs, see mkdocs.yml."""
+
+import json
+import re
+from pathlib import PurePosixPath
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+
+def as_markdown(notebook: str, own: str) -> str:
+    """The cells in order; code as code, ``!`` commands as commands.
+
+    Links to other notebooks lead to their pages; to its ``own`` file, to that file.
+    """
+    parts = []
+    for cell in json.loads(notebook)["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            is_shell = text.startswith("!")
+            language = "sh" if is_shell else "python"
+            text = f"```{language}\n{text.removeprefix('!')}\n```"
+        parts.append(text)
+    page = "\n\n".join(parts)
+    return re.sub(rf"\((?!{re.escape(own)}\))(\S+)\.ipynb\)", r"(\1.md)", page)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """A page beside every notebook, which stays there to be downloaded."""
+    for file in list(files):
+        if file.src_uri.endswith(".ipynb"):
+            page = as_markdown(file.content_string, PurePosixPath(file.src_uri).name)
+            name = file.src_uri.replace(".ipynb", ".md")
+            files.append(File.generated(config, name, content=page))
+    return files
