@@ -6,7 +6,8 @@
 Every task with a goal and a shipped model, with the policy, the update and the settings of
 `examples/ppo.py`. NeRD, eager and compiled, and MuJoCo take turns of one batch and its
 update; the first turn of each is not counted. torch has one thread, and it is the time of
-the processor that counts, all threads together: other work disturbs it little.
+the processor that counts, which other work disturbs little. Threads add up in it: those of
+MuJoCo's pool count as a cost, and not as speed.
 """
 
 import time
