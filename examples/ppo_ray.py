@@ -37,9 +37,8 @@ class Run(ppo.Run):
 
 def make_worker_env(task: str, dynamics: str, rows: int, seed: int) -> EnvBase:
     """A worker's rows; its exploration has a seed of its own, too."""
-    os.environ.setdefault(
-        "NERD_THREADS", "1"
-    )  # the other processors have other workers
+    # the other processors have other workers
+    os.environ.setdefault("NERD_THREADS", "1")
     torch.manual_seed(seed)
     return make_env(task, dynamics=dynamics, num_envs=rows, seed=seed)
 
