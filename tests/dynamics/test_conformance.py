@@ -9,6 +9,7 @@ from dynamics_helpers import (
     LEARNED,
     DynamicsMaker,
     assert_same_motion,
+    in_small_steps,
     random_drive,
     random_mask,
     roll,
@@ -152,6 +153,8 @@ def test_wrong_shapes_are_refused_in_one_sentence(scene, dynamics, generator):
 @warp_too
 def test_torque_and_ground_matter(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
+    if make.model is not None:
+        in_small_steps(make.model)
     start, torques, terrain = random_drive(scene, ROWS, 1, generator)
     pushed = roll(make(), start, torques, terrain)["qvel"]
     passive = roll(make(), start, 0.0 * torques, terrain)["qvel"]

@@ -7,6 +7,7 @@ import torch
 from dynamics_helpers import (
     LEARNED,
     double_model,
+    in_small_steps,
     random_drive,
     random_model,
     roll,
@@ -53,17 +54,9 @@ def test_a_path_is_encode_network_decode(scene, inference, network, generator):
     torch.testing.assert_close(after["qvel"][is_calm], qvel[is_calm], **close)
 
 
-@torch.no_grad()
-def _little(model):
-    """Small steps: within the model's bounds, and no rotations by many turns."""
-    for weight in model.network.head.parameters():
-        weight *= 0.1
-    return model
-
-
 @each_inference
 def test_history_matters_and_a_reset_empties_it(scene, inference, generator):
-    dynamics = NeRDDynamics(_little(random_model(scene, generator)), inference)
+    dynamics = NeRDDynamics(in_small_steps(random_model(scene, generator)), inference)
     start, torques, terrain = random_drive(scene, ROWS, 2, generator)
     first = dynamics.step(start, torques[0], terrain)
     dynamics.step(first, torques[1], terrain)
@@ -75,7 +68,7 @@ def test_history_matters_and_a_reset_empties_it(scene, inference, generator):
 
 @each_inference
 def test_gradients_are_those_of_finite_differences(scene, inference, generator):
-    model = _little(double_model(scene, generator))
+    model = in_small_steps(double_model(scene, generator))
     start, torques, terrain = random_drive(scene, ROWS, 4, generator)
     torques = 0.1 * torques
     weight = torch.randn(ROWS, scene.model.nv, generator=generator).double()

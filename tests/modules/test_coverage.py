@@ -43,7 +43,7 @@ def test_whatever_comes_in_speeds_stay_bounded(scene, generator):
         for torque in wild * torques:
             now = dynamics.step(now, torque, terrain)
             assert now["qpos"].isfinite().all()
-            assert (model.coverage._sizes(now["qvel"]) <= limit).all()
+            assert (model.coverage.sizes(now["qvel"]) <= limit).all()
 
 
 def test_joints_with_limits_stop_where_the_data_end(scene, generator):
