@@ -18,6 +18,7 @@ from typing import Any, cast
 
 import torch
 import tyro
+from scaling import stepper
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor, nn
 from tqdm import trange
@@ -177,18 +178,10 @@ def rates_of(everyone: dict[str, Dynamics], options: Options) -> dict[str, float
     """Control steps of 512 rows per second of the processor, medians over turns."""
     scene = load_scene(options.scene)
     state = states_on_the_way(scene, 512, options.seed)
-    start, terrain = state.select(QPOS, QVEL), state.get(TERRAIN, None)
-    torque = torch.zeros(512, len(scene.actuated)).double()
-
-    def runner(dynamics: Dynamics) -> Runner:
-        def run(steps: int) -> None:
-            for _ in range(steps):
-                dynamics.step(start, torque, terrain)
-
-        dynamics.reset(start)
-        return Runner(run, time.process_time)
-
-    runners = {name: runner(dynamics) for name, dynamics in everyone.items()}
+    runners = {
+        name: Runner(stepper(dynamics, state), time.process_time)
+        for name, dynamics in everyone.items()
+    }
     rounds = [
         {name: 512 * r.steps_per_s() for name, r in runners.items()}
         for _ in range(options.rounds)

@@ -18,12 +18,9 @@ from statistics import median
 
 import torch
 import tyro
-from ppo import Run, make_policy_and_critic, update
+from ppo import Run, make_learning, make_policy_and_critic, update
 from tensordict import TensorDictBase
-from torch.optim import Adam
 from torchrl.collectors import Collector
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import shipped_models
@@ -81,12 +78,7 @@ class Learner:
         env = make_env(cfg.task, cfg.dynamics, cfg.num_envs, cfg.seed, compile=compile)
         policy, critic = make_policy_and_critic(env, cfg)
         actor = make_actor(policy)
-        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
-        self.loss = ClipPPOLoss(
-            actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False
-        )
-        self.loss.normalize_advantage = True
-        self.optimizer = Adam(self.loss.parameters(), lr=cfg.lr)
+        self.learning = make_learning(actor, critic, cfg)
         self.batches: Iterator[TensorDictBase] = iter(
             Collector(
                 env,
@@ -102,7 +94,7 @@ class Learner:
         began = time.process_time()
         batch = next(self.batches)
         collected = time.process_time()
-        update(batch, self.advantage, self.loss, self.optimizer, self.cfg)
+        update(batch, *self.learning, self.cfg)
         return collected - began, time.process_time() - collected
 
 

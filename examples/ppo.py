@@ -20,7 +20,7 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from torchrl.modules import ValueOperator
+from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
@@ -74,6 +74,16 @@ def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperato
     return policy, ValueOperator(critic)
 
 
+def make_learning(
+    actor: ProbabilisticActor, critic: ValueOperator, cfg: Run
+) -> tuple[GAE, ClipPPOLoss, Adam]:
+    """What `update` takes beside a batch."""
+    advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
+    loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
+    loss.normalize_advantage = True
+    return advantage, loss, Adam(loss.parameters(), lr=cfg.lr)
+
+
 def update(
     batch: TensorDictBase,
     advantage: GAE,
@@ -119,10 +129,7 @@ def train(
     env = make_env(task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
-    advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
-    loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
-    loss.normalize_advantage = True
-    optimizer = Adam(loss.parameters(), lr=cfg.lr)
+    advantage, loss, optimizer = make_learning(actor, critic, cfg)
     frames, total = num_frames(cfg)
     schedule = LinearLR(optimizer, 1.0, end_factor=0.0, total_iters=total // frames)
     curve = []

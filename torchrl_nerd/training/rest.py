@@ -37,8 +37,8 @@ def resting(data: TensorDict) -> TensorDict:
 def find_rest(model: NeRD, states: TensorDict) -> None:
     """Tell a model how slow is still: what it makes of states at rest, in 20 steps.
 
-    Nothing is changed where there are too few such states, or where the model does not
-    leave them at rest.
+    Nothing is changed where there are too few such states; a model that does not leave
+    them at rest never sleeps.
 
     Args:
         model: trained; its `Coverage` is changed.
@@ -46,6 +46,7 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
     """
     if len(states) < LEAST_ROWS or not model.coverage.can_rest:
         return
+    model.coverage.still.zero_()  # or what it knew before would hide its noise
     dynamics, terrain = NeRDDynamics(model), states.get(TERRAIN, None)
     torque, speeds = states[JOINT_TORQUE], []
     now = states.select(QPOS, QVEL)
