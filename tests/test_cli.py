@@ -61,7 +61,7 @@ def test_every_command_explains_itself(command, capsys):
     text = capsys.readouterr().out
     assert stop.value.code == 0
     assert f"Example: nerd {command} " in text
-    assert "--json " in text
+    assert "--json " in text and "--dry-run" in text
     assert ("--seed " in text) == (command not in NOTHING_RANDOM)
 
 
@@ -74,6 +74,44 @@ def test_help_shows_the_recipe_of_the_scene(command, scene, capsys):
     assert stop.value.code == 0
     count = recipe.data.trajectories if command == "data" else recipe.train.steps
     assert f"default: {count})" in text
+
+
+@pytest.mark.parametrize(
+    ("argv", "plan"),
+    [
+        ("data cartpole --trajectories 300 --steps 7", "draw 300 trajectories of"),
+        ("train cartpole --network mlp", "begin a run in runs/cartpole"),
+        ("train cartpole --fine", "to datasets/cartpole-fine"),
+        ("eval cartpole --rows 77", "rows                77"),
+        ("stability cube --cases resting", "('resting',)"),
+        ("doctor --json out.json", "out.json"),
+    ],
+)
+def test_a_dry_run_says_what_it_would_do_and_does_nothing(
+    argv, plan, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main([*argv.split(), "--dry-run"]) == 0
+    assert plan in capsys.readouterr().out
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    draw = "data cartpole --trajectories 8 --steps 20 --quiet".split()
+    learn = "train cartpole --steps 1 --rollout-steps 1 --rows 2 --length 2".split()
+    learn += ["--rollout-rows", "2", "--rollout-length", "2", "--quiet"]
+    assert main(draw) == main(learn) == main([*draw, "--dry-run"]) == 0
+    assert "where 8 are now" in capsys.readouterr().out
+    assert main([*learn, "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert "use the data in datasets/cartpole" in text
+    assert "go on with the run in runs/cartpole" in text
+
+
+@pytest.mark.parametrize("command", ["data", "train"])
+def test_a_dry_run_refuses_what_the_run_would(command, capsys):
+    assert "'unicorn'" in refusal(capsys, command, "unicorn", "--dry-run")
 
 
 def test_an_unknown_command_is_refused(capsys):

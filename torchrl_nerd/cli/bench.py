@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.report import bench
@@ -12,7 +13,7 @@ from torchrl_nerd.scenes import load_scene
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(Command):
     """Speed against error: the shipped models and MuJoCo, coarse and fine, in one race.
 
     Example: nerd bench cartpole --json results/bench.json --plot results/bench.png
@@ -38,8 +39,6 @@ class Bench:
     """Largest mean errors, in the table's order: names the fastest row within them."""
     plot: Path | None = None
     """Draw the race to this PNG."""
-    json: Path | None = None
-    """Write the figures to this file."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their figures."""

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import (
     Flat,
     Positional,
@@ -14,9 +15,16 @@ from torchrl_nerd.cli.options import (
     run_name,
     scene_of,
 )
-from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data
+from torchrl_nerd.data.generate import (
+    CARD,
+    DataConfig,
+    draw_chunk,
+    generate,
+    load_data,
+    simulate,
+)
 from torchrl_nerd.data.ray_map import ray_map
-from torchrl_nerd.data.recorded import write_tosses
+from torchrl_nerd.data.recorded import load_tosses, write_tosses
 from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
 from torchrl_nerd.files import read_json
@@ -25,7 +33,7 @@ from torchrl_nerd.training.recipes import recipe_of
 
 
 @dataclass(frozen=True)
-class Data:
+class Data(Command):
     """Generate random trajectories of the true dynamics, or take over recorded ones.
 
     Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
@@ -53,10 +61,29 @@ class Data:
     ray: str | None = None
     """Draw on the workers of a Ray cluster: its HOST:PORT, auto, or local for this machine
     alone. The data are the same."""
-    json: Path | None = None
-    """Write the figures to this file."""
     quiet: bool = False
     """No progress bar."""
+
+    @property
+    def folder(self) -> Path:
+        """Where drawn data go."""
+        return self.out or Path("datasets") / run_name(self.scene, self.fine)
+
+    def plan(self) -> list[str]:
+        """How much would be drawn, and how much is there."""
+        if self.recorded is not None:
+            tosses, _ = load_tosses(self.recorded, real_scene(self.scene))
+            return [f"take over {len(tosses)} recorded tosses"]
+        scene, out = scene_of(self.scene, self.fine), self.folder
+        _, draw = recipe_of(self.scene).draw(scene) or (None, partial(simulate, scene))
+        one = draw_chunk(draw, self.config, (0, 1)).bytes()
+        wanted, there = self.config.trajectories, 0
+        if (out / CARD).exists():
+            there = read_json(out / CARD)["trajectories"]
+        return [
+            f"draw {wanted} trajectories of {scene.name}, {one * wanted / 1e9:.2g} GB, "
+            f"in {out}, where {there} are now"
+        ]
 
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
@@ -72,7 +99,7 @@ class Data:
             print(f"{card['trajectories']} recorded tosses in {out}: they fit physics")
             return card
         scene = scene_of(self.scene, self.fine)
-        out = self.out or Path("datasets") / run_name(self.scene, self.fine)
+        out = self.folder
         draw = recipe_of(self.scene).draw(scene)
         mapper = partial(ray_map, address=self.ray) if self.ray else map
         generate(scene, self.config, out, self.quiet, draw, mapper)

@@ -1,21 +1,18 @@
 """``nerd doctor``: what this machine has, and whether the shipped models work on it."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.evaluation.doctor import machine, shipped_checks, versions
 
 
 @dataclass(frozen=True)
-class Doctor:
+class Doctor(Command):
     """Versions, devices, and the self-check of every shipped model.
 
     Example: nerd doctor --json results/doctor.json
     """
-
-    json: Path | None = None
-    """Write what was found to this file."""
 
     def run(self) -> dict[str, Any]:
         """Print what was found and return it.

@@ -1,9 +1,9 @@
 """``nerd explain``: which features a scene has, why, and the proof."""
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.explain.report import explain
 from torchrl_nerd.evaluation.explain.table import report_table
@@ -11,7 +11,7 @@ from torchrl_nerd.scenes import load_scene
 
 
 @dataclass(frozen=True)
-class Explain:
+class Explain(Command):
     """What a network sees of a scene, what is left out, and proofs that it may be.
 
     Example: nerd explain double_pendulum --json results/explain.json
@@ -28,8 +28,6 @@ class Explain:
     """What to time the compact input and the paper's with."""
     timing: bool = True
     """Time them."""
-    json: Path | None = None
-    """Write the figures to this file."""
 
     def run(self) -> dict[str, Any]:
         """Print the report and return its figures."""

@@ -6,14 +6,16 @@ from typing import Annotated, Any
 
 import tyro
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
+from torchrl_nerd.data.recorded import load_tosses
 from torchrl_nerd.files import writable_folder
 from torchrl_nerd.training.finetune import FinetuneConfig
 from torchrl_nerd.training.finetune_run import finetune
 
 
 @dataclass(frozen=True)
-class Finetune:
+class Finetune(Command):
     """Fine-tune on recorded tosses a model that was pretrained in MuJoCo.
 
     Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
@@ -32,10 +34,13 @@ class Finetune:
     scratch: str | None = None
     """Start from fresh weights instead: residual, or a network's name, such as mlp."""
     config: Flat[FinetuneConfig] = field(default_factory=FinetuneConfig)
-    json: Path | None = None
-    """Write the figures to this file."""
     quiet: bool = False
     """No progress bar."""
+
+    def plan(self) -> list[str]:
+        """How many tosses there are to learn from, once they fit physics."""
+        _, parts = load_tosses(self.recorded, real_scene(self.scene))
+        return [f"{name}: {len(members)} tosses" for name, members in parts.items()]
 
     def run(self) -> dict[str, Any]:
         """Train, save the best model on validation tosses and return its card."""

@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from torchrl_nerd.cli.bench import Bench
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.data import Data
 from torchrl_nerd.cli.doctor import Doctor
 from torchrl_nerd.cli.eval import Eval
@@ -25,7 +26,7 @@ from torchrl_nerd.scenes import is_import
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.recipes import RECIPES, recipe_of
 
-COMMANDS = {
+COMMANDS: dict[str, type[Command]] = {
     "data": Data,
     "train": Train,
     "eval": Eval,
@@ -54,6 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     kind = COMMANDS[argv[0]]
     try:
         command = _parse(kind, argv)
+        if command.dry_run:
+            print("\n".join((*command.plan(), *command.settings())))
+            return 0
         figures = command.run()
         if command.json is not None:
             write_json(command.json, figures)
@@ -62,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(kind: type, argv: list[str]) -> Any:
+def _parse(kind: type[Command], argv: list[str]) -> Command:
     """The command with its settings; tyro's boxes point at what cannot be read.
 
     Raises:
@@ -85,7 +89,7 @@ def _parse(kind: type, argv: list[str]) -> Any:
         raise
 
 
-def _default(kind: type, args: list[str]) -> Any:
+def _default(kind: type[Command], args: list[str]) -> Any:
     """Defaults of a command: a scene's recipe where the command has one."""
     known = [arg for arg in args if arg in RECIPES]
     scene = next(

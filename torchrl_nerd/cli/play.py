@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.render.film import Draw, film
@@ -19,7 +20,7 @@ SECONDS = 5.0  # of motion, where neither steps nor the task says less
 
 
 @dataclass(frozen=True)
-class Play:
+class Play(Command):
     """A film of one episode, learned beside MuJoCo: same start, same actions.
 
     Example: nerd play cartpole/swingup --policy runs/ppo --out swing_up.gif
@@ -49,8 +50,6 @@ class Play:
     """OpenGL where it works without a screen, else drawings; or one of them."""
     viewer: bool = False
     """Show it in MuJoCo's window in place of a film."""
-    json: Path | None = None
-    """Write the figures to this file."""
     quiet: bool = False
     """No progress bar."""
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.protocols import protocol_of
@@ -17,7 +18,7 @@ from torchrl_nerd.settings import expect_at_least
 
 
 @dataclass(frozen=True)
-class Plot:
+class Plot(Command):
     """Error, energy and distance to the ground over time; or the curves of a training run.
 
     Example: nerd plot double_pendulum --case "ground 3" --out rollouts.png
@@ -39,8 +40,6 @@ class Plot:
     """Of the starts."""
     out: Path | None = None
     """PNG to write; runs/NAME_rollouts.png, or training.png in the run's folder."""
-    json: Path | None = None
-    """Write the figures to this file."""
 
     def run(self) -> dict[str, Any]:
         """Draw and return what was drawn."""

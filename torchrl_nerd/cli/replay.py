@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.replay import read_dump, replay
 
 
 @dataclass(frozen=True)
-class Replay:
+class Replay(Command):
     """The steps that led to a fault, again in learned and true dynamics.
 
     Envs with a fault_folder leave dumps: make_env(..., fault_folder=Path("faults")).
@@ -22,8 +23,6 @@ class Replay:
     """The dump."""
     model: str | None = None
     """Checkpoint folder; the shipped model of its scene by default."""
-    json: Path | None = None
-    """Write the figures to this file."""
 
     def run(self) -> dict[str, Any]:
         """Print a line per step and return the figures."""

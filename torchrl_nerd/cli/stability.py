@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.stability.plot import plot_results
@@ -20,7 +21,7 @@ from torchrl_nerd.settings import SettingError
 
 
 @dataclass(frozen=True)
-class Stability:
+class Stability(Command):
     """Hard cases: conservation, contact, geometry, bad input, long runs, gradients.
 
     A case whose line is not met stays in the table; the exit status is 0 all the same.
@@ -40,8 +41,6 @@ class Stability:
     """Share of the long rollouts' steps and of large batches' rows, in (0, 1]."""
     plot: Path | None = None
     """Draw every figure as a share of its line to this PNG."""
-    json: Path | None = None
-    """Write the figures to this file."""
 
     def run(self) -> dict[str, Any]:
         """Print a line per case, then the table, and return the figures."""

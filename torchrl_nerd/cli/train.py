@@ -7,18 +7,20 @@ from typing import Any
 import torch
 
 from torchrl_nerd.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
 from torchrl_nerd.data.generate import CARD, generate, load_data
 from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.files import read_json, writable_folder
+from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName
 from torchrl_nerd.training.recipes import recipe_of
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.trainer import STATE, TrainConfig, Trainer
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(Command):
     """Train a NeRD; without options, exactly as the shipped model of the scene.
 
     Robots of others get one recipe for all, validated from their own sampling ranges.
@@ -47,17 +49,36 @@ class Train:
     """Where figures go beside log.csv: tensorboard, wandb, mlflow, or csv for nowhere."""
     threads: int | None = None
     """Processor threads; torch's own choice by default."""
-    json: Path | None = None
-    """Write the figures to this file."""
     quiet: bool = False
     """No progress bar."""
+
+    @property
+    def folders(self) -> tuple[Path, Path]:
+        """Of the run and of its data."""
+        name = run_name(self.scene, self.fine)
+        return self.out or Path("runs") / name, self.data or Path("datasets") / name
+
+    def plan(self) -> list[str]:
+        """What would be trained on what, and what is there."""
+        scene, (out, data) = scene_of(self.scene, self.fine), self.folders
+        network = NeRD(scene, network_config(self.config.network)).network
+        weights = sum(weight.numel() for weight in network.parameters())
+        count = recipe_of(self.scene).data.trajectories
+        return [
+            f"use the data in {data}"
+            if (data / CARD).exists()
+            else f"draw {count} trajectories, to {data}",
+            f"go on with the run in {out}"
+            if (out / STATE).exists()
+            else f"begin a run in {out}",
+            f"train {weights} weights for {self.config.total_steps} updates",
+        ]
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the recipe takes."""
         scene = scene_of(self.scene, self.fine)
-        recipe, name = recipe_of(self.scene), run_name(self.scene, self.fine)
-        out = writable_folder(self.out or Path("runs") / name)
-        folder = self.data or Path("datasets") / name
+        recipe, (out, folder) = recipe_of(self.scene), self.folders
+        writable_folder(out)
         ranks.join(torch.device(self.device))
         if ranks.rank() == 0 and not (folder / CARD).exists():
             generate(scene, recipe.data, folder, self.quiet, recipe.draw(scene))

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
@@ -11,7 +12,7 @@ from torchrl_nerd.tasks import make_task
 
 
 @dataclass(frozen=True)
-class Transfer:
+class Transfer(Command):
     """Returns of a policy in learned and in true dynamics, and the gap.
 
     Example: nerd transfer cartpole/swingup --policy runs/ppo
@@ -27,8 +28,6 @@ class Transfer:
     """Per dynamics."""
     seed: int = 500
     """Of the resets."""
-    json: Path | None = None
-    """Write the figures to this file."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows."""

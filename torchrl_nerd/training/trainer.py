@@ -31,6 +31,7 @@ from torchrl_nerd.training.muon import Muon
 from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.sequences import Sequences, Symmetry, cover, data_stats
 
+STATE = "state.json"  # of a run that can go on
 VALIDATION_SEED = 1_000_003
 VALIDATION_ROWS = 256
 COUNTS = (
@@ -174,7 +175,7 @@ class Trainer:
         self.average = {name: w.detach().clone() for name, w in weights.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
         self.errors: dict[int, dict[str, ErrorSummary]] = {}  # of the last validation
-        if (self.folder / "state.json").exists():
+        if (self.folder / STATE).exists():
             self._resume()
 
     def run(self, until: int | None = None) -> NeRD:
@@ -330,7 +331,7 @@ class Trainer:
         write_tensors(self.folder / "state.safetensors", tensors)
         card = {"config": asdict(self.config), "scene_hash": self.scene.hash}
         card |= {"seconds": self.seconds}
-        write_json(self.folder / "state.json", card)
+        write_json(self.folder / STATE, card)
 
     def _save_model(
         self, name: str, errors: dict[int, dict[str, ErrorSummary]]
@@ -354,7 +355,7 @@ class Trainer:
         save_checkpoint(model, self.folder / name, make_card(model, training))
 
     def _resume(self) -> None:
-        card = read_json(self.folder / "state.json")
+        card = read_json(self.folder / STATE)
         expected = {"config": asdict(self.config), "scene_hash": self.scene.hash}
         for key, value in expected.items():
             if card.get(key) != value:

@@ -1,0 +1,39 @@
+"""What every command has: where its figures go, and a run that does nothing."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command(ABC):
+    """A command whose fields are its options."""
+
+    json: Path | None = None
+    """Write the figures to this file."""
+    dry_run: bool = False
+    """Say what would be done and with which settings, and do none of it."""
+
+    @abstractmethod
+    def run(self) -> dict[str, Any]:
+        """Do it and return the figures."""
+
+    def plan(self) -> list[str]:
+        """What `run` would do, in sentences; bad input is refused as there."""
+        return []
+
+    def settings(self) -> list[str]:
+        """Every option and its value, a line each."""
+        return [f"  {name:<20}{value}" for name, value in _leaves(self)]
+
+
+def _leaves(options: Any) -> Iterator[tuple[str, Any]]:
+    """Names and values, those of dataclasses within in their place."""
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if is_dataclass(value):
+            yield from _leaves(value)
+        elif field.name != "dry_run":
+            yield field.name, value
