@@ -141,13 +141,7 @@ def train(
         if number % cfg.evaluate_every == 0 or number * frames == total:
             where, seed = [cfg.dynamics], cfg.seed + 1
             episodes = min(256, cfg.episodes)
-            returns = policy_transfer.transfer(
-                task,  # pyright: ignore
-                actor,
-                where,
-                episodes,
-                seed=seed,
-            )
+            returns = policy_transfer.transfer(task, actor, where, episodes, seed=seed)
             means = {name: summary.mean for name, summary in returns.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})

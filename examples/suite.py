@@ -106,7 +106,7 @@ def main(cfg: Config) -> None:
     save_policy(policy, folder, {"task": task.scene_name, "dynamics": str(model)})
     print(f"policy in {folder} after {time.monotonic() - began:.0f} s")
     where, actor = (str(model), "mujoco", "dm_control"), make_actor(policy)
-    report = transfer(task, actor, where, cfg.episodes, seed=cfg.seed + 1)  # pyright: ignore
+    report = transfer(task, actor, where, cfg.episodes, seed=cfg.seed + 1)
     print(transfer_table(report), f"(one reward per {cfg.hold} control steps)")
     played = min(10, cfg.episodes)
     returns = suite_returns(policy, cfg.name, cfg.hold, played)

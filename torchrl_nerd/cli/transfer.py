@@ -28,14 +28,23 @@ class Transfer(Command):
     """Per dynamics."""
     seed: int = 500
     """Of the resets."""
+    device: str = "cpu"
+    """cpu or cuda."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows."""
         if self.episodes < 2:
             raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
         policy = load_policy(self.policy, make_task(self.task))
-        actor = make_actor(policy)
-        summaries = transfer(self.task, actor, self.dynamics, self.episodes, self.seed)
+        actor = make_actor(policy.to(self.device))
+        summaries = transfer(
+            self.task,
+            actor,
+            self.dynamics,
+            self.episodes,
+            seed=self.seed,
+            device=self.device,
+        )
         print(transfer_table(summaries))
         figures = {name: asdict(summary) for name, summary in summaries.items()}
         return {"task": self.task, "seed": self.seed, "returns": figures}

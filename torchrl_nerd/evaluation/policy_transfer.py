@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.tasks import Task
 
 TRUTH = "mujoco"
 NORMAL_95 = 1.96  # half width of a 95% interval, in standard errors
@@ -94,22 +95,24 @@ def _interval(samples: Tensor) -> float:
 
 
 def transfer(
-    task: str,
+    task: str | Task,
     actor: Actor,
     dynamics: Sequence[str | Path] = ("nerd", "mujoco", "dm_control"),
     episodes: int = 2048,
     slow_episodes: int = 256,
     seed: int = 0,
+    device: torch.device | str = "cpu",
 ) -> dict[str, ReturnSummary]:
     """The same policy from the same starts in each dynamics.
 
     Args:
-        task: id of a registered task.
-        actor: any TorchRL policy.
+        task: a task, or its id.
+        actor: any TorchRL policy, on ``device``.
         dynamics: what `make_env` takes; the truth, MuJoCo, is added where it is missing.
         episodes: in each dynamics (paper, table 1: 2,048).
         slow_episodes: the first so many of them on dm_control, which steps row by row.
         seed: of the starts.
+        device: where all envs live.
 
     Returns:
         Summaries by name of the dynamics.
@@ -120,14 +123,14 @@ def transfer(
     returns = {}
     for name in dict.fromkeys((*map(str, dynamics), TRUTH)):
         rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
-        env = make_env(task, dynamics=name, num_envs=rows, seed=seed)
+        env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
         returns[name] = policy_returns(env, actor)
     return {name: summarize(value, returns[TRUTH]) for name, value in returns.items()}
 
 
 @torch.no_grad()
 def hardest_episode(
-    task: str, actor: Actor, dynamics: Sequence[str | Path], seed: int = 0
+    task: str | Task, actor: Actor, dynamics: Sequence[str | Path], seed: int = 0
 ) -> dict[str, TensorDictBase]:
     """What the policy does in each dynamics from the start that earns least, of 64.
 
@@ -151,9 +154,10 @@ def hardest_episode(
 
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     """Lines for the terminal: one dynamics each, with 95% intervals."""
-    rows = [f"{'dynamics':<12}{'episodes':>9}{'return':>18}{'std':>9}{'gap':>20}"]
+    width = max(12, *(len(name) + 1 for name in summaries))
+    rows = [f"{'dynamics':<{width}}{'episodes':>9}{'return':>18}{'std':>9}{'gap':>20}"]
     for name, s in summaries.items():
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
         gap = f"{s.gap:+.3%} ± {s.gap_interval:.3%}"
-        rows.append(f"{name:<12}{s.episodes:>9}{mean:>18}{s.std:>9.1f}{gap:>20}")
+        rows.append(f"{name:<{width}}{s.episodes:>9}{mean:>18}{s.std:>9.1f}{gap:>20}")
     return "\n".join(rows)
