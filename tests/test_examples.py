@@ -1,6 +1,7 @@
 """Examples with tiny budgets."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -38,3 +39,15 @@ def test_a_suite_task_from_its_name_to_a_report(monkeypatch, tmp_path, seed, cap
         step = env.step(action)
         rewards.append(step.reward)
     np.testing.assert_allclose(returns, [sum(rewards)], rtol=1e-9)
+
+
+def test_a_library_that_knows_gymnasium_alone_learns_in_it(monkeypatch, seed, capsys):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import gymnasium_skrl as example
+
+    cfg = example.Config(num_envs=4, rollout=8, steps=16, episode=5, seed=seed % 1000)
+    found = example.main(cfg)
+    assert set(found) == {"nerd", "mujoco"}
+    assert all(math.isfinite(mean) and mean != 0.0 for mean in found.values())
+    np.testing.assert_allclose(found["nerd"], found["mujoco"], rtol=1e-3, atol=1e-3)
+    assert "mujoco: " in capsys.readouterr().out
