@@ -3,6 +3,7 @@
 import json
 import math
 
+import mujoco
 import pytest
 import torch
 
@@ -86,6 +87,19 @@ def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
     assert 3.0 < coarse / fine < 6.0
     again = ground[0].errors(truth(ground[0].scene, 1))
     assert all(not error.any() for error in again.values())
+
+
+@pytest.mark.parametrize("robot", ["cartpole", "franka"])
+def test_nothing_is_finer_than_a_truth_without_contact(robot, seed):
+    """Of the error of the scene's own substeps, finer ones move it by a ten-thousandth."""
+    course = courses(PROTOCOLS[robot](), 8, seed, 1, steps=20)[0]
+    rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+    finer = MujocoDynamics(
+        course.scene.fine.with_substeps(16 * course.scene.substeps, rk4)
+    )
+    own = course.errors(MujocoDynamics(course.scene))
+    for name, error in course.errors(finer).items():
+        assert error.max() < 1e-4 * own[name].max()
 
 
 def test_the_chaos_floor_is_as_high_as_the_push(seed):
