@@ -8,6 +8,7 @@ environment. An action is held over a few control steps, as is usual on the suit
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -77,16 +78,33 @@ def make_policy(task: SuiteTask, model: Path, cfg: Config) -> Policy:
     return policy
 
 
-@torch.no_grad()
-def suite_returns(policy: Policy, name: str, hold: int, episodes: int) -> np.ndarray:
+Choose = Callable[[np.ndarray], np.ndarray]  # an action for an observation
+
+
+def mean_action(policy: Policy) -> Choose:
+    """What the policy does without exploring."""
+
+    @torch.no_grad()
+    def choose(observation: np.ndarray) -> np.ndarray:
+        return policy(torch.from_numpy(observation).float())[0].tanh().double().numpy()
+
+    return choose
+
+
+def random_action(size: int, seed: int) -> Choose:
+    """Uniform random actions."""
+    draw = np.random.default_rng(seed)
+    return lambda observation: draw.uniform(-1.0, 1.0, size)
+
+
+def suite_returns(choose: Choose, name: str, hold: int, episodes: int) -> np.ndarray:
     """Whole episodes of 1000 rewards in the suite's own environment, ``(episodes,)``."""
     env, returns = load_suite(*name.split("-", 1)), np.zeros(episodes)
     for episode in range(episodes):
         step = env.reset()
         while not step.last():
             parts = [np.ravel(part) for part in step.observation.values()]
-            seen = torch.from_numpy(np.concatenate(parts)).float()
-            action = policy(seen)[0].tanh().double().numpy()
+            action = choose(np.concatenate(parts))
             for _ in range(hold):
                 if not step.last():
                     step = env.step(action)
@@ -109,15 +127,19 @@ def main(cfg: Config) -> None:
     report = transfer(task, actor, where, cfg.episodes, seed=cfg.seed + 1)
     print(transfer_table(report), f"(one reward per {cfg.hold} control steps)")
     played = min(10, cfg.episodes)
-    returns = suite_returns(policy, cfg.name, cfg.hold, played)
-    mean, std = float(returns.mean()), float(returns.std())
-    print(f"dm_control itself, {played} episodes: {mean:.1f} of 1000, std {std:.1f}")
+    size, suite = task.controller.num_actions, {}
+    acts = {"policy": mean_action(policy), "random": random_action(size, cfg.seed)}
+    for who, choose in acts.items():
+        found = suite_returns(choose, cfg.name, cfg.hold, played)
+        suite[who] = {"mean": float(found.mean()), "std": float(found.std())}
+        spread = f"{found.mean():.1f} of 1000, std {found.std():.1f}"
+        print(f"dm_control itself, {played} episodes, {who} actions: {spread}")
     seconds = time.monotonic() - began
     print(f"{seconds:.0f} s in all")
     figures = {name: asdict(summary) for name, summary in report.items()}
     write_json(
         folder / "report.json",
-        {"suite_mean": mean, "suite_std": std, "seconds": seconds, "returns": figures},
+        {"suite": suite, "seconds": seconds, "returns": figures},
     )
 
 

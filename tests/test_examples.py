@@ -24,11 +24,12 @@ def test_a_suite_task_from_its_name_to_a_report(monkeypatch, tmp_path, seed, cap
     model = str(tmp_path / name / "model" / "best")
     assert set(report["returns"]) == {model, "mujoco", "dm_control"}
     assert report["returns"][model]["episodes"] == 2
-    assert 0.0 < report["suite_mean"] <= 1000.0
-    assert "dm_control itself, 2 episodes" in capsys.readouterr().out
+    assert set(report["suite"]) == {"policy", "random"}
+    assert all(0.0 < who["mean"] <= 1000.0 for who in report["suite"].values())
+    assert "dm_control itself, 2 episodes, policy" in capsys.readouterr().out
 
     policy = load_policy(tmp_path / name)
-    returns = suite.suite_returns(policy, name, hold, episodes=1)
+    returns = suite.suite_returns(suite.mean_action(policy), name, hold, 1)
     env = dm_suite.load(*name.split("-"), task_kwargs={"random": 0})
     step, rewards = env.reset(), []
     while not step.last():
