@@ -1,7 +1,7 @@
 """From the name of a dm_control suite task to data, model, policy and transfer report.
 
     python examples/suite.py cartpole-swingup
-    python examples/suite.py acrobot-swingup
+    python examples/suite.py cheetah-run
 
 The policy is learned in the learned model alone and measured in dm_control's own
 environment. An action is held over a few control steps, as is usual on the suite.
