@@ -85,7 +85,7 @@ RECIPES: dict[str, Recipe] = {
     "anymal": _mlp("anymal/forward", 10_000, "mlp-large", 10_000, 500, softening=0.02),
     "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),
     "franka_gravity": _mlp(
-        "franka_gravity/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01
+        "franka_gravity/reach_torque", 10_000, "mlp-wide", 12_000, 1_000, softening=0.01
     ),
     "cube": Recipe(  # the last: errors over a toss do not show how well it rests
         DataConfig(trajectories=15_000, steps=100),
