@@ -8,7 +8,7 @@ import tyro
 
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
 from torchrl_nerd.files import writable_folder
-from torchrl_nerd.training.finetune import FinetuneConfig
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import finetune
 
 
