@@ -12,7 +12,7 @@ from pathlib import Path
 from torchrl_nerd import load_scene
 from torchrl_nerd.data.recorded import load_tosses
 from torchrl_nerd.evaluation.parameter_fit import WINDOWS
-from torchrl_nerd.evaluation.system_identification import FITTED, PUBLISHED, fit_mujoco
+from torchrl_nerd.evaluation.system_identification import fit_mujoco
 from torchrl_nerd.files import write_json
 
 
@@ -23,13 +23,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the parameters to this file")
     parser.add_argument("--evaluations", type=int, default=90, help="of each stage")
     parser.add_argument("--centre", action="store_true", help="fit the centre of mass")
-    parser.add_argument("--refine", action="store_true", help="start from FITTED")
     args = parser.parse_args()
     scene = load_scene("cube_real")
     tosses, split = load_tosses(args.data, scene)
     began = time.monotonic()
-    start, train = FITTED if args.refine else PUBLISHED, split["train"]
-    found = fit_mujoco(scene, tosses, train, args.evaluations, start, args.centre)
+    found = fit_mujoco(scene, tosses, split["train"], args.evaluations, args.centre)
     seconds = time.monotonic() - began
     figures = {
         "parameters": found,

@@ -50,6 +50,7 @@ def main() -> None:
     paths = {
         name: torch.cat((start["qpos"], open_loop(model, start, STATES - 1)[0]))
         for name, model in models.items()
+        if name != "MuJoCo, published"
     }
     plot = args.out / "toss.png"
     plot_toss(window["qpos"][0], paths, scene.control_step, plot)

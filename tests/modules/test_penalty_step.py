@@ -88,8 +88,8 @@ def test_it_comes_to_rest_on_the_ground_at_any_stiffness(real_cube, generator, h
     assert lowest.max() < 0.0 and lowest.min() > -2.0 * weight / values["stiffness"]
 
 
-def test_a_centre_of_mass_falls_freely_and_turns_the_cube_upon_it(real_cube, generator):
-    """Whatever the frame does: in flight its centre of mass draws a parabola."""
+def test_a_centre_of_mass_falls_freely(real_cube, generator):
+    """In flight it draws a parabola, whatever the frame does."""
     step = PenaltyStep(real_cube)
     centre = 0.01 * torch.randn(3, generator=generator).double()
     step.set_values(dict(zip(CENTRE, centre.tolist(), strict=True)))
@@ -109,7 +109,7 @@ def test_a_centre_of_mass_falls_freely_and_turns_the_cube_upon_it(real_cube, gen
 
 
 def test_friction_fades_under_load(real_cube, generator):
-    """A slide of the heavier pressed cube is shortened less, and never more."""
+    """A cube that is pressed into the ground loses less speed."""
     step = PenaltyStep(real_cube)
     qpos, qvel = falling(real_cube, generator, height=-0.002)
     qvel = qvel.clone()

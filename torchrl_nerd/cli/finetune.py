@@ -18,7 +18,7 @@ class Finetune:
 
     Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
 
-    Example: nerd finetune cube --from cube_tosses.npz --scratch mlp --epochs 40
+    Example: nerd finetune cube --from tosses.npz --scratch mlp --update all --epochs 40
     """
 
     scene: Positional[str]

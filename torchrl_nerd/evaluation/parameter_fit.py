@@ -89,12 +89,17 @@ def moved(
     return after
 
 
-def fit_flight(scene: Scene, tosses: Tosses) -> dict[str, float]:
+def fit_flight(scene: Scene, tosses: Tosses, every: int = 1) -> dict[str, float]:
     """Gravity (m/s^2) and centre of mass (m, body axes) from the tosses' first flights.
 
     The body's frame is where its centre of mass is, less the turned offset between them:
     ``p + R c = p0 + v0 t - g t^2 / 2``, linear in all unknowns. Empty where no toss flies
     long enough.
+
+    Args:
+        scene: of the body.
+        tosses: recorded.
+        every: frames between those that are looked at.
     """
     flies = scene.clearances(tosses.qpos).amin(-1) > CLEAR
     rows, values = [], []
@@ -103,13 +108,13 @@ def fit_flight(scene: Scene, tosses: Tosses) -> dict[str, float]:
         count = int(down[0]) if len(down) else int(end - first)
         if count < SHORTEST:
             continue
-        qpos = tosses.qpos[first : first + count]
-        time = scene.control_step * torch.arange(count).to(qpos)
+        qpos = tosses.qpos[first : first + count : every]
+        time = scene.control_step * every * torch.arange(len(qpos)).to(qpos)
         line = torch.stack((torch.ones_like(time), time), 1)
-        apart = torch.eye(count).to(qpos) - line @ torch.linalg.pinv(line)
+        apart = torch.eye(len(qpos)).to(qpos) - line @ torch.linalg.pinv(line)
         axes = torch.eye(3).to(qpos)
         for axis in range(3):
-            arm = rotate_inverse(qpos[:, 3:7], axes[axis].expand(count, 3))
+            arm = rotate_inverse(qpos[:, 3:7], axes[axis].expand(len(qpos), 3))
             drop = 0.5 * time.square() * (axis == 2)
             rows.append(apart @ torch.cat((-arm, -drop[:, None]), 1))
             values.append(apart @ qpos[:, axis])

@@ -34,9 +34,11 @@ def fit_physics(
     def errors_of(values: dict[str, float], rows: Tensor) -> tuple[Tensor, Tensor]:
         model.simulator.set_values(values)
         show(len(rows))
-        return view.errors(model, rows)
+        seen = slice(view.every - 1, None, view.every)
+        distance, angle = view.errors(model, rows)
+        return distance[:, seen], angle[:, seen]
 
-    flight = fit_flight(model.scene, view.seen.select(train))
+    flight = fit_flight(model.scene, view.seen.select(train), view.every)
     first, starts = model.simulator.values() | flight, view.starts(STATES, train)
     for found in fit_parameters(errors_of, first, PARAMETERS, starts, evaluations):
         model.simulator.set_values(found)
