@@ -44,6 +44,9 @@ class FineTuner:
         config: how.
         quiet: no progress bar.
         keep: called with every model that is better than all before.
+
+    Raises:
+        ValueError: tosses that are too short, or physics to fit without a simulator.
     """
 
     def __init__(
