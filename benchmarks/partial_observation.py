@@ -17,12 +17,13 @@ from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.toss_error import STATES, summarize_both, toss_errors
 from torchrl_nerd.files import write_json
-from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
+from torchrl_nerd.training.finetune import FineTuner
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import PRETRAINED_NAME
 
 CASES = {
     "poses": FinetuneConfig(observe="poses"),
-    "third": FinetuneConfig(observe="poses", every=3),
+    "third": FinetuneConfig(observe="poses", every=3, poses=2),
     "noisy": FinetuneConfig(observe="poses", pose_noise=1e-3, poses=8),
 }
 
@@ -35,20 +36,17 @@ def main() -> None:
     parser.add_argument("--model", default=PRETRAINED_NAME, help="to start from")
     parser.add_argument("--reference", default=SHIPPED, help="sees whole states")
     parser.add_argument("--part", default="test", choices=("validation", "test"))
-    parser.add_argument("--epochs", type=float, default=FinetuneConfig.epochs)
-    parser.add_argument("--length", type=int, default=FinetuneConfig.length)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args()
     scene = load_scene("cube_real")
     tosses, split = load_tosses(args.data, scene)
     # velocities are withheld: a NaN would reach the figures
     poses = replace(tosses, qvel=torch.full_like(tosses.qvel, float("nan")))
-    config = replace(CASES[args.case], epochs=args.epochs, length=args.length)
-    parts = split["train"], split["validation"]
+    config, parts = CASES[args.case], (split["train"], split["validation"])
     tuner = FineTuner(from_pretrained(args.model), poses, *parts, config)
     tuner.run()
-    assert tuner.encoder is not None
-    span = tuner.encoder.span
+    assert tuner.view.encoder is not None
+    span = tuner.view.encoder.span
     rows = tosses.starts(span + STATES, split[args.part])
     starts = rows + span
     reference = NeRDDynamics(from_pretrained(args.reference))

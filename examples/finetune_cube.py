@@ -21,7 +21,7 @@ from torchrl_nerd.evaluation.toss_error import STATES, first_state
 from torchrl_nerd.evaluation.toss_plot import plot_toss
 from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
 from torchrl_nerd.files import write_json
-from torchrl_nerd.training.finetune import FinetuneConfig
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import PRETRAINED_NAME, finetune
 
 
@@ -50,6 +50,7 @@ def main() -> None:
     paths = {
         name: torch.cat((start["qpos"], open_loop(model, start, STATES - 1)[0]))
         for name, model in models.items()
+        if name != "MuJoCo, published"
     }
     plot = args.out / "toss.png"
     plot_toss(window["qpos"][0], paths, scene.control_step, plot)

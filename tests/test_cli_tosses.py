@@ -8,7 +8,17 @@ from helpers import EXCERPT
 
 from torchrl_nerd.cli import main
 
-TINY = ["--epochs", "0.02", "--rows", "16", "--length", "2", "--quiet"]
+TINY = [
+    "--update",
+    "all",
+    "--epochs",
+    "0.02",
+    "--rows",
+    "16",
+    "--length",
+    "2",
+    "--quiet",
+]
 
 
 def refusal(capsys, *argv: str) -> str:

@@ -5,7 +5,13 @@ import math
 import torch
 from tensordict import TensorDict
 
-from torchrl_nerd.evaluation.system_identification import PUBLISHED, cube_with
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.parameter_fit import CENTRE
+from torchrl_nerd.evaluation.system_identification import (
+    PUBLISHED,
+    SUBSTEPS,
+    cube_with,
+)
 from torchrl_nerd.evaluation.toss_error import (
     no_motion,
     paired_interval,
@@ -14,6 +20,7 @@ from torchrl_nerd.evaluation.toss_error import (
     summarize_both,
     toss_errors,
 )
+from torchrl_nerd.modules.penalty_step import PenaltyStep
 
 
 class Replay:
@@ -82,7 +89,27 @@ def test_a_cube_of_other_parameters_has_them(real_cube):
     assert abs(model.geom_size[1] - 0.04).max() < 1e-12
     assert model.geom_friction[1, 0] == 0.5 and model.body_inertia[1, 0] == 0.001
     assert real_cube.model.geom_size[1, 0] == 0.0524  # left as it was
+    assert not model.body_ipos[1].any()
     assert (
         -model.geom_solref[1, 0] / model.body_invweight0[1, 0] - PUBLISHED["stiffness"]
         < 1e-6 * PUBLISHED["stiffness"]
     )
+
+
+def test_mujocos_centre_of_mass_falls_freely(real_cube, generator):
+    """As the cheap simulator's does, in flight, up to the error of MuJoCo's substeps."""
+    centre = 0.01 * torch.randn(3, generator=generator).double()
+    values = dict(zip(CENTRE, centre.tolist(), strict=True))
+    truth = MujocoDynamics(cube_with(real_cube, {**PUBLISHED, **values}), num_threads=1)
+    step = PenaltyStep(real_cube, substeps=SUBSTEPS)
+    step.set_values(values)
+    state = real_cube.sample_initial(8, generator)[0]
+    real_cube.set_down(state, torch.ones(8, dtype=torch.float64))
+    start = TensorDict(state, [8])
+    truth.reset(start)
+    expected = truth.step(start, start["qpos"][:, :0])
+    qpos, qvel, _ = step(start["qpos"], start["qvel"])
+    moved = (expected["qpos"] - start["qpos"]).abs().max()
+    assert (qpos - expected["qpos"]).abs().max() < 1e-3 * moved
+    changed = (expected["qvel"] - start["qvel"])[:, :3].abs().max()
+    assert (qvel - expected["qvel"])[:, :3].abs().max() < 0.02 * changed

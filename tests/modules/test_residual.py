@@ -29,7 +29,7 @@ def test_a_fresh_one_moves_as_its_simulator_does(real_cube, tosses, generator):
     path = open_loop(NeRDDynamics(model), start, 5)
     qpos, qvel = start["qpos"], start["qvel"]
     for step in range(5):
-        qpos, qvel = model.simulator(qpos, qvel)
+        qpos, qvel, _ = model.simulator(qpos, qvel)
         assert (path[:, step] - qpos).abs().max() < 1e-5  # float32 in between
 
 

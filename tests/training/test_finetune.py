@@ -8,11 +8,13 @@ import torch
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.modules.pose_encoder import PoseEncoder
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner, converged
+from torchrl_nerd.training.convergence import converged, score
+from torchrl_nerd.training.finetune import FineTuner
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.pose_loss import pose_error, rollout
 from torchrl_nerd.training.toss_models import from_scratch
 
-QUICK = FinetuneConfig(epochs=0.2, rows=64, length=4, validate_every=100)
+QUICK = FinetuneConfig(update="all", epochs=0.2, rows=64, length=4, validate_every=100)
 NUMBERS = torch.arange(12)
 
 
@@ -35,6 +37,22 @@ def test_it_learns_from_real_tosses(model, tosses):
     run.run()
     first, *_, last = [point for point in run.curve]
     assert last["orientation_rad"] < first["orientation_rad"]
+
+
+def test_physics_is_fitted_without_gradients(model, tosses):
+    run = tuner(model, tosses, update="physics", evaluations=2)
+    best = run.run()
+    epochs = [point["epoch"] for point in run.curve]
+    assert epochs == sorted(set(epochs)) and epochs[-1] < 4.1
+    lowest = min(run.curve, key=score)
+    assert run.errors(run.checks)[0].mean() == pytest.approx(lowest["position_m"])
+    network = model.network.state_dict()
+    assert all(torch.equal(network[k], v) for k, v in best.network.state_dict().items())
+
+
+def test_only_a_simulator_has_physics_to_fit(real_cube, tosses):
+    with pytest.raises(SettingError, match="simulator"):
+        tuner(from_scratch(real_cube, tosses, "mlp", seed=0), tosses, update="physics")
 
 
 def test_statistics_are_frozen_and_the_given_model_is_left_alone(model, tosses):
@@ -79,16 +97,23 @@ def test_poses_at_any_rate_are_enough(model, tosses):
     assert run.curve[-1]["position_m"] < 0.2
 
 
-def test_the_encoder_starts_with_the_slope_of_its_window(real_cube, generator):
+@pytest.mark.parametrize("is_high", [True, False])
+def test_the_encoder_knows_velocities_in_flight_and_slopes_on_ground(
+    real_cube, generator, is_high
+):
     every = int(torch.randint(1, 4, (), generator=generator))
     encoder = PoseEncoder(real_cube, poses=5, every=every)
     linear, angular = torch.randn(2, 8, 3, generator=generator).double()
     start = real_cube.sample_initial(8, generator)[0]["qpos"]
+    start[:, 2] = 2.0 if is_high else -2.0
     qvel = torch.cat((linear, angular), 1)
     time = real_cube.control_step * every * torch.arange(5).double()
     window = torch.stack(
         [integrate_pos(real_cube.layout, start, t * qvel) for t in time], 1
     )
+    gravity = torch.as_tensor(real_cube.model.opt.gravity) * is_high
+    window[..., :3] += 0.5 * time[:, None] ** 2 * gravity
+    qvel[:, :3] += time[-1] * gravity
     qpos, found = encoder(window)
     torch.testing.assert_close(qpos, window[:, -1])
     torch.testing.assert_close(found, qvel, atol=1e-9, rtol=0)

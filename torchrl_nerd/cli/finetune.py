@@ -10,7 +10,7 @@ from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
 from torchrl_nerd.data.recorded import load_tosses
 from torchrl_nerd.files import writable_folder
-from torchrl_nerd.training.finetune import FinetuneConfig
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import finetune
 
 
@@ -20,7 +20,7 @@ class Finetune(Command):
 
     Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
 
-    Example: nerd finetune cube --from cube_tosses.npz --scratch mlp --epochs 40
+    Example: nerd finetune cube --from tosses.npz --scratch mlp --update all --epochs 40
     """
 
     scene: Positional[str]

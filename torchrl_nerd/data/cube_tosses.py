@@ -33,12 +33,12 @@ from torchrl_nerd.geometry.frames import (
     quat_normalize,
 )
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.pose_encoder import CLEAR
 from torchrl_nerd.scenes import Scene
 
 FRAME = 1.0 / 148.0  # s, of the published camera
 SPLIT_SEED, TRAIN_SHARE, VALIDATION_SHARE = 0, 380 / 510, 65 / 510
 MEASURED_GRAVITY = 9.61  # m/s^2 in the recordings' own metres: 2% short of 9.81
-CLEAR = 0.005  # m between the lowest corner and the ground: free flight
 COLUMNS = {
     "position": ("x", "y", "z"),
     "quaternion_wxyz": ("qw", "qx", "qy", "qz"),

@@ -2,7 +2,10 @@
 
 Each contact point that is in the ground is pushed out by a spring and a damper and held
 back by friction, ``min(kf * slip, mu * normal force)``: the law of the paper's engine, see
-`scenes.penalty`. A few substeps with a backward Euler spring are stable at any stiffness.
+`scenes.penalty`. Two things are added that real bodies have: a centre of mass that is not
+where the body's frame is, and friction that fades under load, ``mu / (1 + normal force *
+fading)``, as elastic asperities' does (J. F. Archard, "Elastic deformation and the laws of
+friction", 1957). A few substeps with a backward Euler spring are stable at any stiffness.
 Every operation is differentiable, and so are the physical parameters: a rollout through it
 fits them to recordings.
 """
@@ -14,11 +17,26 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.scenes.scene import Scene
 
-PARAMETERS = ("gravity", "size", "inertia", "friction", "stiffness", "damping", "slip")
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
 # move little, so that one step size suits all
-SHARE = (0.1, 0.1, 0.5, 0.3, 2.0, 2.0, 4.0)
-GROUND_SHARE = 0.005  # m, the same for the ground's height
+SCALED = {
+    "gravity": 0.1,
+    "size": 0.1,
+    "inertia": 0.5,
+    "friction": 0.3,
+    "stiffness": 2.0,
+    "damping": 2.0,
+    "slip": 4.0,
+}
+# what a unit of ``raw`` is of the parameters that are zero in a scene
+SHIFTED = {
+    "ground": 0.005,  # m, its height
+    "centre_x": 0.005,  # m, of mass, in body axes
+    "centre_y": 0.005,
+    "centre_z": 0.005,
+    "fading": 0.01,  # 1/N, of friction under load
+}
+PARAMETERS = (*SCALED, *SHIFTED)
 SLOWEST = 1e-4  # m/s: keeps the direction of slip defined at rest
 
 # rotation matrix, row by row, from the 16 products of a quaternion's entries
@@ -52,9 +70,9 @@ for _index, (_row, _sign) in enumerate(
 class PenaltyStep(nn.Module):
     """One control step of a single free body above the plane z = 0.
 
-    ``raw (8,)`` times `SHARE` is the logarithm of what multiplies the scene's own
-    `PARAMETERS`; the last number times `GROUND_SHARE` is the height of the ground, m. All
-    zero for the scene as it is.
+    ``raw (12,)`` holds the `PARAMETERS`: the logarithms of what multiplies the scene's own,
+    in units of `SCALED`, then those that scenes lack, in units of `SHIFTED`. All zero for
+    the scene as it is.
 
     Args:
         scene: a single free body with point contacts that follow the penalty law.
@@ -68,10 +86,11 @@ class PenaltyStep(nn.Module):
     inertia: Tensor
     nominal: Tensor
     share: Tensor
+    shift: Tensor
     matrix: Tensor
     spin: Tensor
 
-    def __init__(self, scene: Scene, substeps: int = 4) -> None:
+    def __init__(self, scene: Scene, substeps: int = 8) -> None:
         super().__init__()
         model, name = scene.model, scene.name
         if model.njnt != 1 or not scene.base.is_floating or len(scene.contacts) == 0:
@@ -101,49 +120,55 @@ class PenaltyStep(nn.Module):
         inertia = torch.as_tensor(model.body_inertia[body], dtype=torch.float64)
         reach = points.square().sum(-1).amax() / inertia.amin()
         self.lightest = float(1.0 / (1.0 / self.mass + reach))  # kg, at a point
-        nominal = torch.tensor([values[key] for key in PARAMETERS], dtype=torch.float64)
+        nominal = torch.tensor([values[key] for key in SCALED], dtype=torch.float64)
         for key, value in (
             ("points", points.clone()),
             ("inertia", inertia.clone()),
             ("nominal", nominal),
-            ("share", torch.tensor(SHARE, dtype=torch.float64)),
+            ("share", torch.tensor([*SCALED.values()], dtype=torch.float64)),
+            ("shift", torch.tensor([*SHIFTED.values()], dtype=torch.float64)),
             ("matrix", _MATRIX),
             ("spin", _SPIN),
         ):
             self.register_buffer(key, value.clone(), persistent=False)
-        count = len(PARAMETERS) + 1
-        self.raw = nn.Parameter(torch.zeros(count, dtype=torch.float64))
+        self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
 
     def scaled(self) -> Tensor:
-        """The `PARAMETERS` in SI units; size and inertia as multiples of the scene's.
-
-        The height of the ground (m) comes last.
-        """
-        factors = (self.share * self.raw[:-1]).exp()
-        return torch.cat((self.nominal * factors, GROUND_SHARE * self.raw[-1:]))
+        """The `PARAMETERS` in SI units; size and inertia as multiples of the scene's."""
+        count = len(SCALED)
+        factors = (self.share * self.raw[:count]).exp()
+        return torch.cat((self.nominal * factors, self.shift * self.raw[count:]))
 
     def values(self) -> dict[str, float]:
         """`scaled` by name."""
-        names = (*PARAMETERS, "ground")
-        return dict(zip(names, self.scaled().tolist(), strict=True))
+        return dict(zip(PARAMETERS, self.scaled().tolist(), strict=True))
 
     @torch.no_grad()
     def set_values(self, values: dict[str, float]) -> None:
-        """Take over parameters as `values` gives them."""
-        wanted = self.nominal.new_tensor([values[key] for key in PARAMETERS])
-        self.raw[:-1] = (wanted / self.nominal).log() / self.share
-        self.raw[-1] = values["ground"] / GROUND_SHARE
+        """Take over parameters as `values` gives them; those not named stay."""
+        wanted = self.nominal.new_tensor([*(self.values() | values).values()])
+        count = len(SCALED)
+        self.raw[:count] = (wanted[:count] / self.nominal).log() / self.share
+        self.raw[count:] = wanted[count:] / self.shift
 
-    def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
-        """The state one control step later, ``(rows, 7), (rows, 6)``, float64.
+    def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One control step, float64.
 
-        The backward Euler spring foresees its own push but not the weight on it, so that a
-        body at rest lies deeper than its stiffness says: 2.3 mm with the scene's damping,
-        0.2 mm with that of the shipped model.
+        The backward Euler spring foresees its own push and the weight on it. What it adds
+        to the damping is small only beside ``mass / substep``: 90 N s/m at a corner.
+
+        Args:
+            qpos: ``(rows, 7)``, of the body's frame.
+            qvel: ``(rows, 6)``.
+
+        Returns:
+            The state after it, likewise, and how hard the ground pushed: the impulse of
+            all normal forces over the mass, ``(rows, 1)``, m/s.
         """
-        gravity, size, heavier, mu, ke, kd, kf, ground = self.scaled().unbind()
-        h, points = self.step_size, size * self.points
-        inertia = heavier * self.inertia
+        scaled = self.scaled()
+        gravity, size, heavier, mu, ke, kd, kf, ground, *_, fading = scaled.unbind()
+        centre, inertia = scaled[-4:-1], heavier * self.inertia
+        h, points = self.step_size, size * self.points - centre
         soften = 1.0 + h * (kd + h * ke) / self.lightest  # backward Euler at a point
         spring, damper = ke / soften, (kd + h * ke) / soften
         slip = kf / (1.0 + h * kf / self.lightest)
@@ -153,11 +178,13 @@ class PenaltyStep(nn.Module):
         fall = torch.zeros_like(qvel[:1, :3])
         fall[:, 2] = 1.0
         fall = fall * (h * gravity)
-        position, quat = qpos[:, :3], qpos[:, 3:]
-        linear, angular = qvel[:, :3], qvel[:, 3:]
+        quat, angular = qpos[:, 3:], qvel[:, 3:]
+        rotation = self._rotation(quat)
+        position = qpos[:, :3] + rotation @ centre
+        linear = qvel[:, :3] + _swing(rotation, angular, centre)
+        pushed = torch.zeros_like(linear[:, :1])
         for _ in range(self.substeps):
-            products = (quat[:, :, None] * quat[:, None]).flatten(1)
-            rotation = (products @ self.matrix).unflatten(1, (3, 3))
+            linear = linear - fall
             up = rotation[:, 2]  # of the world, in body axes
             in_body = (linear[:, None] @ rotation)[:, 0]
             depth = ground - position[:, 2:] - up @ points.mT
@@ -167,17 +194,33 @@ class PenaltyStep(nn.Module):
             speed = (sliding.square().sum(-1) + SLOWEST**2).sqrt()
             normal = (spring * depth - damper * rising).clamp_min(0.0)
             normal = torch.where(depth > 0.0, normal, 0.0)
-            drag = torch.minimum(slip, mu * normal / speed)
-            drag = torch.where(depth > 0.0, drag, 0.0)
+            limit = mu * normal / (1.0 + fading * normal)
+            drag = torch.minimum(slip, limit / speed)
             force = normal[..., None] * up[:, None] - drag[..., None] * sliding
             push = (rotation @ force.sum(1)[..., None])[..., 0]
-            linear = linear + (h / self.mass) * push - fall
+            linear = linear + (h / self.mass) * push
+            pushed = pushed + (h / self.mass) * normal.sum(1, keepdim=True)
             gyro = torch.linalg.cross(angular, inertia * angular)
             angular = angular + h * (force.flatten(1) @ torques - gyro) / inertia
             position = position + h * linear
             turn = (quat[:, :, None] * (0.5 * h * angular)[:, None]).flatten(1)
             quat = quat_normalize(quat + turn @ self.spin)
-        return torch.cat((position, quat), 1), torch.cat((linear, angular), 1)
+            rotation = self._rotation(quat)
+        position = position - rotation @ centre
+        linear = linear - _swing(rotation, angular, centre)
+        after = torch.cat((position, quat), 1), torch.cat((linear, angular), 1)
+        return *after, pushed
+
+    def _rotation(self, quat: Tensor) -> Tensor:
+        """Rotation matrices ``(rows, 3, 3)``, body to world."""
+        products = (quat[:, :, None] * quat[:, None]).flatten(1)
+        return (products @ self.matrix).unflatten(1, (3, 3))
+
+
+def _swing(rotation: Tensor, angular: Tensor, point: Tensor) -> Tensor:
+    """Velocity ``(rows, 3)``, world, of a point of the body beside its origin's."""
+    moving = torch.linalg.cross(angular, point.expand_as(angular))
+    return (rotation @ moving[..., None])[..., 0]
 
 
 def _cross_matrices(points: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torchrl_nerd.scenes.scene import Scene
 
 WIDTH = 64
 REACH = (0.1, 1.0)  # m/s and rad/s: size of a correction of velocities
+CLEAR = 0.005  # m between the lowest corner and the ground: free flight
 SHIFT = 1e-3  # m and rad: size of a correction of the pose
 
 
@@ -17,7 +18,8 @@ class PoseEncoder(nn.Module):
 
     A weighted mean of the velocities between the last pose and each before it, plus what a
     small network adds. It sees them in the base frame, with gravity. At first the mean is
-    the slope of the line of least squares through the window, and nothing is added.
+    the slope of the line of least squares through the window, and nothing is added. That
+    slope is of the window's middle: where all of it flies, the fall since then is added.
 
     Args:
         scene: a single free body.
@@ -36,7 +38,8 @@ class PoseEncoder(nn.Module):
             raise ValueError(
                 f"expected at least 2 poses and every 1, got {poses} and {every}"
             )
-        self.layout, self.poses, self.every = scene.layout, poses, every
+        self.scene, self.layout = scene, scene.layout
+        self.poses, self.every = poses, every
         lag = torch.arange(poses - 1, 0, -1, dtype=torch.float64)
         self.lags = scene.control_step * every * lag  # s before the last pose
         self.weights = nn.Parameter(_slope_weights(lag))
@@ -73,7 +76,10 @@ class PoseEncoder(nn.Module):
         change = self.network(seen.float()).double()
         size = change.new_tensor(REACH).repeat_interleave(3)
         velocity = self.weights @ speeds + size * change[:, :6]
-        linear = rotate(quat, velocity[:, :3])
+        flies = self.scene.clearances(window).amin((-2, -1)) > CLEAR
+        gravity = torch.as_tensor(self.scene.model.opt.gravity).to(last)
+        fall = 0.5 * self.span * self.scene.control_step * gravity
+        linear = rotate(quat, velocity[:, :3]) + flies[:, None] * fall
         shift = SHIFT * change[:, 6:]
         return (
             integrate_pos(self.layout, last, shift),

@@ -11,18 +11,13 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.frames import rotate_inverse
 from torchrl_nerd.modules.baselines import MLP, MLPConfig, NoMemory
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.modules.penalty_step import PenaltyStep
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Stats
 
-LEVER = 0.05  # m: turns count as velocities so far from the centre
-HALF_GATE = (
-    0.05  # m/s: kicks of that size are corrected by half of what the network says
-)
-TINY = 1e-6  # m/s
+HALF_GATE = 0.05  # m/s: pushes of that size are corrected by half of what the net says
 
 
 @dataclass(frozen=True)
@@ -31,7 +26,7 @@ class ResidualConfig:
 
     depth: int = 2
     width: int = 64
-    substeps: int = 4
+    substeps: int = 8
 
     def build(self, num_inputs: int, num_outputs: int) -> "Correction":
         """A network that corrects nothing yet."""
@@ -95,13 +90,12 @@ class ResidualNeRD(NeRD):
         """Tokens ``(*batch, F + D + 1)``, the simulator's change among them."""
         token = super().assemble(features, qpos, qvel)
         flat = qpos.reshape(-1, qpos.shape[-1]), qvel.reshape(-1, qvel.shape[-1])
-        after = (
-            x.view_as(y)
-            for x, y in zip(self.simulator(*flat), (qpos, qvel), strict=True)
-        )
+        *after, push = self.simulator(*flat)
+        after = (x.view_as(y) for x, y in zip(after, (qpos, qvel), strict=True))
         change = self.state_delta.delta(qpos, qvel, *after)
-        gate = self._contact(qpos, change)
         change = self.normalize.normalize(TARGET, change)
+        push = push.detach().view(*qpos.shape[:-1], 1)
+        gate = push / (push + HALF_GATE)
         return torch.cat((token, change.to(token.dtype), gate.to(token.dtype)), -1)
 
     def decode(
@@ -110,17 +104,6 @@ class ResidualNeRD(NeRD):
         """As `NeRD`, but unbounded: the simulator knows what lies beyond the data."""
         delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
         return self.state_delta.integrate(qpos, qvel, delta)
-
-    def _contact(self, qpos: Tensor, change: Tensor) -> Tensor:
-        """Share of contact in the simulator's change, ``(*batch, 1)``."""
-        gravity = self.simulator.scaled()[0].detach()
-        fall = torch.zeros_like(change[..., :3])
-        fall[..., 2] = -gravity * self.scene.control_step
-        kick = change[..., :3] - rotate_inverse(qpos[..., 3:7], fall)
-        turn = LEVER * change[..., 3:6]
-        size = (kick.square() + turn.square()).sum(-1, keepdim=True)
-        size = (size.detach() + TINY**2).sqrt() - TINY
-        return size / (size + HALF_GATE)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "ResidualNeRD":
         """As `NeRD`: the simulator moves but stays float64."""

@@ -35,10 +35,14 @@ def cube() -> Scene:
     return cube_scene("cube", CONTACT)
 
 
+def cube_path(name: str) -> Path:
+    """Where the cube of that name is described."""
+    return Path(__file__).parent / "assets" / f"{name}.xml"
+
+
 def cube_scene(name: str, contact: dict[str, float]) -> Scene:
     """A cube of that name in the assets, with penalty contacts."""
-    path = Path(__file__).parent / "assets" / f"{name}.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model = mujoco.MjModel.from_xml_path(str(cube_path(name)))
     set_penalty_contact(model, **contact)
     return Scene(
         name=name,

@@ -15,9 +15,11 @@ from torchrl_nerd.checkpoint import (
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tensor_files import write_tensors
-from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
+from torchrl_nerd.training.finetune import FineTuner
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.toss_models import from_scratch, pretrain
 
 PRETRAINED_NAME = f"{SHIPPED}-pretrained"
@@ -65,13 +67,16 @@ def finetune(
     }
 
     def keep(best: NeRD) -> None:
-        card = make_card(best, {"finetuning": {**made, **tuner.card()["finetuning"]}})
+        figures = {**made, **tuner.card()["finetuning"]}
+        if isinstance(best, ResidualNeRD):
+            figures["simulator"] = best.simulator.values()
+        card = make_card(best, {"finetuning": figures})
         save_checkpoint(best, out, card)
         write_json(out / "curve.json", {"curve": tuner.curve})
 
     parts = split["train"], split["validation"]
     tuner = FineTuner(model, tosses, *parts, config, quiet, keep)
     keep(tuner.run())
-    if tuner.encoder is not None:
-        write_tensors(out / "encoder.safetensors", tuner.encoder.state_dict())
+    if tuner.view.encoder is not None:
+        write_tensors(out / "encoder.safetensors", tuner.view.encoder.state_dict())
     return read_json(out / CARD)

@@ -10,7 +10,8 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneTokens, network_
 from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.cube import HALF
-from torchrl_nerd.training.finetune import FinetuneConfig, FineTuner
+from torchrl_nerd.training.finetune import FineTuner
+from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.sequences import cover
 from torchrl_nerd.training.simulated_tosses import simulate_tosses
 from torchrl_nerd.transforms import StateDelta, Stats
@@ -18,7 +19,13 @@ from torchrl_nerd.transforms import StateDelta, Stats
 CUBES, TOSSES, STATES = 50, 20, 100  # simulated cubes, tosses of each, states of a toss
 CHECKED = 50  # simulated tosses that validate
 PRETRAINING = FinetuneConfig(
-    epochs=0.4, length=12, short_share=0.0, physics_lr=0.0, validate_every=30
+    update="all",
+    epochs=0.4,
+    length=12,
+    short_share=0.0,
+    physics_lr=0.0,
+    validate_every=30,
+    use_symmetry=True,
 )
 
 
