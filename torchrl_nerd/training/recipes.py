@@ -47,6 +47,7 @@ def _mlp(
     steps: int,
     rollout_steps: int,
     softening: float,
+    validate_every: int = 2_000,
 ) -> Recipe:
     """An MLP on single states: without a history, sequences tell it less."""
     train = TrainConfig(
@@ -55,6 +56,7 @@ def _mlp(
         rollout_steps=rollout_steps,
         single_share=1.0,
         softening=softening,
+        validate_every=validate_every,
     )
     return Recipe(DataConfig(trajectories=trajectories, steps=100), train, task)
 
@@ -85,7 +87,13 @@ RECIPES: dict[str, Recipe] = {
     "anymal": _mlp("anymal/forward", 10_000, "mlp-large", 10_000, 500, softening=0.02),
     "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),
     "franka_gravity": _mlp(
-        "franka_gravity/reach_torque", 10_000, "mlp-wide", 12_000, 1_000, softening=0.01
+        "franka_gravity/reach_torque",
+        10_000,
+        "mlp-wide",
+        12_000,
+        1_000,
+        softening=0.01,
+        validate_every=3_000,
     ),
     "cube": Recipe(  # the last: errors over a toss do not show how well it rests
         DataConfig(trajectories=15_000, steps=100),
