@@ -21,7 +21,7 @@ from torchrl_nerd.data.generate import (
     draw_chunk,
     generate,
     load_data,
-    simulate,
+    plain_strategy,
 )
 from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.data.recorded import load_tosses, write_tosses
@@ -75,7 +75,7 @@ class Data(Command):
             tosses, _ = load_tosses(self.recorded, real_scene(self.scene))
             return [f"take over {len(tosses)} recorded tosses"]
         scene, out = scene_of(self.scene, self.fine), self.folder
-        _, draw = recipe_of(self.scene).draw(scene) or (None, partial(simulate, scene))
+        _, draw = recipe_of(self.scene).draw(scene) or plain_strategy(scene)
         one = draw_chunk(draw, self.config, (0, 1)).bytes()
         wanted, there = self.config.trajectories, 0
         if (out / CARD).exists():

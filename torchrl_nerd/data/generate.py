@@ -119,6 +119,11 @@ def is_sound(data: TensorDictBase) -> torch.Tensor:
     return (state.abs() < LARGEST).all(-1).all(-1)
 
 
+def plain_strategy(scene: Scene) -> tuple[None, Draw]:
+    """Trajectories from the scene's own ranges, which cards have no name for."""
+    return None, partial(simulate, scene)
+
+
 def draw_chunk(draw: Draw, config: DataConfig, chunk: Chunk) -> TensorDict:
     """One chunk's trajectories; seed and number decide them, not who draws them."""
     number, rows = chunk
@@ -148,7 +153,7 @@ def generate(
     Raises:
         ValueError: the folder cannot be written or holds data of another card.
     """
-    name, draw = strategy or (None, partial(simulate, scene))
+    name, draw = strategy or plain_strategy(scene)
     card = _open_card(scene, config, writable_folder(folder), name)
     store = _open_store(draw, config, folder, card["chunks_done"])
     chunks = [

@@ -8,6 +8,7 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -25,7 +26,7 @@ from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.low_rank import add_low_rank, merge_low_rank
 from torchrl_nerd.training.physics_fit import fit_physics
 from torchrl_nerd.training.pose_loss import pose_loss, rollout
-from torchrl_nerd.training.symmetry import find_isometries
+from torchrl_nerd.training.symmetry import Isometry, find_isometries
 from torchrl_nerd.training.toss_view import TossView
 
 VALIDATION_STRIDE = 5  # of the validation tosses' sub-trajectories, which overlap
@@ -77,9 +78,6 @@ class FineTuner:
                 "expected a model with a simulator for update 'physics', got another: "
                 "give update 'all', 'head' or 'low-rank'"
             )
-        self.isometries = find_isometries(model.scene)[
-            : None if config.use_symmetry else 1
-        ]
         network = cast(nn.Module, self.model.network)
         if config.update == "low-rank":
             add_low_rank(network, config.rank)
@@ -100,6 +98,12 @@ class FineTuner:
         self.optimizer = torch.optim.Adam(groups)
         self.peaks = [group["lr"] for group in groups]
         self.curve: list[dict[str, float]] = []
+
+    @cached_property
+    def isometries(self) -> tuple[Isometry, ...]:
+        """What windows are shown as: a search that the fit of physics does without."""
+        found = find_isometries(self.model.scene)
+        return found if self.config.use_symmetry else found[:1]
 
     @property
     def updates_per_epoch(self) -> int:
