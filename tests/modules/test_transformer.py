@@ -8,6 +8,7 @@ from torch import Generator, Tensor, nn
 from torchrl_nerd.modules.transformer import (
     PRESETS,
     CausalTransformer,
+    FullLinear,
     TransformerConfig,
 )
 
@@ -196,3 +197,14 @@ def test_every_preset_gives_one_finite_output_per_token(name, generator):
 def test_sizes_that_make_no_transformer_are_refused(sizes, named):
     with pytest.raises(ValueError, match=f"expected.*{named}.*got"):
         CausalTransformer(TransformerConfig(**sizes), INPUTS, OUTPUTS)
+
+
+def test_autocast_leaves_the_ends_of_a_network_alone(generator):
+    tokens = randn(generator, 6, INPUTS, dtype=torch.float32)
+    for layer in (FullLinear(INPUTS, OUTPUTS), FullLinear(INPUTS, OUTPUTS, bias=False)):
+        with torch.autocast("cpu", torch.bfloat16):
+            found = layer(tokens)
+            assert nn.Linear(INPUTS, OUTPUTS)(tokens).dtype == torch.bfloat16
+        assert torch.equal(
+            found, nn.functional.linear(tokens, layer.weight, layer.bias)
+        )

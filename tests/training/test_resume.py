@@ -27,6 +27,7 @@ CONFIG = TrainConfig(
     rollout_rows=8,
     rollout_length=4,
     warmup=3,
+    bf16_share=0.5,
     save_every=4,
     validate_every=3,
 )

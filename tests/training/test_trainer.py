@@ -68,6 +68,26 @@ def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
     assert set(card["validation_error"]) == {"2", "5"}
 
 
+@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+def test_bfloat16_learns_as_much_and_leaves_weights_and_outputs_alone(
+    network, tmp_path, seed
+):
+    losses = []
+    for share in (0.0, 1.0):
+        config = replace(BRIEF, network=network, bf16_share=share, seed=seed)
+        trainer = make_trainer(SCENE, config, tmp_path / str(share))
+        before = loss_of(trainer, seed)
+        for _ in range(BRIEF.steps):
+            trainer.update()
+            trainer.step += 1
+        losses.append(loss_of(trainer, seed))
+        weights = trainer.model.network.parameters()
+        assert {weight.dtype for weight in weights} == {torch.float32}
+        assert losses[-1] < 0.9 * before
+    assert losses[0] != losses[1]  # it was used
+    assert abs(losses[1] / losses[0] - 1.0) < 0.1
+
+
 def test_the_log_has_every_validation_once(tmp_path):
     make_trainer(SCENE, BRIEF, tmp_path).run()
     rows = TrainingLog(tmp_path, BRIEF.total_steps).rows

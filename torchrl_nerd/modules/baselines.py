@@ -5,7 +5,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.modules.transformer import FeedForward, initialize, make_head
+from torchrl_nerd.modules.transformer import (
+    FeedForward,
+    FullLinear,
+    initialize,
+    make_head,
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ class MLP(nn.Module):
     def __init__(self, config: MLPConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
         self.config = config
-        self.embed = nn.Linear(num_inputs, config.width)
+        self.embed = FullLinear(num_inputs, config.width)
         self.blocks = nn.ModuleList(
             FeedForward(config.width) for _ in range(config.depth)
         )
@@ -85,9 +90,9 @@ class GRU(nn.Module):
     def __init__(self, config: GRUConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
         self.config = config
-        self.embed = nn.Linear(num_inputs, config.width)
+        self.embed = FullLinear(num_inputs, config.width)
         self.gru = nn.GRU(config.width, config.width, config.layers, batch_first=True)
-        self.head = nn.Linear(config.width, num_outputs)
+        self.head = FullLinear(config.width, num_outputs)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""

@@ -30,6 +30,7 @@ NETWORKS: dict[str, NetworkConfig] = {
     "mlp": MLPConfig(),
     "mlp-wide": MLPConfig(depth=4, width=120),
     "mlp-large": MLPConfig(depth=4, width=128),
+    "mlp-larger": MLPConfig(depth=4, width=160),
     "gru": GRUConfig(),
 }
 """Networks by name, for the command line."""

@@ -161,10 +161,23 @@ class Block(FeedForward):
         return super().forward(x + self.attention.step(x, cache, layer))
 
 
+class FullLinear(nn.Linear):
+    """A linear layer that autocast leaves in the weights' own precision.
+
+    For the ends of a network: a gap or a change of speed that is rounded to the 8 bits of
+    bfloat16 is off by up to 0.4%, while roundings inside the network average out.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(*batch, in) -> (*batch, out)``."""
+        with torch.autocast(input.device.type, enabled=False):
+            return super().forward(input.to(self.weight.dtype))
+
+
 def make_head(width: int, num_outputs: int) -> nn.Sequential:
     """From a block's width to predictions; SiLU for the paper's ReLU: half the error."""
     return nn.Sequential(
-        nn.Linear(width, HEAD_WIDTH), nn.SiLU(), nn.Linear(HEAD_WIDTH, num_outputs)
+        FullLinear(width, HEAD_WIDTH), nn.SiLU(), FullLinear(HEAD_WIDTH, num_outputs)
     )
 
 
@@ -198,7 +211,7 @@ class CausalTransformer(nn.Module):
                 f"expected heads to divide width {config.width}, got {config.heads}"
             )
         self.config = config
-        self.embed = nn.Linear(num_inputs, config.width)
+        self.embed = FullLinear(num_inputs, config.width)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.head = make_head(config.width, num_outputs)
         initialize(self.blocks)

@@ -60,6 +60,8 @@ class TrainConfig:
     | ``rollout_lr`` | share of the peak at which the rollout updates begin |
     | ``rollout_rounds`` | how often, in equal parts of them, they begin there anew |
     | ``warmup`` | updates over which the step size rises from zero |
+    | ``bf16_share`` | share of the one-step updates, the first ones, whose matrices are
+      multiplied in bfloat16: faster on processors that have it; all updates on CUDA |
     | ``softening`` | of the relative loss; see `losses.relative_error` |
     | ``clip`` | largest norm of the gradient |
     | ``ema`` | decay of the averaged weights, which are the ones saved |
@@ -82,6 +84,7 @@ class TrainConfig:
     rollout_lr: float = 0.1
     rollout_rounds: int = 1
     warmup: int = 200
+    bf16_share: float = 0.0
     softening: float = 0.01
     clip: float = 1.0
     ema: float = 0.995
@@ -116,7 +119,7 @@ class Trainer:
         source: a task or the scene; its resets or ranges start the validation rollouts.
         config: how.
         folder: where.
-        device: of model and data; bf16 autocast on CUDA, float32 on the CPU.
+        device: of model and data; CUDA multiplies matrices in bfloat16.
         horizons: control steps of the validation rollouts.
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
@@ -243,8 +246,9 @@ class Trainer:
         ranks.average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, config.clip)
         if norm.isfinite():
-            for optimizer in self.optimizers.values():
-                optimizer.step()
+            with self._autocast():  # Muon multiplies matrices, too
+                for optimizer in self.optimizers.values():
+                    optimizer.step()
         decay = min(config.ema, self.step / (self.step + 10.0))
         with torch.no_grad():
             for name, weight in self.model.network.named_parameters():
@@ -274,8 +278,9 @@ class Trainer:
         return config.rollout_lr * (1.0 - done % 1.0)
 
     def _autocast(self) -> AbstractContextManager:
-        if self.device.type == "cuda":
-            return torch.autocast("cuda", torch.bfloat16)
+        is_coarse = self.step < self.config.bf16_share * self.config.steps
+        if is_coarse or self.device.type == "cuda":
+            return torch.autocast(self.device.type, torch.bfloat16)
         return nullcontext()
 
     def averaged_model(self) -> NeRD:
