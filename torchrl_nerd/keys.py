@@ -63,6 +63,11 @@ CONTACT_DEPTH = "contact_depth"
 step if ``qvel`` stayed as it is ``(*batch, num_points * K)``, m, at least zero, and zero
 beyond the margin."""
 
+CONTACT_FORCE = "contact_force"
+"""What the ground's springs and dampers would push every dof with over the control step if
+``qvel`` stayed as it is, in B_t ``(*batch, nv)``, N and N m. Only where the scene says that
+its springs are to be foreseen."""
+
 CONTACT_NORMAL = "contact_normal"
 """Ground normal at each point in B_t ``(*batch, num_points * 3)``, zero beyond the
 margin. Only where it does not follow from gravity."""

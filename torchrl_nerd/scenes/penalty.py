@@ -10,6 +10,8 @@ multiplies it, so ``impratio = kf / kd``.
 Source: https://mujoco.readthedocs.io/en/stable/computation/#constraint-model
 """
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 
@@ -56,3 +58,56 @@ def set_penalty_limit(
     inverse_mass = model.dof_invweight0[model.jnt_dofadr[index]]
     model.jnt_solref[index] = (-ke * inverse_mass, -kd * inverse_mass)
     model.jnt_solimp[index] = SOLIMP
+
+
+@dataclass(frozen=True)
+class PenaltyLaw:
+    """What springs and dampers push with, read from a compiled model.
+
+    | field | meaning |
+    |---|---|
+    | ``stiffness``, ``damping`` | N/m and N s/m, or N m/rad and N m s/rad, of each |
+    | ``slip`` | tangential damping below the friction limit, N s/m (contacts) |
+    | ``friction`` | Coulomb coefficient (contacts) |
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    slip: np.ndarray
+    friction: np.ndarray
+
+    @classmethod
+    def of_bodies(cls, model: mujoco.MjModel, bodies: list[int]) -> "PenaltyLaw":
+        """The law of the contacts of each body, the inverse of `set_penalty_contact`.
+
+        Raises:
+            ValueError: a body whose shapes follow another law.
+        """
+        geoms = [int(np.flatnonzero(model.geom_bodyid == body)[0]) for body in bodies]
+        weight = model.body_invweight0[bodies, 0]
+        stiffness, damping = _springs(model.geom_solref[geoms], weight, "contacts")
+        slip = damping * model.opt.impratio
+        return cls(stiffness, damping, slip, model.geom_friction[geoms, 0])
+
+    @classmethod
+    def of_joints(cls, model: mujoco.MjModel, joints: list[int]) -> "PenaltyLaw":
+        """The law of the joints' limits, the inverse of `set_penalty_limit`.
+
+        Raises:
+            ValueError: a joint whose limit follows another law.
+        """
+        weight = model.dof_invweight0[model.jnt_dofadr[joints]]
+        stiffness, damping = _springs(model.jnt_solref[joints], weight, "limits")
+        return cls(stiffness, damping, 0.0 * damping, 0.0 * damping)
+
+
+def _springs(
+    solref: np.ndarray, weight: np.ndarray, what: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness and damping of MuJoCo's direct format."""
+    if not (solref < 0.0).all():
+        raise ValueError(
+            f"expected {what} that are springs and dampers (solref below 0), got "
+            f"{solref.min(0).tolist()}"
+        )
+    return tuple((-solref / weight[:, None]).T)

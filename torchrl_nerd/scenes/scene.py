@@ -60,6 +60,8 @@ class Scene:
     | ``controller`` | turns actions into joint torques |
     | ``sampling`` | ranges of training states and torques |
     | ``refinement`` | substeps in one of the robot's own, see `fine`; else 1 |
+    | ``foresees_forces`` | whether the forces of its springs, at limits and contacts (see
+      `scenes.penalty`), are among the features: where they decide most steps |
 
     Raises:
         ValueError: the model has something no NeRD can be built for (named).
@@ -71,6 +73,7 @@ class Scene:
     controller: Controller
     sampling: Sampling
     refinement: int = 1
+    foresees_forces: bool = False
 
     def __post_init__(self) -> None:
         if self.substeps < 1:

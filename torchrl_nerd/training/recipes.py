@@ -1,7 +1,7 @@
 """How a model of each scene is made: ``nerd train SCENE`` with its defaults."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from torchrl_nerd.data.generate import DataConfig, Draw
 from torchrl_nerd.data.strategies import strategies
@@ -47,7 +47,7 @@ def _mlp(
     steps: int,
     rollout_steps: int,
     softening: float,
-    validate_every: int = 2_000,
+    **others: Any,
 ) -> Recipe:
     """An MLP on single states: without a history, sequences tell it less."""
     train = TrainConfig(
@@ -56,7 +56,7 @@ def _mlp(
         rollout_steps=rollout_steps,
         single_share=1.0,
         softening=softening,
-        validate_every=validate_every,
+        **others,
     )
     return Recipe(DataConfig(trajectories=trajectories, steps=100), train, task)
 
@@ -68,21 +68,27 @@ RECIPES: dict[str, Recipe] = {
         "cartpole/swingup",
     ),
     "double_pendulum": _mlp(
-        "double_pendulum/passive", 40_000, "mlp-wide", 36_000, 4_000, softening=1.0
+        "double_pendulum/passive",
+        100_000,
+        "mlp-wide",
+        90_000,
+        4_000,
+        softening=1.0,
+        rollout_lr=0.03,
+        bf16_share=0.9,
+        validate_every=6_000,
     ),
-    "ant": Recipe(
-        DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(
-            network="mlp-large",
-            steps=30_000,
-            rollout_steps=9_000,
-            rollout_rounds=3,
-            single_share=1.0,
-            use_symmetry=True,
-            softening=0.02,
-            validate_every=1_000,
-        ),
+    "ant": _mlp(
         "ant/run",
+        50_000,
+        "mlp-larger",
+        46_000,
+        6_000,
+        softening=0.02,
+        use_symmetry=True,
+        rollout_rounds=2,
+        bf16_share=0.85,
+        validate_every=5_000,
     ),
     "anymal": _mlp("anymal/forward", 10_000, "mlp-large", 10_000, 500, softening=0.02),
     "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),

@@ -8,7 +8,8 @@ too. Of several surfaces each point sees the nearest, so that a model fits any n
 
 Added is what decides an impact: the point's velocity, and how deep it will be if it goes
 on: whether a point touches within the step is a threshold, which a network learns slowly
-from distance and speed. All of it fades to zero at the margin without a jump.
+from distance and speed. All of it fades to zero at the margin without a jump. Where a scene
+asks for it, the forces that its springs would push with on that way are worked out, too.
 """
 
 import numpy as np
@@ -22,6 +23,7 @@ from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
+    CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
     QPOS,
@@ -31,6 +33,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
+from torchrl_nerd.transforms.ground_force import GroundForce
 
 MAX_GLANCES = 5  # times within a step at which the coming penetration is foreseen
 FADE = 0.25  # share of the way from margin to touching over which velocities fade in
@@ -46,6 +49,8 @@ class ContactFeatures(FeatureTransform):
     | ``contact_distance`` | min(d - xi, 0), m | P |
     | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
     | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed, m | K P |
+    | ``contact_force`` | what springs push each dof with on that way, mean, N and N m; in
+      scenes that foresee forces, see `GroundForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
     The K = min(substeps, 5) times are spread evenly from the step's start on: with few
@@ -79,6 +84,8 @@ class ContactFeatures(FeatureTransform):
             sizes[CONTACT_DEPTH] = glances * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
+            if scene.foresees_forces:
+                sizes[CONTACT_FORCE] = scene.layout.nv
             plane = terrain.fixed_plane
             is_level = (
                 plane is not None and abs(float(plane[:3] @ scene.down)) > 1.0 - 1e-12
@@ -91,9 +98,13 @@ class ContactFeatures(FeatureTransform):
         if terrain is None:
             return
         points = scene.contacts
-        self.kinematics = PointKinematics(
-            scene.model, scene.base, points.bodies, points.positions
-        )
+        bodies, positions = points.bodies, points.positions
+        self.force = GroundForce(scene) if scene.foresees_forces else None
+        if self.force is not None:  # the places of its joints are found along the way
+            bodies = bodies + self.force.bodies
+            positions = np.concatenate((positions, self.force.positions))
+        self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
+        self.count = count
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         constants = {"radii": points.radii, "margins": points.margins}
         constants |= {"glances": np.arange(glances) / glances}
@@ -117,6 +128,8 @@ class ContactFeatures(FeatureTransform):
         later = integrate_pos(self.layout, qpos, self.step_size * qvel)
         both = torch.stack((qpos, later))
         points, velocity = self.kinematics(both, qvel)
+        places, points = points[0, ..., self.count :, :], points[..., : self.count, :]
+        velocity = velocity[..., : self.count, :]
         mount = self.mount_pos, self.mount_rot
         position, rotation = base_pose(self.base, both, *mount)
         if terrain is not None:
@@ -137,6 +150,9 @@ class ContactFeatures(FeatureTransform):
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
         features.append((gate * depth).flatten(-2))
+        if self.force is not None:
+            contact = points[0], normal, gate * depth, speed, sliding
+            features.append(self.force(*contact, places))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features

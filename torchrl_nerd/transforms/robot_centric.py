@@ -14,11 +14,13 @@ from torch import Tensor
 from torchrl_nerd.geometry.frames import rotate_inverse
 from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, matrix_from_quat
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
+from torchrl_nerd.scenes.penalty import PenaltyLaw
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
 LIMIT_STEPS = 1.5  # a limit is seen this many control steps ahead, at top speed
 FADE = 0.25  # share of the margin over which a gated velocity fades in
+GLANCES = 5  # parts of a step at whose ends a limit's torque is foreseen
 
 
 class RobotCentric(FeatureTransform):
@@ -32,6 +34,8 @@ class RobotCentric(FeatureTransform):
     | | ball: first two columns of its rotation matrix | 6 |
     | | limited joint: gaps to both limits, minus the margin, at most 0 | 2 |
     | | velocity of every dof; one that the free dynamics ignore only near a limit | 1 |
+    | | limited joint of a scene that foresees forces: mean torque of the limit's spring
+      and damper over the step, if ``qvel`` stayed | 1 |
     | ``robot_torque`` | ``("next", "joint_torque")``, where there is one | actuated dofs |
 
     Args:
@@ -91,10 +95,13 @@ class _JointFeatures:
     limited: list[int]  # qpos of limited joints
     limits: list[tuple[float, float, float]]  # low, high, margin of each
     gated: list[tuple[int, int]]  # (index into limited, dof): velocity near a limit
+    pressed: list[int]  # dofs of the limited joints whose torque is foreseen
+    springs: list[tuple[float, float]]  # stiffness, damping of each
+    step_size: float
 
     @classmethod
     def from_scene(cls, scene: Scene) -> "_JointFeatures":
-        found = cls([], [], [], [], [], [], [])
+        found = cls([], [], [], [], [], [], [], [], [], scene.control_step)
         model, ignored = scene.model, scene.symmetries
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
@@ -122,6 +129,10 @@ class _JointFeatures:
                 # from the end: the ranges may leave out a floating base, which is first
                 fastest = float(speed[v - model.nv])
                 margin = LIMIT_STEPS * scene.control_step * fastest
+                if scene.foresees_forces:
+                    law = PenaltyLaw.of_joints(model, [joint])
+                    found.pressed.append(v)
+                    found.springs.append((law.stiffness.item(), law.damping.item()))
                 found.limited.append(q)
                 found.limits.append((low, high, margin))
         return found
@@ -129,7 +140,7 @@ class _JointFeatures:
     @property
     def size(self) -> int:
         configuration = 2 * len(self.angles) + len(self.positions) + 6 * len(self.balls)
-        limits = 2 * len(self.limited) + len(self.gated)
+        limits = 2 * len(self.limited) + len(self.gated) + len(self.pressed)
         return configuration + len(self.velocities) + limits
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
@@ -149,4 +160,19 @@ class _JointFeatures:
                 rows, dofs = map(list, zip(*self.gated, strict=True))
                 depth = -torch.minimum(below, above) / (FADE * margin)
                 parts.append(qvel[..., dofs] * depth[..., rows].clamp(0.0, 1.0))
+        if self.pressed:
+            parts.append(self._limit_torque(qpos[..., self.limited], qvel))
         return parts
+
+    def _limit_torque(self, position: Tensor, qvel: Tensor) -> Tensor:
+        """Mean torque of the limits' springs and dampers over the step, N m."""
+        low, high, _ = position.new_tensor(self.limits).unbind(-1)
+        stiffness, damping = position.new_tensor(self.springs).unbind(-1)
+        speed = qvel[..., self.pressed]
+        total = torch.zeros_like(position)
+        for glance in range(GLANCES + 1):
+            there = position + glance / GLANCES * self.step_size * speed
+            beyond = (there - high).clamp_min(0.0) - (low - there).clamp_min(0.0)
+            drag = torch.where(beyond == 0.0, 0.0, damping * speed)
+            total = total - stiffness * beyond - drag
+        return total / (GLANCES + 1)

@@ -50,6 +50,8 @@ MOVED = {
     kinds.NORMAL: "robot turned against the ground about its lowest point",
     kinds.VELOCITY: "velocities: what contact does to them",
     kinds.DEPTH: "contact switched off",
+    kinds.PRESSED: "limits switched off, beyond them",
+    kinds.FORCE: "contact switched off",
 }
 
 
@@ -118,6 +120,8 @@ class _Questions:
             kinds.NORMAL: lambda: self.against_ground(0.0, TURN),
             kinds.VELOCITY: self.impact,
             kinds.DEPTH: self.untouched,
+            kinds.PRESSED: self.unlimited,
+            kinds.FORCE: self.untouched,
         }
 
     def moved(

@@ -16,6 +16,7 @@ from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
+    CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
     JOINT_TORQUE,
@@ -33,6 +34,7 @@ BALL, SPEED = "ball orientation", "joint velocity"
 GAPS, GATED = "gaps to limits", "velocity near limits"
 TORQUE, DISTANCE, NORMAL = "joint torque", "contact distance", "contact normal"
 VELOCITY, DEPTH = "contact velocity", "contact depth"
+PRESSED, FORCE = "torque of limits", "force of contacts"
 
 WHY = {
     LINEAR: "floating base: what drag and friction act on",
@@ -49,12 +51,14 @@ WHY = {
     NORMAL: "ground varies, or tilts under a floating base",
     VELOCITY: "along and across the normal: decides an impact",
     DEPTH: "penetration in the coming step, a threshold",
+    PRESSED: "spring of a limited joint, in the coming step",
+    FORCE: "springs of all points on each dof, in the coming step",
 }
 
 # Kinds in the order in which they are asked what they add: helpers come last.
 ORDER = (
     *(LINEAR, ANGULAR, GRAVITY, ANGLE, POSITION, BALL, SPEED, TORQUE),
-    *(DISTANCE, NORMAL, GAPS, GATED, VELOCITY, DEPTH),
+    *(DISTANCE, NORMAL, GAPS, GATED, VELOCITY, DEPTH, PRESSED, FORCE),
 )
 RANK_TOLERANCE = 1e-7  # of the largest singular value of a matrix of unit rows
 
@@ -92,10 +96,12 @@ def token_slices(tokens: SceneTokens) -> dict[str, slice]:
         **{ANGLE: 2 * len(joints.angles), POSITION: len(joints.positions)},
         **{BALL: 6 * len(joints.balls), SPEED: len(joints.velocities)},
         **{GAPS: 2 * len(joints.limited), GATED: len(joints.gated)},
+        PRESSED: len(joints.pressed),
         TORQUE: tokens.robot.sizes.get(ROBOT_TORQUE, 0),
         DISTANCE: contact.get(CONTACT_DISTANCE, 0),
         VELOCITY: contact.get(CONTACT_VELOCITY, 0),
         DEPTH: contact.get(CONTACT_DEPTH, 0),
+        FORCE: contact.get(CONTACT_FORCE, 0),
         NORMAL: contact.get(CONTACT_NORMAL, 0),
     }
     slices, start = {}, 0

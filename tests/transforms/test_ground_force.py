@@ -1,0 +1,112 @@
+"""Forces foreseen for springs: MuJoCo's own where nothing moves, or hardly."""
+
+import copy
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from helpers import HANDMADE, make_scene, random_transitions
+
+from torchrl_nerd.geometry.frames import rotate_inverse
+from torchrl_nerd.keys import CONTACT_FORCE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.transforms import ContactFeatures, RobotCentric
+
+ROWS = 60
+SPRINGY = [load_scene(name) for name in SCENES]
+SPRINGY = [scene for scene in SPRINGY if scene.terrain is not None]
+springy_scene = pytest.mark.parametrize(
+    "scene", [replace(s, foresees_forces=True) for s in SPRINGY], ids=lambda s: s.name
+)
+
+
+def in_ground(scene, generator):
+    """Random rows, the lowest point up to 5 cm deep where the robot can be moved."""
+    rows = random_transitions(scene, ROWS, generator)
+    depth = 0.05 * torch.rand(ROWS, dtype=torch.float64, generator=generator)
+    if scene.base.is_floating:
+        state = {QPOS: rows[QPOS], QVEL: rows[QVEL]}
+        scene.set_down(state, -depth)
+        rows[QPOS] = state[QPOS]
+    elif scene.terrain.is_per_row:
+        gap = scene.clearances(rows[QPOS], rows[TERRAIN]).amin(-1)
+        rows[TERRAIN][:, 3] += gap + depth
+    return rows
+
+
+def foreseen(scene, rows):
+    """Forces of contacts and of limits on every dof, ``(rows, nv)``, in B_t."""
+    contact, robot = ContactFeatures(scene), RobotCentric(scene)
+    values = contact.contact_features(rows[QPOS], rows[QVEL], rows.get(TERRAIN, None))
+    force = dict(zip(contact.out_keys, values, strict=True))[CONTACT_FORCE].clone()
+    pressed = robot.joints.pressed
+    if pressed:
+        state = robot.state_features(rows[QPOS], rows[QVEL])
+        force[:, pressed] += state[:, -len(pressed) :]
+    return force
+
+
+def mujoco_force(scene, rows):
+    """What MuJoCo's constraints push every dof with, the base's part in B_t.
+
+    Without gravity: a soft constraint gives a thousandth of it back.
+    """
+    model, forces = copy.copy(scene.model), []
+    model.opt.gravity[:] = 0.0
+    data = mujoco.MjData(model)
+    for row in rows:
+        mujoco.mj_resetData(model, data)
+        data.qpos, data.qvel = row[QPOS].numpy(), row[QVEL].numpy()
+        if scene.terrain.is_per_row:
+            pose = scene.terrain.mocap_pose(row[TERRAIN]).reshape(-1, 7).numpy()
+            data.mocap_pos, data.mocap_quat = pose[:, :3], pose[:, 3:]
+        mujoco.mj_forward(model, data)
+        forces.append(data.qfrc_constraint.copy())
+    force = torch.from_numpy(np.array(forces))
+    if scene.base.is_floating:
+        linear = rotate_inverse(rows[QPOS][:, 3:7], force[:, :3])
+        force = torch.cat((linear, force[:, 3:]), -1)
+    return force
+
+
+def expect_near(scene, got, want):
+    """Within what MuJoCo's small impedance leaves of the law.
+
+    A percent of the force; more where a point gives way much more easily than it does in
+    the model's reference pose, as the pendulum's tip.
+    """
+    scale = torch.linalg.vector_norm(want, dim=-1, keepdim=True) + 30.0  # N
+    off = ((got - want).abs() / scale).amax(-1)
+    allowed = 0.02 if load_scene(scene.name).foresees_forces else 0.1
+    assert off.median() < allowed and off.quantile(0.9) < 5.0 * allowed
+    assert (want.abs().amax(-1) > 10.0).any(), "nothing touched"
+
+
+@springy_scene
+def test_at_rest_they_are_what_mujoco_pushes_with(scene, generator):
+    rows = in_ground(scene, generator)
+    rows[QVEL].zero_()
+    expect_near(scene, foreseen(scene, rows), mujoco_force(scene, rows))
+
+
+@springy_scene
+def test_a_moment_of_motion_is_damped_and_held_back_as_by_mujoco(scene, generator):
+    """In a control step so short that the way along it is nothing."""
+    rows = in_ground(scene, generator)
+    rows[QVEL] *= 1e-3  # slow enough for friction to hold
+    model = copy.copy(scene.model)
+    model.opt.timestep = 1e-9
+    short = replace(scene, model=model, substeps=5)
+    expect_near(scene, foreseen(short, rows), mujoco_force(scene, rows))
+
+
+def test_what_is_not_foreseen_is_refused():
+    several = HANDMADE["floater"]
+    with pytest.raises(ValueError, match="one to a body, under foreseen forces, got"):
+        ContactFeatures(replace(several, foresees_forces=True))
+    hard = make_scene("""<mujoco><worldbody><geom type="plane" size="0 0 1"/>
+      <body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>""")
+    with pytest.raises(ValueError, match="springs and dampers"):
+        ContactFeatures(replace(hard, foresees_forces=True))
