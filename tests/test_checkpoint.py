@@ -152,5 +152,7 @@ def test_recipes_are_those_of_the_shipped_models(name):
     recipe = RECIPES[name]
     assert made["trajectories"] == recipe.data.trajectories
     settings = asdict(recipe.train)
-    younger = asdict(TrainConfig())  # than the model, and what it had before there was one
+    younger = asdict(
+        TrainConfig()
+    )  # than the model, and what it had before there was one
     assert {key: made.get(key, younger[key]) for key in settings} == settings
