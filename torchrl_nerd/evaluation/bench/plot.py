@@ -1,5 +1,6 @@
 """The race as a picture: error to the right, speed upwards, best at the upper left."""
 
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,7 @@ def plot_race(report: BenchReport, path: Path, batch: int | None = None) -> None
         points = {
             name: (errors[quantity].mean, report.rates[batch][name].steps_per_s)
             for name, errors in report.errors.items()
+            if isfinite(errors[quantity].mean)  # a coarse step may blow up
         }
         for name, point in points.items():
             color = COLORS[0] if name.startswith("MuJoCo") else COLORS[1]
