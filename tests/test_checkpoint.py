@@ -152,7 +152,6 @@ def test_recipes_are_those_of_the_shipped_models(name):
     recipe = RECIPES[name]
     assert made["trajectories"] == recipe.data.trajectories
     settings = asdict(recipe.train)
-    younger = asdict(
-        TrainConfig()
-    )  # than the model, and what it had before there was one
+    # what is younger than the model has its default, which is how things were before
+    younger = asdict(TrainConfig())
     assert {key: made.get(key, younger[key]) for key in settings} == settings

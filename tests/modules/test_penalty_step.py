@@ -155,5 +155,5 @@ def test_other_robots_and_contacts_are_refused(real_cube):
         PenaltyStep(load_scene("cartpole"))
     model = real_cube.model.__copy__()
     model.geom_solref[:] = (0.02, 1.0)
-    with pytest.raises(ValueError, match="penalty contacts"):
+    with pytest.raises(ValueError, match="contacts that are springs and dampers"):
         PenaltyStep(replace(real_cube, model=model))

@@ -10,11 +10,11 @@ Every operation is differentiable, and so are the physical parameters: a rollout
 fits them to recordings.
 """
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.frames import quat_normalize
+from torchrl_nerd.scenes.penalty import PenaltyLaw
 from torchrl_nerd.scenes.scene import Scene
 
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
@@ -98,21 +98,15 @@ class PenaltyStep(nn.Module):
                 f"expected a single free body on a ground, got scene '{name}'"
             )
         body = int(model.jnt_bodyid[0])
-        geom = int(np.flatnonzero(model.geom_bodyid == body)[0])
-        solref, weight = model.geom_solref[geom], model.body_invweight0[body, 0]
-        if solref[0] >= 0.0:
-            raise ValueError(
-                f"expected penalty contacts, got scene '{name}' with others"
-            )
-        stiffness, damping = -solref / weight
+        law = PenaltyLaw.of_bodies(model, [body])
         values = {
             "gravity": -model.opt.gravity[2],
             "size": 1.0,
             "inertia": 1.0,
-            "friction": model.geom_friction[geom, 0],
-            "stiffness": stiffness,
-            "damping": damping,
-            "slip": damping * model.opt.impratio,
+            "friction": law.friction.item(),
+            "stiffness": law.stiffness.item(),
+            "damping": law.damping.item(),
+            "slip": law.slip.item(),
         }
         self.substeps, self.step_size = substeps, scene.control_step / substeps
         self.mass = float(model.body_mass[body])

@@ -170,7 +170,10 @@ class FullLinear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """``(*batch, in) -> (*batch, out)``."""
-        with torch.autocast(input.device.type, enabled=False):
+        device = input.device.type
+        if not torch.is_autocast_enabled(device):
+            return super().forward(input)
+        with torch.autocast(device, enabled=False):
             return super().forward(input.to(self.weight.dtype))
 
 

@@ -62,13 +62,13 @@ def set_penalty_limit(
 
 @dataclass(frozen=True)
 class PenaltyLaw:
-    """What springs and dampers push with, read from a compiled model.
+    """What each contact pushes with, read from a compiled model.
 
     | field | meaning |
     |---|---|
-    | ``stiffness``, ``damping`` | N/m and N s/m, or N m/rad and N m s/rad, of each |
-    | ``slip`` | tangential damping below the friction limit, N s/m (contacts) |
-    | ``friction`` | Coulomb coefficient (contacts) |
+    | ``stiffness``, ``damping`` | along the normal, N/m and N s/m |
+    | ``slip`` | tangential damping below the friction limit, N s/m |
+    | ``friction`` | Coulomb coefficient |
     """
 
     stiffness: np.ndarray
@@ -89,16 +89,19 @@ class PenaltyLaw:
         slip = damping * model.opt.impratio
         return cls(stiffness, damping, slip, model.geom_friction[geoms, 0])
 
-    @classmethod
-    def of_joints(cls, model: mujoco.MjModel, joints: list[int]) -> "PenaltyLaw":
-        """The law of the joints' limits, the inverse of `set_penalty_limit`.
 
-        Raises:
-            ValueError: a joint whose limit follows another law.
-        """
-        weight = model.dof_invweight0[model.jnt_dofadr[joints]]
-        stiffness, damping = _springs(model.jnt_solref[joints], weight, "limits")
-        return cls(stiffness, damping, 0.0 * damping, 0.0 * damping)
+def limit_springs(
+    model: mujoco.MjModel, joints: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness and damping of the joints' limits, the inverse of `set_penalty_limit`.
+
+    In N/m and N s/m or N m/rad and N m s/rad.
+
+    Raises:
+        ValueError: a joint whose limit follows another law.
+    """
+    weight = model.dof_invweight0[model.jnt_dofadr[joints]]
+    return _springs(model.jnt_solref[joints], weight, "limits")
 
 
 def _springs(

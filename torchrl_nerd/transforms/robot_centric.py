@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_nerd.geometry.frames import rotate_inverse
 from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, matrix_from_quat
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
-from torchrl_nerd.scenes.penalty import PenaltyLaw
+from torchrl_nerd.scenes.penalty import limit_springs
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
@@ -130,9 +130,9 @@ class _JointFeatures:
                 fastest = float(speed[v - model.nv])
                 margin = LIMIT_STEPS * scene.control_step * fastest
                 if scene.foresees_forces:
-                    law = PenaltyLaw.of_joints(model, [joint])
+                    stiffness, damping = limit_springs(model, [joint])
                     found.pressed.append(v)
-                    found.springs.append((law.stiffness.item(), law.damping.item()))
+                    found.springs.append((stiffness.item(), damping.item()))
                 found.limited.append(q)
                 found.limits.append((low, high, margin))
         return found
@@ -166,13 +166,13 @@ class _JointFeatures:
 
     def _limit_torque(self, position: Tensor, qvel: Tensor) -> Tensor:
         """Mean torque of the limits' springs and dampers over the step, N m."""
-        low, high, _ = position.new_tensor(self.limits).unbind(-1)
-        stiffness, damping = position.new_tensor(self.springs).unbind(-1)
-        speed = qvel[..., self.pressed]
-        total = torch.zeros_like(position)
-        for glance in range(GLANCES + 1):
-            there = position + glance / GLANCES * self.step_size * speed
-            beyond = (there - high).clamp_min(0.0) - (low - there).clamp_min(0.0)
-            drag = torch.where(beyond == 0.0, 0.0, damping * speed)
-            total = total - stiffness * beyond - drag
-        return total / (GLANCES + 1)
+        low, high, _ = position.new_tensor(self.limits)[..., None].unbind(-2)
+        stiffness, damping = position.new_tensor(self.springs)[..., None].unbind(-2)
+        speed = qvel[..., self.pressed, None]
+        times = torch.linspace(
+            0.0, self.step_size, GLANCES + 1, dtype=qvel.dtype, device=qvel.device
+        )
+        there = position[..., None] + speed * times
+        beyond = (there - high).clamp_min(0.0) - (low - there).clamp_min(0.0)
+        drag = torch.where(beyond == 0.0, 0.0, damping * speed)
+        return -(stiffness * beyond + drag).mean(-1)
