@@ -3,7 +3,7 @@
 import json
 import re
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import mujoco
@@ -54,6 +54,27 @@ def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
         assert not unequal_keys(roll(NeRDDynamics(copy), *drive), expected)
     assert sorted(path.name for path in tmp_path.iterdir()) == [CARD, WEIGHTS]
     assert json.loads((tmp_path / CARD).read_text()) == json.loads(json.dumps(card))
+
+
+FORESEEING = [name for name in SCENES if load_scene(name).foresees_forces]
+
+
+@pytest.mark.parametrize("name", FORESEEING)
+def test_a_model_keeps_the_features_it_learned_on(name, tmp_path, generator):
+    scene = load_scene(name)
+    plain = random_model(replace(scene, foresees_forces=False), generator)
+    card = make_card(plain)
+    del card["foresees_forces"]  # as in the cards of before
+    save_checkpoint(plain, tmp_path / "plain", card)
+    foreseeing = random_model(scene, generator)
+    save_checkpoint(foreseeing, tmp_path / "new", make_card(foreseeing))
+    drive = random_drive(scene, 4, 5, generator)
+    for model, folder in (plain, "plain"), (foreseeing, "new"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loaded = load_checkpoint(tmp_path / folder, scene)
+        expected = roll(NeRDDynamics(model), *drive)
+        assert not unequal_keys(roll(NeRDDynamics(loaded), *drive), expected)
 
 
 def test_saving_again_replaces_the_old_model(folder, generator):

@@ -7,7 +7,7 @@ local scene and warns, in one sentence, of what differs.
 import os
 import platform
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -66,6 +66,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
         "scene_hash": scene.hash,
         "refinement": scene.refinement,
         "control_step": scene.control_step,
+        "foresees_forces": scene.foresees_forces,
         "network": {"kind": kind, **asdict(cast(Any, config))},
         "training_ranges": scene.sampling.ranges(),
         "versions": {
@@ -119,7 +120,7 @@ def read_checkpoint(
             f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint"
         )
     card = read_json(folder / CARD)
-    scene = scene or _scene_of(card, folder)
+    scene = _as_learned(scene or _scene_of(card, folder), card)
     teacher = _teacher(card, scene)
     _compare(card, teacher, folder)
     config, tensors = _network_config(card, folder), read_tensors(folder / WEIGHTS)
@@ -181,6 +182,14 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
         return load_scene(name)
     except ValueError as error:
         raise ValueError(f"the scene of the card in {folder}: {error}") from None
+
+
+def _as_learned(scene: Scene, card: dict[str, Any]) -> Scene:
+    """The scene with the features of the model; before 0.2 none had foreseen forces."""
+    foresees_forces = card.get("foresees_forces") is True
+    if scene.foresees_forces == foresees_forces:
+        return scene
+    return replace(scene, foresees_forces=foresees_forces)
 
 
 def _teacher(card: dict[str, Any], scene: Scene) -> Scene:

@@ -77,6 +77,7 @@ def _scene(
             ground=ground,
             clearance=clearance,
         ),
+        foresees_forces=True,
     )
 
 
