@@ -7,7 +7,7 @@ local scene and warns, in one sentence, of what differs.
 import os
 import platform
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -120,7 +120,8 @@ def read_checkpoint(
             f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint"
         )
     card = read_json(folder / CARD)
-    scene = _as_learned(scene or _scene_of(card, folder), card)
+    foresees_forces = card.get("foresees_forces") is True  # none did before 0.2
+    scene = (scene or _scene_of(card, folder)).foreseeing(foresees_forces)
     teacher = _teacher(card, scene)
     _compare(card, teacher, folder)
     config, tensors = _network_config(card, folder), read_tensors(folder / WEIGHTS)
@@ -182,14 +183,6 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
         return load_scene(name)
     except ValueError as error:
         raise ValueError(f"the scene of the card in {folder}: {error}") from None
-
-
-def _as_learned(scene: Scene, card: dict[str, Any]) -> Scene:
-    """The scene with the features of the model; before 0.2 none had foreseen forces."""
-    foresees_forces = card.get("foresees_forces") is True
-    if scene.foresees_forces == foresees_forces:
-        return scene
-    return replace(scene, foresees_forces=foresees_forces)
 
 
 def _teacher(card: dict[str, Any], scene: Scene) -> Scene:

@@ -29,6 +29,7 @@ TOTAL_MASS = {  # kg
     "franka_gravity": 16.6919 - 0.629769,  # without the fixed base
     "cube": 1.15102,
     "cube_real": 0.37,
+    "cube_slope": 1.15102,
 }
 TIMING = {  # control step (s), substeps
     "ant": (1 / 60, 16),
@@ -37,8 +38,9 @@ TIMING = {  # control step (s), substeps
     "franka_gravity": (1 / 120, 9),
     "cube": (1 / 148, 20),
     "cube_real": (1 / 148, 20),
+    "cube_slope": (1 / 148, 20),
 }
-POINTS_FOUND = {"ant": 25, "anymal": 14, "cube": 8, "cube_real": 8}
+POINTS_FOUND = {"ant": 25, "anymal": 14, "cube": 8, "cube_real": 8, "cube_slope": 8}
 ANT_POSE = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)  # rad
 ANYMAL_POSE = (  # rad, as the published policies run: LF, RF, LH, RH
     *(-0.03, -0.4, 0.8),
@@ -51,6 +53,7 @@ STANDING = {  # height (m), pose
     "anymal": (0.6230, ANYMAL_POSE),
     "cube": (0.0524, ()),
     "cube_real": (0.0524, ()),
+    "cube_slope": (0.0524, ()),
 }
 every_table = pytest.mark.parametrize("name", PUBLISHED)
 

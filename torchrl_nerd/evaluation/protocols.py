@@ -8,7 +8,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks.ant import AntRun
 from torchrl_nerd.tasks.anymal import AnymalForward
 from torchrl_nerd.tasks.cartpole import CartpoleSwingup
-from torchrl_nerd.tasks.cube import CubeToss, RealCubeToss
+from torchrl_nerd.tasks.cube import CubeToss, RealCubeToss, SlopeToss
 from torchrl_nerd.tasks.double_pendulum import GROUNDS, DoublePendulumPassive
 from torchrl_nerd.tasks.franka import FrankaGravityReachTorque, FrankaReachTorque
 
@@ -102,6 +102,11 @@ def cube_real() -> Protocol:
     return Protocol({"toss": RealCubeToss()}, (80,), {})
 
 
+def cube_slope() -> Protocol:
+    """As `cube`, over slopes."""
+    return Protocol({"toss": SlopeToss()}, (80,), {})
+
+
 PROTOCOLS = {
     "cartpole": cartpole,
     "double_pendulum": double_pendulum,
@@ -111,6 +116,7 @@ PROTOCOLS = {
     "anymal": anymal,
     "cube": cube,
     "cube_real": cube_real,
+    "cube_slope": cube_slope,
 }
 
 

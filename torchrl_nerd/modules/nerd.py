@@ -148,6 +148,7 @@ class NeRD(nn.Module):
                 f"expected the robot of scene '{self.scene.name}' over another ground, "
                 f"got another robot in '{scene.name}'"
             )
+        scene = scene.foreseeing(self.scene.foresees_forces)
         with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
             model = type(self)(scene, self.config)
         mine, other = self.tokens.contact.sizes, model.tokens.contact.sizes

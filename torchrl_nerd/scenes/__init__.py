@@ -8,6 +8,7 @@ from torchrl_nerd.scenes.anymal import anymal
 from torchrl_nerd.scenes.cartpole import cartpole
 from torchrl_nerd.scenes.cube import cube
 from torchrl_nerd.scenes.cube_real import cube_real
+from torchrl_nerd.scenes.cube_slope import cube_slope
 from torchrl_nerd.scenes.double_pendulum import double_pendulum
 from torchrl_nerd.scenes.franka import franka
 from torchrl_nerd.scenes.franka_gravity import franka_gravity
@@ -22,6 +23,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "anymal": anymal,
     "cube": cube,
     "cube_real": cube_real,
+    "cube_slope": cube_slope,
 }
 
 

@@ -7,7 +7,7 @@ import mujoco
 
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty import set_penalty_contact
-from torchrl_nerd.scenes.sampling import BaseSampling, Sampling
+from torchrl_nerd.scenes.sampling import BaseSampling, GroundSampler, Sampling
 from torchrl_nerd.scenes.scene import Scene
 
 SUBSTEPS = 20  # of 1/2960 s: control step 1/148 s, the real tosses' frame rate
@@ -42,7 +42,16 @@ def cube_path(name: str) -> Path:
 
 def cube_scene(name: str, contact: dict[str, float]) -> Scene:
     """A cube of that name in the assets, with penalty contacts."""
-    model = mujoco.MjModel.from_xml_path(str(cube_path(name)))
+    return cube_of(name, mujoco.MjModel.from_xml_path(str(cube_path(name))), contact)
+
+
+def cube_of(
+    name: str,
+    model: mujoco.MjModel,
+    contact: dict[str, float],
+    ground: GroundSampler | None = None,
+) -> Scene:
+    """A cube of that model, with penalty contacts."""
     set_penalty_contact(model, **contact)
     return Scene(
         name=name,
@@ -56,6 +65,8 @@ def cube_scene(name: str, contact: dict[str, float]) -> Scene:
             qvel_high=(),
             torque=(),
             base=START,
+            ground=ground,
             clearance=CLEARANCE,
         ),
+        foresees_forces=ground is not None,
     )

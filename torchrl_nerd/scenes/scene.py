@@ -231,6 +231,12 @@ class Scene:
             points_still=still,
         )
 
+    def foreseeing(self, forces: bool) -> "Scene":
+        """The same scene with foreseen forces among the features, or without."""
+        if self.foresees_forces == forces:
+            return self
+        return replace(self, foresees_forces=forces)
+
     @cached_property
     def hash(self) -> str:
         """Fingerprint of the physics: equal for equal robots, steps and grounds."""
@@ -305,23 +311,35 @@ class Scene:
             qpos: ``(*batch, nq)``.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
         """
+        return self._ground(qpos, terrain)[0]
+
+    def set_down(self, state: dict[str, torch.Tensor], gap: torch.Tensor) -> None:
+        """Move floating bases, in place, to ``gap (rows,)`` m over the ground.
+
+        Along its normal at the lowest contact point; fixed bases and robots without contact
+        stay.
+        """
+        if self.base.is_floating and self.terrain is not None:
+            qpos, q = state["qpos"], self.base.qpos_address
+            gaps, normals = self._ground(qpos, state.get("terrain"))
+            lowest, point = gaps.min(-1)
+            normal = normals[torch.arange(len(qpos)), point]
+            qpos[:, q : q + 3] += (gap - lowest)[:, None] * normal
+
+    def _ground(
+        self, qpos: torch.Tensor, terrain: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gap ``(*batch, P)``, m, and the ground's normal ``(*batch, P, 3)``, world."""
         if self.terrain is None:
-            return qpos.new_zeros(*qpos.shape[:-1], 0)
+            none = qpos.new_zeros(*qpos.shape[:-1], 0)
+            return none, none[..., None].expand(*none.shape, 3)
         still = qpos.new_zeros(0, self.layout.nv)
         points, _ = self.point_kinematics.to(qpos.device)(qpos, still)
         ground = self.terrain_distance.to(qpos.device)
-        distance, _ = ground(points, terrain, *self.base_pose(qpos))
-        return distance - torch.as_tensor(self.contacts.radii).to(qpos)
-
-    def set_down(self, state: dict[str, torch.Tensor], gap: torch.Tensor) -> None:
-        """Raise or lower floating bases, in place, to ``gap (rows,)`` m over the ground.
-
-        That of the lowest contact point; fixed bases and robots without contact stay.
-        """
-        if self.base.is_floating and self.terrain is not None:
-            qpos = state["qpos"]
-            lowest = self.clearances(qpos, state.get("terrain")).amin(-1)
-            qpos[:, self.base.qpos_address + 2] += gap - lowest
+        position, rotation = self.base_pose(qpos)
+        distance, normal = ground(points, terrain, position, rotation)
+        gap = distance - torch.as_tensor(self.contacts.radii).to(qpos)
+        return gap, normal @ rotation.mT
 
     def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from torchrl_nerd.tasks.ant import AntRun, AntSpin, AntSpinTrack
 from torchrl_nerd.tasks.anymal import AnymalForward, AnymalSideways
 from torchrl_nerd.tasks.cartpole import CartpoleSwingup
-from torchrl_nerd.tasks.cube import CubeToss, RealCubeToss
+from torchrl_nerd.tasks.cube import CubeToss, RealCubeToss, SlopeToss
 from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
 from torchrl_nerd.tasks.franka import (
     FrankaGravityReachTorque,
@@ -28,6 +28,7 @@ TASKS: dict[str, Callable[[], Task]] = {
     "anymal/sideways": AnymalSideways,
     "cube/toss": CubeToss,
     "cube_real/toss": RealCubeToss,
+    "cube_slope/toss": SlopeToss,
 }
 
 

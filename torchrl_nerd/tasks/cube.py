@@ -5,8 +5,9 @@ from torch import Tensor
 
 from torchrl_nerd.geometry.frames import random_tilt, rotate
 from torchrl_nerd.geometry.kinematics import matrix_from_quat
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes.cube import CLEARANCE, HALF, START
+from torchrl_nerd.scenes.cube_slope import slope_beneath
 from torchrl_nerd.tasks.floating import angular_velocity
 from torchrl_nerd.tasks.task import State, Task
 
@@ -60,6 +61,20 @@ class RealCubeToss(CubeToss):
     """The same with the real cube's mass."""
 
     scene_name = "cube_real"
+
+
+class SlopeToss(CubeToss):
+    """The same over a plane of its own in every row, up to 20 degrees steep."""
+
+    scene_name = "cube_slope"
+    num_uniforms = CubeToss.num_uniforms + 2
+    parameters = {TERRAIN: 4}
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """Tosses of the training ranges, as far above the slope as above level ground."""
+        toss, slope = u.split([CubeToss.num_uniforms, 2], -1)
+        state = super().initial_state(toss)
+        return state | {TERRAIN: slope_beneath(state[QPOS], slope)}
 
 
 def _between(low: tuple[float, ...], high: tuple[float, ...], u: Tensor) -> Tensor:

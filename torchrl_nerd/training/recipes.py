@@ -115,6 +115,20 @@ RECIPES: dict[str, Recipe] = {
         exports="last",
     ),
     "cube_real": _mlp("cube_real/toss", 10_000, "mlp", 10_000, 1_000, softening=0.1),
+    "cube_slope": Recipe(
+        DataConfig(trajectories=30_000, steps=100),
+        TrainConfig(
+            network="mlp-wide",
+            steps=20_000,
+            rollout_steps=2_000,
+            single_share=1.0,
+            softening=0.001,
+            bf16_share=0.8,
+        ),
+        "cube_slope/toss",
+        strategy="resting",
+        exports="last",
+    ),
 }
 
 # Of robots that nobody has tuned one for, such as imported ones.

@@ -15,6 +15,7 @@ from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.sampling import sample_torque
+from torchrl_nerd.scenes.terrain import POSE_PARAMETERS
 
 SETTLE, STILL = 5.0, 1e-3  # s; m/s and rad/s
 HIGH = 100.0  # m
@@ -34,11 +35,15 @@ def starts(scene: Scene, rows: int, generator: Generator) -> TensorDict:
 def settled(scene: Scene, rows: int) -> TensorDict:
     """Where the robot comes to lie in true dynamics, dropped from its training ranges.
 
+    Where the ground varies, on that of the file.
+
     Returns:
         Up to ``rows`` states at rest; fewer where it does not come to rest.
     """
     start = starts(scene, 2 * rows, Generator().manual_seed(0))
     start[QVEL] = 0.0 * start[QVEL]
+    if scene.terrain is not None and scene.terrain.is_per_row:
+        start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(2 * rows, -1)
     steps = round(SETTLE / scene.control_step)
     torque = idle(scene, 2 * rows)[:, None].expand(-1, steps, -1)
     path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None))
@@ -70,7 +75,9 @@ def uniform_torque(scene: Scene, rows: int, steps: int, generator: Generator) ->
 
 
 def turned(scene: Scene, states: TensorDict, turn: Tensor) -> TensorDict:
-    """States of a floating robot, turned about the world's origin.
+    """States of a floating robot, turned about the world's origin, its ground with it.
+
+    Ground that all rows share stays; see `ground_turned`.
 
     Args:
         scene: the robot.
@@ -83,6 +90,13 @@ def turned(scene: Scene, states: TensorDict, turn: Tensor) -> TensorDict:
     qpos[..., q : q + 3] = rotate(turn, qpos[..., q : q + 3])
     qpos[..., q + 3 : q + 7] = quat_multiply(turn, qpos[..., q + 3 : q + 7])
     qvel[..., v : v + 3] = rotate(turn, qvel[..., v : v + 3])
+    if scene.terrain is not None and TERRAIN in states.keys():
+        ground = states[TERRAIN]
+        for part in scene.terrain.parameters.values():  # normals, or poses
+            given = ground[..., part]
+            given[..., :3] = rotate(turn, given[..., :3])
+            if given.shape[-1] == POSE_PARAMETERS:
+                given[..., 3:] = quat_multiply(turn, given[..., 3:])
     return states
 
 

@@ -4,7 +4,7 @@ import math
 
 import mujoco
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures
@@ -18,6 +18,7 @@ from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
 from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import ground_geoms
+from torchrl_nerd.scenes.terrain import PLANE
 
 ROWS, SECONDS = 16, 1.0
 SHARES = {"less": 0.95, "more": 1.05}
@@ -40,8 +41,8 @@ def _applies(scene: Scene) -> bool:
     """One free block over one plane, on which it slides sooner than it topples."""
     free = int(mujoco.mjtJoint.mjJNT_FREE)
     is_block = scene.model.njnt == 1 and scene.model.jnt_type[0] == free
-    plane = scene.terrain is not None and scene.terrain.fixed_plane is not None
-    return bool(is_block and plane and _friction(scene) < 0.5)
+    kinds = [] if scene.terrain is None else [s.kind for s in scene.terrain.surfaces]
+    return bool(is_block and kinds == [PLANE] and _friction(scene) < 0.5)
 
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
@@ -52,10 +53,9 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
         angle = math.atan(share * friction)
         turn = torch.tensor([math.cos(angle / 2.0), 0.0, math.sin(angle / 2.0), 0.0])
         turn = turn.double()
-        slope = ground_turned(scene, turn)
         expected = gravity * (math.sin(angle) - friction * math.cos(angle)) * SECONDS
         try:
-            there = _over(world, slope)
+            there = _on_slope(world, turn)
         except ValueError:  # learned on level ground, whose normal is no feature
             figures[SLIDES[name]] = math.nan
             continue
@@ -65,13 +65,17 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     return figures
 
 
-def _over(world: World, slope: Scene) -> World:
-    """The same dynamics over another ground.
+def _on_slope(world: World, turn: Tensor) -> World:
+    """The same dynamics over turned ground; a ground per row turns with the state.
 
     Raises:
         ValueError: a model that was trained over other kinds of ground.
         TypeError: an env, whose ground is its own.
     """
+    terrain = world.scene.terrain
+    if terrain is not None and terrain.is_per_row:
+        return world
+    slope = ground_turned(world.scene, turn)
     if world.dynamics is None:
         raise TypeError("expected dynamics, got an env: turn its ground yourself")
     if isinstance(world.dynamics, NeRDDynamics):

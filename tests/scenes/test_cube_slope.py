@@ -1,0 +1,46 @@
+"""A plane per row: as steep as said, as far below, and the ground that MuJoCo steps on."""
+
+import torch
+
+from torchrl_nerd import load_scene
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.stability.states import ground_turned, starts, turned
+from torchrl_nerd.scenes.cube_slope import STEEPEST
+
+ROWS = 64
+SCENE, LEVEL = load_scene("cube_slope"), load_scene("cube")
+
+
+def test_slopes_are_as_far_below_as_level_ground_would_be(generator):
+    start = starts(SCENE, ROWS, generator)
+    plane, qpos = start["terrain"], start["qpos"]
+    length = torch.linalg.vector_norm(plane[:, :3], dim=-1)
+    torch.testing.assert_close(length, torch.ones_like(length), rtol=0.0, atol=1e-14)
+    steepness = plane[:, 2].acos()
+    assert steepness.max() <= STEEPEST + 1e-9 and steepness.max() > 0.8 * STEEPEST
+    gap = SCENE.clearances(qpos, plane).amin(-1)
+    torch.testing.assert_close(gap, LEVEL.clearances(qpos).amin(-1))
+
+
+def test_setting_down_leaves_the_gap_asked_for(generator):
+    start = starts(SCENE, ROWS, generator)
+    gap = 0.1 * torch.rand(ROWS, dtype=torch.float64, generator=generator)
+    state = {key: start[key] for key in ("qpos", "terrain")}
+    SCENE.set_down(state, gap)
+    found = SCENE.clearances(state["qpos"], state["terrain"]).amin(-1)
+    torch.testing.assert_close(found, gap, rtol=0.0, atol=1e-12)
+
+
+def test_a_slope_of_the_row_is_a_slope_of_the_file(generator):
+    start = starts(SCENE, 1, generator)
+    start["qpos"][:, 2] = 0.08
+    start["terrain"][:] = torch.tensor([0.0, 0.0, 1.0, 0.0])
+    turn = torch.tensor([1.0, 0.0, 0.0, 0.0]).double()
+    turn[1:3] = 0.1 * torch.randn(2, dtype=torch.float64, generator=generator)
+    turn = turn / torch.linalg.vector_norm(turn)
+    start = turned(SCENE, start, turn)
+    torque = torch.zeros(1, 40, 0, dtype=torch.float64)
+    here = MujocoDynamics(SCENE).rollout(start, torque, start["terrain"])
+    there = MujocoDynamics(ground_turned(LEVEL, turn)).rollout(start, torque)
+    torch.testing.assert_close(here["qpos"], there["qpos"], rtol=0.0, atol=1e-9)
+    assert here["qvel"][:, -1].abs().max() > 0.0
