@@ -5,7 +5,7 @@ from copy import deepcopy
 import pytest
 import torch
 
-from torchrl_nerd.training.muon import Muon, orthogonalize
+from torchrl_nerd.training.muon import COEFFICIENTS, ITERATIONS, Muon, orthogonalize
 
 SHAPES = [(64, 64), (192, 64), (64, 256), (3, 17), (20, 2), (1, 8)]
 
@@ -33,6 +33,24 @@ def test_singular_values_become_one_and_vectors_stay(shape, batch, generator):
     assert outside.abs().max() < 1e-2
     left = result - u @ inside @ v
     assert left.abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("smallest", [1e-1, 1e-5])
+def test_singular_values_go_through_the_quintic(shape, smallest, generator):
+    u, s, v = torch.linalg.svd(
+        torch.randn(shape, generator=generator).double(), full_matrices=False
+    )
+    s = smallest ** torch.rand(s.shape, generator=generator).double()
+    scaled, (a, b, c) = s / s.square().sum().sqrt(), COEFFICIENTS
+    for _ in range(ITERATIONS):
+        scaled = a * scaled + b * scaled**3 + c * scaled**5
+    result = orthogonalize((u * s @ v).float())
+    torch.testing.assert_close(
+        result, (u * scaled @ v).float(), rtol=0.0, atol=5e-3 * float(scaled.max())
+    )
+    with torch.autocast("cpu", torch.bfloat16):  # as in training
+        assert torch.equal(orthogonalize((u * s @ v).float()), result)
 
 
 @pytest.mark.parametrize("shape", SHAPES)

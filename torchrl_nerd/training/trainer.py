@@ -246,9 +246,8 @@ class Trainer:
         ranks.average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, config.clip)
         if norm.isfinite():
-            with self._autocast():  # Muon multiplies matrices, too
-                for optimizer in self.optimizers.values():
-                    optimizer.step()
+            for optimizer in self.optimizers.values():
+                optimizer.step()
         decay = min(config.ema, self.step / (self.step + 10.0))
         with torch.no_grad():
             for name, weight in self.model.network.named_parameters():
