@@ -79,7 +79,7 @@ def expect_near(scene, got, want):
     """
     scale = torch.linalg.vector_norm(want, dim=-1, keepdim=True) + 30.0  # N
     off = ((got - want).abs() / scale).amax(-1)
-    allowed = 0.02 if load_scene(scene.name).foresees_forces else 0.1
+    allowed = 0.02 if scene.base.is_floating else 0.1
     assert off.median() < allowed and off.quantile(0.9) < 5.0 * allowed
     assert (want.abs().amax(-1) > 10.0).any(), "nothing touched"
 

@@ -77,6 +77,7 @@ def anymal() -> Scene:
             passive_share=0.1,
             quiet_share=0.4,
         ),
+        foresees_forces=True,
     )
 
 

@@ -1,5 +1,6 @@
 """Cube of the NeRD paper's simulated tosses: 1.151 kg, no joints, no motors."""
 
+from dataclasses import replace
 from math import pi
 from pathlib import Path
 
@@ -32,7 +33,7 @@ CLEARANCE = 1e-3  # m
 
 def cube() -> Scene:
     """Build the scene. ``qpos`` = centre (m), quaternion."""
-    return cube_scene("cube", CONTACT)
+    return replace(cube_scene("cube", CONTACT), foresees_forces=True)
 
 
 def cube_path(name: str) -> Path:
@@ -40,18 +41,15 @@ def cube_path(name: str) -> Path:
     return Path(__file__).parent / "assets" / f"{name}.xml"
 
 
-def cube_scene(name: str, contact: dict[str, float]) -> Scene:
-    """A cube of that name in the assets, with penalty contacts."""
-    return cube_of(name, mujoco.MjModel.from_xml_path(str(cube_path(name))), contact)
-
-
-def cube_of(
+def cube_scene(
     name: str,
-    model: mujoco.MjModel,
     contact: dict[str, float],
+    model: mujoco.MjModel | None = None,
     ground: GroundSampler | None = None,
 ) -> Scene:
-    """A cube of that model, with penalty contacts."""
+    """A cube with penalty contacts: of that model, or of that name in the assets."""
+    if model is None:
+        model = mujoco.MjModel.from_xml_path(str(cube_path(name)))
     set_penalty_contact(model, **contact)
     return Scene(
         name=name,
@@ -68,5 +66,4 @@ def cube_of(
             ground=ground,
             clearance=CLEARANCE,
         ),
-        foresees_forces=ground is not None,
     )

@@ -1,5 +1,6 @@
 """The paper's cube over a plane of its own in every row: on level ground and on slopes."""
 
+from dataclasses import replace
 from math import pi
 
 import mujoco
@@ -7,7 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.geometry.kinematics import matrix_from_quat
-from torchrl_nerd.scenes.cube import CONTACT, HALF, cube_of, cube_path
+from torchrl_nerd.scenes.cube import CONTACT, HALF, cube_path, cube_scene
 from torchrl_nerd.scenes.scene import Scene
 
 STEEPEST = pi / 9  # rad; friction holds the cube up to atan(0.15) = 0.149
@@ -27,7 +28,8 @@ def cube_slope() -> Scene:
         rgba=level.rgba,
     )
     spec.delete(level)
-    return cube_of("cube_slope", spec.compile(), CONTACT, sample_slope)
+    scene = cube_scene("cube_slope", CONTACT, spec.compile(), sample_slope)
+    return replace(scene, foresees_forces=True)
 
 
 def sample_slope(qpos: Tensor, generator: Generator) -> Tensor:

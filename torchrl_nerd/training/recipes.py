@@ -61,6 +61,20 @@ def _mlp(
     return Recipe(DataConfig(trajectories=trajectories, steps=100), train, task)
 
 
+def _resting(task: str, trajectories: int) -> Recipe:
+    """A cube that comes to rest; its last checkpoint, as tosses do not show how well."""
+    train = TrainConfig(
+        network="mlp-wide",
+        steps=20_000,
+        rollout_steps=2_000,
+        single_share=1.0,
+        bf16_share=0.8,
+        softening=0.001,
+    )
+    data = DataConfig(trajectories=trajectories, steps=100)
+    return Recipe(data, train, task, strategy="resting", exports="last")
+
+
 RECIPES: dict[str, Recipe] = {
     "cartpole": Recipe(
         DataConfig(trajectories=20_000, steps=100),
@@ -71,7 +85,7 @@ RECIPES: dict[str, Recipe] = {
         "double_pendulum/passive",
         100_000,
         "mlp-wide",
-        90_000,
+        110_000,
         4_000,
         softening=1.0,
         rollout_lr=0.03,
@@ -90,7 +104,15 @@ RECIPES: dict[str, Recipe] = {
         bf16_share=0.85,
         validate_every=5_000,
     ),
-    "anymal": _mlp("anymal/forward", 10_000, "mlp-large", 10_000, 500, softening=0.02),
+    "anymal": _mlp(
+        "anymal/forward",
+        20_000,
+        "mlp-large",
+        15_000,
+        1_000,
+        softening=0.02,
+        bf16_share=0.8,
+    ),
     "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),
     "franka_gravity": _mlp(
         "franka_gravity/reach_torque",
@@ -101,34 +123,9 @@ RECIPES: dict[str, Recipe] = {
         softening=0.01,
         validate_every=3_000,
     ),
-    "cube": Recipe(  # the last: errors over a toss do not show how well it rests
-        DataConfig(trajectories=15_000, steps=100),
-        TrainConfig(
-            network="mlp-wide",
-            steps=10_000,
-            rollout_steps=2_000,
-            single_share=1.0,
-            softening=0.001,
-        ),
-        "cube/toss",
-        strategy="resting",
-        exports="last",
-    ),
+    "cube": _resting("cube/toss", 15_000),
     "cube_real": _mlp("cube_real/toss", 10_000, "mlp", 10_000, 1_000, softening=0.1),
-    "cube_slope": Recipe(
-        DataConfig(trajectories=30_000, steps=100),
-        TrainConfig(
-            network="mlp-wide",
-            steps=20_000,
-            rollout_steps=2_000,
-            single_share=1.0,
-            softening=0.001,
-            bf16_share=0.8,
-        ),
-        "cube_slope/toss",
-        strategy="resting",
-        exports="last",
-    ),
+    "cube_slope": _resting("cube_slope/toss", 30_000),
 }
 
 # Of robots that nobody has tuned one for, such as imported ones.
