@@ -67,7 +67,9 @@ class Nudged:
     """Robots at rest, pushed a little: what a model must know to come to rest again.
 
     Without them nothing near rest is in the data but rest itself, and whatever small
-    error a model makes there may grow. Sizes are log-uniform over four decades.
+    error a model makes there may grow. Sizes are log-uniform over four decades, that of the
+    velocity and that of the displacement each by itself: a cube that slides fast lies as
+    deep in the ground as one at rest.
 
     | field | meaning |
     |---|---|
@@ -81,7 +83,7 @@ class Nudged:
     def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
         """See `Starts`."""
         start, scene = self.fallen(rows, generator), self.fallen.scene
-        size = log_uniform(self.least, 1.0, rows, generator)
+        size = log_uniform(self.least, 1.0, 2 * rows, generator).reshape(2, rows, 1)
         shape = (2, rows, scene.model.nv)
         push = size * torch.randn(shape, dtype=torch.float64, generator=generator)
         unit = torch.full((scene.model.nv,), 3.0, dtype=torch.float64)

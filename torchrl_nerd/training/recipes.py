@@ -69,7 +69,7 @@ def _resting(task: str, trajectories: int) -> Recipe:
         rollout_steps=2_000,
         single_share=1.0,
         bf16_share=0.8,
-        softening=0.001,
+        softening=0.0001,
     )
     data = DataConfig(trajectories=trajectories, steps=100)
     return Recipe(data, train, task, strategy="resting", exports="last")
