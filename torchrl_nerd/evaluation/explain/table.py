@@ -1,9 +1,17 @@
 """The report as text for a terminal."""
 
-from torchrl_nerd.evaluation.explain.features import DEPTH, GAPS, GATED, VELOCITY
+from torchrl_nerd.evaluation.explain.features import (
+    DEPTH,
+    FORCE,
+    GAPS,
+    GATED,
+    PRESSED,
+    VELOCITY,
+)
 from torchrl_nerd.evaluation.explain.report import SceneReport
 
-ADDED = (GAPS, GATED, VELOCITY, DEPTH)  # kinds that the paper's input does not have
+# kinds that the paper's input does not have
+ADDED = (GAPS, GATED, VELOCITY, DEPTH, PRESSED, FORCE)
 
 
 def report_table(report: SceneReport) -> str:
