@@ -77,7 +77,6 @@ def _scene(
             ground=ground,
             clearance=clearance,
         ),
-        foresees_forces=True,
     )
 
 

@@ -85,7 +85,7 @@ RECIPES: dict[str, Recipe] = {
         "double_pendulum/passive",
         100_000,
         "mlp-wide",
-        110_000,
+        90_000,
         4_000,
         softening=1.0,
         rollout_lr=0.03,
