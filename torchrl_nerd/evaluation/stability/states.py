@@ -18,6 +18,7 @@ from torchrl_nerd.scenes.sampling import sample_torque
 from torchrl_nerd.scenes.terrain import POSE_PARAMETERS
 
 SETTLE, STILL = 5.0, 1e-3  # s; m/s and rad/s
+TRIES = 8
 HIGH = 100.0  # m
 
 
@@ -38,19 +39,37 @@ def settled(scene: Scene, rows: int) -> TensorDict:
     Where the ground varies, on that of the file.
 
     Returns:
-        Up to ``rows`` states at rest; fewer where it does not come to rest.
+        Up to ``rows`` states at rest, at least one; fewer where it seldom comes to rest.
+
+    Raises:
+        ValueError: it never did.
     """
-    start = starts(scene, 2 * rows, Generator().manual_seed(0))
+    generator, found = Generator().manual_seed(0), []
+    for _ in range(TRIES):
+        found.append(_at_rest(scene, 2 * rows, generator))
+        if sum(map(len, found)) >= rows:
+            break
+    at_rest = cast(TensorDict, TensorDict.cat(found))[:rows]
+    if not len(at_rest):
+        raise ValueError(
+            f"expected a robot that comes to rest within {SETTLE} s of its drop, "
+            f"'{scene.name}' did in none of {2 * rows * TRIES}"
+        )
+    return at_rest
+
+
+def _at_rest(scene: Scene, drops: int, generator: Generator) -> TensorDict:
+    """Those of so many drops that end at rest."""
+    start = starts(scene, drops, generator)
     start[QVEL] = 0.0 * start[QVEL]
     if scene.terrain is not None and scene.terrain.is_per_row:
-        start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(2 * rows, -1)
+        start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(drops, -1)
     steps = round(SETTLE / scene.control_step)
-    torque = idle(scene, 2 * rows)[:, None].expand(-1, steps, -1)
+    torque = idle(scene, drops)[:, None].expand(-1, steps, -1)
     path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None))
     for key in (QPOS, QVEL):
         start[key] = path[key][:, -1].clone()
-    is_still = torch.amax(start[QVEL].abs(), -1) < STILL
-    return rows_of(start, is_still.nonzero()[:rows, 0])
+    return rows_of(start, torch.amax(start[QVEL].abs(), -1) < STILL)
 
 
 def rows_of(states: TensorDict, rows: Tensor) -> TensorDict:
