@@ -1,6 +1,7 @@
 """Figures of a run in TensorBoard, Weights & Biases and MLflow themselves, offline."""
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -68,12 +69,23 @@ def wandb_records(path: Path) -> Iterator:
             parts = b""
 
 
+def finished_records(path: Path, seconds: float = 30.0) -> list:
+    """All records, once the service, a process of its own, has written the last one."""
+    until = time.monotonic() + seconds
+    while True:
+        records = list(wandb_records(path))
+        if any(record.WhichOneof("record_type") == "exit" for record in records):
+            return records
+        assert time.monotonic() < until, f"{path} is not finished after {seconds} s"
+        time.sleep(0.1)
+
+
 def test_weights_and_biases_has_every_figure(wandb, run, figures, monkeypatch, seed):
     monkeypatch.setenv("WANDB_MODE", "offline")
     write(run, "wandb", {"scene": "cartpole", "seed": seed}, figures)
     (path,) = run.glob("wandb/offline-run-*/run-*.wandb")
     found, settings, names = {}, {}, set()
-    for record in wandb_records(path):
+    for record in finished_records(path):
         if record.WhichOneof("record_type") == "history":
             row = {
                 item.key or item.nested_key[0]: json.loads(item.value_json)
