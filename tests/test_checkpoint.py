@@ -3,7 +3,7 @@
 import json
 import re
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import mujoco
@@ -62,7 +62,7 @@ FORESEEING = [name for name in SCENES if load_scene(name).foresees_forces]
 @pytest.mark.parametrize("name", FORESEEING)
 def test_a_model_keeps_the_features_it_learned_on(name, tmp_path, generator):
     scene = load_scene(name)
-    plain = random_model(replace(scene, foresees_forces=False), generator)
+    plain = random_model(scene.foreseeing(False), generator)
     card = make_card(plain)
     del card["foresees_forces"]  # as in the cards of before
     save_checkpoint(plain, tmp_path / "plain", card)

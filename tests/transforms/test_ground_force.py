@@ -18,7 +18,7 @@ ROWS = 60
 SPRINGY = [load_scene(name) for name in SCENES]
 SPRINGY = [scene for scene in SPRINGY if scene.terrain is not None]
 springy_scene = pytest.mark.parametrize(
-    "scene", [replace(s, foresees_forces=True) for s in SPRINGY], ids=lambda s: s.name
+    "scene", [s.foreseeing(True) for s in SPRINGY], ids=lambda s: s.name
 )
 
 
@@ -105,8 +105,8 @@ def test_a_moment_of_motion_is_damped_and_held_back_as_by_mujoco(scene, generato
 def test_what_is_not_foreseen_is_refused():
     several = HANDMADE["floater"]
     with pytest.raises(ValueError, match="one to a body, under foreseen forces, got"):
-        ContactFeatures(replace(several, foresees_forces=True))
+        ContactFeatures(several.foreseeing(True))
     hard = make_scene("""<mujoco><worldbody><geom type="plane" size="0 0 1"/>
       <body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>""")
     with pytest.raises(ValueError, match="springs and dampers"):
-        ContactFeatures(replace(hard, foresees_forces=True))
+        ContactFeatures(hard.foreseeing(True))

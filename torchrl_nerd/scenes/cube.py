@@ -1,11 +1,12 @@
 """Cube of the NeRD paper's simulated tosses: 1.151 kg, no joints, no motors."""
 
-from dataclasses import replace
 from math import pi
 from pathlib import Path
 
 import mujoco
+from torch import Tensor
 
+from torchrl_nerd.geometry.kinematics import matrix_from_quat
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty import set_penalty_contact
 from torchrl_nerd.scenes.sampling import BaseSampling, GroundSampler, Sampling
@@ -29,11 +30,23 @@ START = BaseSampling(
     angular_high=(12.0, 8.0, 4.0),
 )
 CLEARANCE = 1e-3  # m
+UP = (0.0, 0.0, 1.0)  # normal of level ground
 
 
 def cube() -> Scene:
     """Build the scene. ``qpos`` = centre (m), quaternion."""
-    return replace(cube_scene("cube", CONTACT), foresees_forces=True)
+    return cube_scene("cube", CONTACT).foreseeing(True)
+
+
+def cube_reach(quat: Tensor, direction: Tensor) -> Tensor:
+    """How far a cube's corners are from its centre along a direction, m, ``(*batch,)``.
+
+    Args:
+        quat: ``(*batch, 4)``.
+        direction: of unit length, world, ``(*batch, 3)``.
+    """
+    along = (direction[..., None, :] @ matrix_from_quat(quat))[..., 0, :]
+    return HALF * along.abs().sum(-1)
 
 
 def cube_path(name: str) -> Path:

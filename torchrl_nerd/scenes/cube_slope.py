@@ -1,14 +1,12 @@
 """The paper's cube over a plane of its own in every row: on level ground and on slopes."""
 
-from dataclasses import replace
 from math import pi
 
 import mujoco
 import torch
 from torch import Generator, Tensor
 
-from torchrl_nerd.geometry.kinematics import matrix_from_quat
-from torchrl_nerd.scenes.cube import CONTACT, HALF, cube_path, cube_scene
+from torchrl_nerd.scenes.cube import CONTACT, UP, cube_path, cube_reach, cube_scene
 from torchrl_nerd.scenes.scene import Scene
 
 STEEPEST = pi / 9  # rad; friction holds the cube up to atan(0.15) = 0.149
@@ -29,7 +27,7 @@ def cube_slope() -> Scene:
     )
     spec.delete(level)
     scene = cube_scene("cube_slope", CONTACT, spec.compile(), sample_slope)
-    return replace(scene, foresees_forces=True)
+    return scene.foreseeing(True)
 
 
 def sample_slope(qpos: Tensor, generator: Generator) -> Tensor:
@@ -48,9 +46,7 @@ def slope_beneath(qpos: Tensor, u: Tensor) -> Tensor:
     angle, heading = STEEPEST * u[..., 0], 2.0 * torch.pi * u[..., 1]
     across, up = angle.sin(), angle.cos()
     normal = torch.stack((across * heading.cos(), across * heading.sin(), up), -1)
-    axes = matrix_from_quat(qpos[..., 3:])
-    level = HALF * axes[..., 2, :].abs().sum(-1)  # how far down the lowest corner is
-    below = HALF * (normal[..., None, :] @ axes)[..., 0, :].abs().sum(-1)
-    gap = qpos[..., 2] - level
-    offset = (normal * qpos[..., :3]).sum(-1) - below - gap
+    place, quat = qpos[..., :3], qpos[..., 3:]
+    gap = place[..., 2] - cube_reach(quat, quat.new_tensor(UP))
+    offset = (normal * place).sum(-1) - cube_reach(quat, normal) - gap
     return torch.cat((normal, offset[..., None]), -1)

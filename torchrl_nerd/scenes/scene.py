@@ -324,22 +324,22 @@ class Scene:
             gaps, normals = self._ground(qpos, state.get("terrain"))
             lowest, point = gaps.min(-1)
             normal = normals[torch.arange(len(qpos)), point]
-            qpos[:, q : q + 3] += (gap - lowest)[:, None] * normal
+            _, rotation = self.base_pose(qpos)
+            up = (rotation @ normal[..., None])[..., 0]
+            qpos[:, q : q + 3] += (gap - lowest)[:, None] * up
 
     def _ground(
         self, qpos: torch.Tensor, terrain: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Gap ``(*batch, P)``, m, and the ground's normal ``(*batch, P, 3)``, world."""
+        """Gap ``(*batch, P)``, m, and the ground's normal ``(*batch, P, 3)`` in B_t."""
         if self.terrain is None:
             none = qpos.new_zeros(*qpos.shape[:-1], 0)
             return none, none[..., None].expand(*none.shape, 3)
         still = qpos.new_zeros(0, self.layout.nv)
         points, _ = self.point_kinematics.to(qpos.device)(qpos, still)
         ground = self.terrain_distance.to(qpos.device)
-        position, rotation = self.base_pose(qpos)
-        distance, normal = ground(points, terrain, position, rotation)
-        gap = distance - torch.as_tensor(self.contacts.radii).to(qpos)
-        return gap, normal @ rotation.mT
+        distance, normal = ground(points, terrain, *self.base_pose(qpos))
+        return distance - torch.as_tensor(self.contacts.radii).to(qpos), normal
 
     def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""

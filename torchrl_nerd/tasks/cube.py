@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.geometry.frames import random_tilt, rotate
-from torchrl_nerd.geometry.kinematics import matrix_from_quat
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes.cube import CLEARANCE, HALF, START
+from torchrl_nerd.scenes.cube import CLEARANCE, START, UP, cube_reach
 from torchrl_nerd.scenes.cube_slope import slope_beneath
 from torchrl_nerd.tasks.floating import angular_velocity
 from torchrl_nerd.tasks.task import State, Task
@@ -32,7 +31,7 @@ class CubeToss(Task):
         """
         where, turn, linear, angular = u.split([3, 4, 3, 3], -1)
         quat = random_tilt(turn, START.tilt)
-        reach = HALF * matrix_from_quat(quat)[..., 2, :].abs().sum(-1)
+        reach = cube_reach(quat, quat.new_tensor(UP))
         low = u.new_tensor(START.low).expand_as(where).clone()
         low[..., 2] = low[..., 2].maximum(reach + CLEARANCE)
         position = low + (u.new_tensor(START.high) - low) * where

@@ -1,6 +1,6 @@
 """How a model of each scene is made: ``nerd train SCENE`` with its defaults."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from torchrl_nerd.data.generate import DataConfig, Draw
@@ -63,16 +63,10 @@ def _mlp(
 
 def _resting(task: str, trajectories: int) -> Recipe:
     """A cube that comes to rest; its last checkpoint, as tosses do not show how well."""
-    train = TrainConfig(
-        network="mlp-wide",
-        steps=20_000,
-        rollout_steps=2_000,
-        single_share=1.0,
-        bf16_share=0.8,
-        softening=0.0001,
+    made = _mlp(
+        task, trajectories, "mlp-wide", 20_000, 2_000, softening=0.0001, bf16_share=0.8
     )
-    data = DataConfig(trajectories=trajectories, steps=100)
-    return Recipe(data, train, task, strategy="resting", exports="last")
+    return replace(made, strategy="resting", exports="last")
 
 
 RECIPES: dict[str, Recipe] = {

@@ -4,7 +4,7 @@ NeRD section 3.3. Dynamics do not depend on horizontal position and heading, so 
 not features; nor is any other coordinate that `Scene.symmetries` found to be ignored.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDictBase
@@ -86,22 +86,36 @@ class RobotCentric(FeatureTransform):
 
 @dataclass(frozen=True)
 class _JointFeatures:
-    """Addresses of the joints by the kind of feature they give."""
+    """Addresses of the joints by the kind of feature they give.
 
-    angles: list[int]  # qpos of unlimited hinges
-    positions: list[int]  # qpos that enter as they are
-    balls: list[int]  # qpos of ball joints' quaternions
-    velocities: list[int]  # dofs whose velocity enters as it is
-    limited: list[int]  # qpos of limited joints
-    limits: list[tuple[float, float, float]]  # low, high, margin of each
-    gated: list[tuple[int, int]]  # (index into limited, dof): velocity near a limit
-    pressed: list[int]  # dofs of the limited joints whose torque is foreseen
-    springs: list[tuple[float, float]]  # stiffness, damping of each
+    | field | meaning |
+    |---|---|
+    | ``step_size`` | control step, s |
+    | ``angles`` | qpos of unlimited hinges |
+    | ``positions`` | qpos that enter as they are |
+    | ``balls`` | qpos of ball joints' quaternions |
+    | ``velocities`` | dofs whose velocity enters as it is |
+    | ``limited`` | qpos of limited joints |
+    | ``limits`` | low, high, margin of each |
+    | ``gated`` | (index into limited, dof): velocity near a limit |
+    | ``pressed`` | dofs of the limited joints whose torque is foreseen |
+    | ``springs`` | stiffness, damping of each |
+    """
+
     step_size: float
+    angles: list[int] = field(default_factory=list)
+    positions: list[int] = field(default_factory=list)
+    balls: list[int] = field(default_factory=list)
+    velocities: list[int] = field(default_factory=list)
+    limited: list[int] = field(default_factory=list)
+    limits: list[tuple[float, float, float]] = field(default_factory=list)
+    gated: list[tuple[int, int]] = field(default_factory=list)
+    pressed: list[int] = field(default_factory=list)
+    springs: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
     def from_scene(cls, scene: Scene) -> "_JointFeatures":
-        found = cls([], [], [], [], [], [], [], [], [], scene.control_step)
+        found = cls(scene.control_step)
         model, ignored = scene.model, scene.symmetries
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
