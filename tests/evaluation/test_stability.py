@@ -12,9 +12,10 @@ from torchrl_nerd.evaluation.stability.case import Case
 from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.evaluation.stability.measures import mechanics
 from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_cases
-from torchrl_nerd.evaluation.stability.states import clear_of_ground, starts
+from torchrl_nerd.evaluation.stability.states import clear_of_ground, settled, starts
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, EnvWorld
 from torchrl_nerd.evaluation.traces import energy as traced_energy
+from torchrl_nerd.scenes import load_scene
 
 SCALE = 0.001
 SLOW = (
@@ -89,6 +90,11 @@ def test_momentum_and_energy_are_those_of_a_falling_cube(generator):
     energy -= mass * scene.model.opt.gravity[2] * height
     found = traced_energy(scene, start["qpos"], start["qvel"]).numpy()
     assert abs(found - energy).max() < 1e-9 * abs(energy).max()
+
+
+def test_a_robot_that_never_rests_is_named():
+    with pytest.raises(ValueError, match="'cartpole' did in none of 16"):
+        settled(load_scene("cartpole"), 1)
 
 
 def test_the_command_writes_table_json_and_plot(tmp_path, capsys):
