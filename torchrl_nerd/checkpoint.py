@@ -67,6 +67,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
         "refinement": scene.refinement,
         "control_step": scene.control_step,
         "foresees_forces": scene.foresees_forces,
+        "foresees_free_motion": scene.foresees_free_motion,
         "network": {"kind": kind, **asdict(cast(Any, config))},
         "training_ranges": scene.sampling.ranges(),
         "versions": {
@@ -120,8 +121,9 @@ def read_checkpoint(
             f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint"
         )
     card = read_json(folder / CARD)
-    foresees_forces = card.get("foresees_forces") is True  # none did before 0.2
-    scene = (scene or _scene_of(card, folder)).foreseeing(foresees_forces)
+    names = "foresees_forces", "foresees_free_motion"
+    foresight = [card.get(name) is True for name in names]  # none did before 0.2
+    scene = (scene or _scene_of(card, folder)).foreseeing(*foresight)
     teacher = _teacher(card, scene)
     _compare(card, teacher, folder)
     config, tensors = _network_config(card, folder), read_tensors(folder / WEIGHTS)

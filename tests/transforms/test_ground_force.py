@@ -104,7 +104,7 @@ def test_a_moment_of_motion_is_damped_and_held_back_as_by_mujoco(scene, generato
 
 def test_what_is_not_foreseen_is_refused():
     several = HANDMADE["floater"]
-    with pytest.raises(ValueError, match="one to a body, under foreseen forces, got"):
+    with pytest.raises(ValueError, match="one to a body, to foresee what they do, got"):
         ContactFeatures(several.foreseeing(True))
     hard = make_scene("""<mujoco><worldbody><geom type="plane" size="0 0 1"/>
       <body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>""")

@@ -148,13 +148,14 @@ class NeRD(nn.Module):
                 f"expected the robot of scene '{self.scene.name}' over another ground, "
                 f"got another robot in '{scene.name}'"
             )
-        scene = scene.foreseeing(self.scene.foresees_forces)
+        mine = self.scene
+        scene = scene.foreseeing(mine.foresees_forces, mine.foresees_free_motion)
         with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
             model = type(self)(scene, self.config)
-        mine, other = self.tokens.contact.sizes, model.tokens.contact.sizes
-        if mine != other:
+        sizes, other = self.tokens.contact.sizes, model.tokens.contact.sizes
+        if sizes != other:
             raise ValueError(
-                f"expected a ground with the features {dict(mine)} that the model was "
+                f"expected a ground with the features {dict(sizes)} that the model was "
                 f"trained on, got one with {dict(other)}"
             )
         model.network.to(self.dtype)

@@ -62,6 +62,8 @@ class Scene:
     | ``refinement`` | substeps in one of the robot's own, see `fine`; else 1 |
     | ``foresees_forces`` | whether the forces of its springs, at limits and contacts (see
       `scenes.penalty`), are among the features: where they decide most steps |
+    | ``foresees_free_motion`` | whether contacts are foreseen along the way that the robot
+      takes if it is let go, not at constant velocity: where the onset of touch decides |
 
     Raises:
         ValueError: the model has something no NeRD can be built for (named).
@@ -74,6 +76,7 @@ class Scene:
     sampling: Sampling
     refinement: int = 1
     foresees_forces: bool = False
+    foresees_free_motion: bool = False
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -231,11 +234,11 @@ class Scene:
             points_still=still,
         )
 
-    def foreseeing(self, forces: bool) -> "Scene":
-        """The same scene with foreseen forces among the features, or without."""
-        if self.foresees_forces == forces:
+    def foreseeing(self, forces: bool, free_motion: bool = False) -> "Scene":
+        """The same scene with forces among the features, with or without free motion."""
+        if (self.foresees_forces, self.foresees_free_motion) == (forces, free_motion):
             return self
-        return replace(self, foresees_forces=forces)
+        return replace(self, foresees_forces=forces, foresees_free_motion=free_motion)
 
     @cached_property
     def hash(self) -> str:

@@ -9,7 +9,8 @@ too. Of several surfaces each point sees the nearest, so that a model fits any n
 Added is what decides an impact: the point's velocity, and how deep it will be if it goes
 on: whether a point touches within the step is a threshold, which a network learns slowly
 from distance and speed. All of it fades to zero at the margin without a jump. Where a scene
-asks for it, the forces that its springs would push with on that way are worked out, too.
+asks for it, the forces that its springs would push with on that way are worked out, too,
+and the way is that of a robot that is let go in place of one at constant velocity.
 """
 
 import numpy as np
@@ -18,6 +19,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_nerd.geometry.free_motion import FreeMotion
+from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics, base_pose
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import (
@@ -48,7 +51,8 @@ class ContactFeatures(FeatureTransform):
     |---|---|---|
     | ``contact_distance`` | min(d - xi, 0), m | P |
     | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
-    | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed, m | K P |
+    | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed or, in scenes
+      that foresee free motion, if the robot were let go (see `FreeMotion`), m | K P |
     | ``contact_force`` | what springs push each dof with on that way, mean, N and N m; in
       scenes that foresee forces, see `GroundForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
@@ -99,12 +103,23 @@ class ContactFeatures(FeatureTransform):
             return
         points = scene.contacts
         bodies, positions = points.bodies, points.positions
-        self.force = GroundForce(scene) if scene.foresees_forces else None
-        if self.force is not None:  # the places of its joints are found along the way
-            bodies = bodies + self.force.bodies
-            positions = np.concatenate((positions, self.force.positions))
+        self.force, self.free_motion, self.num_places = None, None, 0
+        self.later = PointKinematics(scene.model, scene.base, bodies, positions)
+        if scene.foresees_forces or scene.foresees_free_motion:
+            axes = JointAxes.of(scene.model, scene.base)  # places found along the way
+            self.num_places = len(axes.bodies)
+            bodies = bodies + axes.bodies
+            positions = np.concatenate((positions, axes.positions))
+            if scene.foresees_forces:
+                self.force = GroundForce(scene, axes)
+            if scene.foresees_free_motion:
+                args = scene.model, scene.base, axes, scene.control_step
+                self.free_motion = FreeMotion(*args)
+                bodies = bodies + self.free_motion.bodies
+                positions = np.concatenate((positions, self.free_motion.positions))
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
-        self.count = count
+        self.count, self.num_known = count, count + self.num_places
+        self.substeps = scene.substeps // scene.refinement
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         constants = {"radii": points.radii, "margins": points.margins}
         constants |= {"glances": np.arange(glances) / glances}
@@ -125,13 +140,20 @@ class ContactFeatures(FeatureTransform):
         """
         if self.terrain is None:
             return []
-        later = integrate_pos(self.layout, qpos, self.step_size * qvel)
-        both = torch.stack((qpos, later))
-        points, velocity = self.kinematics(both, qvel)
-        places, points = points[0, ..., self.count :, :], points[..., : self.count, :]
+        found, velocity = self.kinematics(qpos, qvel)
+        sizes = (self.count, self.num_places, found.shape[-2] - self.num_known)
+        now, places, corners = found.split(sizes, -2)
         velocity = velocity[..., : self.count, :]
         mount = self.mount_pos, self.mount_rot
-        position, rotation = base_pose(self.base, both, *mount)
+        mean = qvel  # velocity of the way to the step's end
+        if self.free_motion is not None:
+            turned = base_pose(self.base, qpos, *mount)[1]
+            gain = self.free_motion(qpos, qvel, turned, corners, places)
+            mean = qvel + 0.5 * self.step_size * (1.0 + 1.0 / self.substeps) * gain
+        later = integrate_pos(self.layout, qpos, self.step_size * mean)
+        ends, _ = self.later(later, qvel.new_empty(0, qvel.shape[-1]))
+        points = torch.stack((now, ends))
+        position, rotation = base_pose(self.base, torch.stack((qpos, later)), *mount)
         if terrain is not None:
             terrain = terrain.expand(2, *terrain.shape)
         (distance, end), (normal, _) = self.ground(points, terrain, position, rotation)
@@ -139,7 +161,7 @@ class ContactFeatures(FeatureTransform):
             v = self.base.dof_address
             linear = (rotation[0].mT @ qvel[..., v : v + 3, None])[..., 0]
             angular = qvel[..., None, v + 3 : v + 6].expand_as(velocity)
-            turning = torch.linalg.cross(angular, points[0])
+            turning = torch.linalg.cross(angular, now)
             velocity = velocity + linear[..., None, :] + turning
         beyond = distance - self.margins
         gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
@@ -151,7 +173,7 @@ class ContactFeatures(FeatureTransform):
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
         features.append((gate * depth).flatten(-2))
         if self.force is not None:
-            contact = points[0], normal, gate * depth, speed, sliding
+            contact = now, normal, gate * depth, speed, sliding
             features.append(self.force(*contact, places))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
@@ -161,11 +183,17 @@ class ContactFeatures(FeatureTransform):
         """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
 
         The distance is the parabola through its value and slope now and its value
-        ``end`` after a whole step at constant ``qvel``.
+        ``end`` after the whole step; of free motion it is the discrete one of the solver,
+        which changes velocities before positions.
         """
         start = (self.radii - distance)[..., None]
         bend = self.radii[:, None] - end[..., None] - start + slope
-        powers = torch.stack((-self.glances, self.glances**2))
+        squares = self.glances**2
+        if self.free_motion is not None:
+            squares = (squares + self.glances / self.substeps) / (
+                1.0 + 1.0 / self.substeps
+            )
+        powers = torch.stack((-self.glances, squares))
         path = start + torch.cat((slope, bend), -1) @ powers
         return path.clamp_min(0.0)
 
