@@ -101,6 +101,20 @@ def random_transitions(scene: Scene, rows: int, generator: Generator) -> TensorD
     return true_step(scene, TensorDict(start, batch_size=[rows]), torque)
 
 
+def in_ground(scene: Scene, rows: int, generator: Generator) -> TensorDict:
+    """Random rows, the lowest point up to 5 cm deep where the robot can be moved."""
+    drawn = random_transitions(scene, rows, generator)
+    depth = 0.05 * torch.rand(rows, dtype=torch.float64, generator=generator)
+    if scene.base.is_floating:
+        state = {QPOS: drawn[QPOS], QVEL: drawn[QVEL]}
+        scene.set_down(state, -depth)
+        drawn[QPOS] = state[QPOS]
+    elif scene.terrain.is_per_row:
+        gap = scene.clearances(drawn[QPOS], drawn[TERRAIN]).amin(-1)
+        drawn[TERRAIN][:, 3] += gap + depth
+    return drawn
+
+
 def true_step(scene: Scene, state: TensorDict, torque: Tensor) -> TensorDict:
     """``state`` with MuJoCo's next state and the torque under ``next``."""
     dynamics = MujocoDynamics(scene, num_threads=1)

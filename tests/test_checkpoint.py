@@ -59,12 +59,16 @@ def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
 FORESEEING = [name for name in SCENES if load_scene(name).foresees_forces]
 
 
+@pytest.mark.parametrize("free_motion", [False, True])
 @pytest.mark.parametrize("name", FORESEEING)
-def test_a_model_keeps_the_features_it_learned_on(name, tmp_path, generator):
-    scene = load_scene(name)
+def test_a_model_keeps_the_features_it_learned_on(
+    name, free_motion, tmp_path, generator
+):
+    scene = load_scene(name).foreseeing(True, free_motion)
     plain = random_model(scene.foreseeing(False), generator)
     card = make_card(plain)
-    del card["foresees_forces"]  # as in the cards of before
+    for key in ("foresees_forces", "foresees_free_motion"):
+        del card[key]  # as in the cards of before
     save_checkpoint(plain, tmp_path / "plain", card)
     foreseeing = random_model(scene, generator)
     save_checkpoint(foreseeing, tmp_path / "new", make_card(foreseeing))

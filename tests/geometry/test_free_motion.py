@@ -33,7 +33,7 @@ floating = floating.replace('springref="0.2" armature="0.1"', "")
 SUPPORTED.append(make_scene(floating))
 
 
-def free_acceleration(scene, rows, period=0.0):
+def free_acceleration(scene, rows, period=0.0, torque=None):
     model = scene.model
     axes = JointAxes.of(model, scene.base)
     motion = FreeMotion(model, scene.base, axes, period)
@@ -46,31 +46,36 @@ def free_acceleration(scene, rows, period=0.0):
     mount = map(torch.as_tensor, scene.mount)
     rotation = base_pose(scene.base, rows[QPOS], *mount)[1]
     corners, places = points[:, count:], points[:, :count]
-    return motion(rows[QPOS], rows[QVEL], rotation, corners, places)
+    return motion(rows[QPOS], rows[QVEL], torque, rotation, corners, places)
 
 
-def mujoco_acceleration(scene, rows, period=0.0):
+def mujoco_acceleration(scene, rows, period=0.0, torque=None):
     """Solved with the mass matrix and the bias of MuJoCo, nothing touching."""
     model = copy.copy(scene.model)
     data, found = mujoco.MjData(model), []
     matrix = np.zeros((model.nv, model.nv))
-    for row in rows:
+    pushes = [0.0] * len(rows) if torque is None else torque.numpy()
+    for row, push in zip(rows, pushes, strict=True):
         mujoco.mj_resetData(model, data)
         data.qpos, data.qvel = row[QPOS].numpy(), row[QVEL].numpy()
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, matrix)
-        force = data.qfrc_passive - data.qfrc_bias
+        force = data.qfrc_passive - data.qfrc_bias + push
         braked = matrix + 0.5 * period * np.diag(model.dof_damping)
         found.append(np.linalg.solve(braked, force))
     return torch.from_numpy(np.array(found))
 
 
+@pytest.mark.parametrize("is_driven", [False, True])
 @pytest.mark.parametrize("period", [0.0, 0.1])
 @pytest.mark.parametrize("scene", SUPPORTED, ids=lambda scene: scene.name)
-def test_it_is_mujocos_own(scene, period, generator):
-    rows = random_transitions(scene, ROWS, generator)
-    want = mujoco_acceleration(scene, rows, period)
-    got = free_acceleration(scene, rows, period)
+def test_it_is_mujocos_own(scene, period, is_driven, generator):
+    rows, torque = random_transitions(scene, ROWS, generator), None
+    if is_driven:
+        torque = torch.randn(ROWS, scene.model.nv, generator=generator).double()
+        torque[:, : 6 * scene.base.is_floating] = 0.0  # no motor moves a free base
+    want = mujoco_acceleration(scene, rows, period, torque)
+    got = free_acceleration(scene, rows, period, torque)
     scale = want.abs().amax(-1, keepdim=True) + 1.0
     assert ((got - want).abs() / scale).max() < 1e-9
 

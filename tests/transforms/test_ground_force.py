@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from helpers import HANDMADE, make_scene, random_transitions
+from helpers import HANDMADE, in_ground, make_scene
 
 from torchrl_nerd.geometry.frames import rotate_inverse
 from torchrl_nerd.keys import CONTACT_FORCE, QPOS, QVEL, TERRAIN
@@ -20,20 +20,6 @@ SPRINGY = [scene for scene in SPRINGY if scene.terrain is not None]
 springy_scene = pytest.mark.parametrize(
     "scene", [s.foreseeing(True) for s in SPRINGY], ids=lambda s: s.name
 )
-
-
-def in_ground(scene, generator):
-    """Random rows, the lowest point up to 5 cm deep where the robot can be moved."""
-    rows = random_transitions(scene, ROWS, generator)
-    depth = 0.05 * torch.rand(ROWS, dtype=torch.float64, generator=generator)
-    if scene.base.is_floating:
-        state = {QPOS: rows[QPOS], QVEL: rows[QVEL]}
-        scene.set_down(state, -depth)
-        rows[QPOS] = state[QPOS]
-    elif scene.terrain.is_per_row:
-        gap = scene.clearances(rows[QPOS], rows[TERRAIN]).amin(-1)
-        rows[TERRAIN][:, 3] += gap + depth
-    return rows
 
 
 def foreseen(scene, rows):
@@ -86,7 +72,7 @@ def expect_near(scene, got, want):
 
 @springy_scene
 def test_at_rest_they_are_what_mujoco_pushes_with(scene, generator):
-    rows = in_ground(scene, generator)
+    rows = in_ground(scene, ROWS, generator)
     rows[QVEL].zero_()
     expect_near(scene, foreseen(scene, rows), mujoco_force(scene, rows))
 
@@ -94,7 +80,7 @@ def test_at_rest_they_are_what_mujoco_pushes_with(scene, generator):
 @springy_scene
 def test_a_moment_of_motion_is_damped_and_held_back_as_by_mujoco(scene, generator):
     """In a control step so short that the way along it is nothing."""
-    rows = in_ground(scene, generator)
+    rows = in_ground(scene, ROWS, generator)
     rows[QVEL] *= 1e-3  # slow enough for friction to hold
     model = copy.copy(scene.model)
     model.opt.timestep = 1e-9

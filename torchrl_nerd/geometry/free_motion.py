@@ -1,4 +1,4 @@
-"""How a robot that is let go begins to move: gravity, inertia, damping, springs.
+"""How a robot moves that nothing touches: torques, gravity, inertia, damping, springs.
 
 Every rigid body is the same as four points of a quarter of its mass each, at the even
 corners of a box about its centre: they have its centre and its moments. Where those points
@@ -13,25 +13,24 @@ import mujoco
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.linalg import cross
 
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import Base, quat_matrix
+from torchrl_nerd.geometry.kinematics import Base, cross, quat_matrix
 
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float)
 
 
 class _Inertia(NamedTuple):
-    """Mass ``(n, 1)`` and its first and second moments about the base frame's origin."""
+    """Mass ``(n, 1)`` and its moments about the base frame's origin, rows last."""
 
     mass: Tensor
-    first: Tensor  # (*batch, n, 3)
-    second: Tensor  # (*batch, n, 3, 3)
+    first: Tensor  # (3, n, N)
+    second: Tensor  # (3, 3, n, N)
 
     def momentum(self, spin: Tensor, slide: Tensor) -> tuple[Tensor, Tensor]:
-        """Angular and linear, of bodies that turn and move so, ``(*batch, n, 3)``."""
-        trace = self.second.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-        turning = trace * spin - (self.second @ spin[..., None])[..., 0]
+        """Angular and linear, of bodies that turn and move so, ``(3, n, N)``."""
+        trace = self.second[0, 0] + self.second[1, 1] + self.second[2, 2]
+        turning = trace * spin - (self.second * spin).sum(1)
         return (
             turning + cross(self.first, slide),
             self.mass * slide + cross(spin, self.first),
@@ -39,14 +38,11 @@ class _Inertia(NamedTuple):
 
     def of_groups(self, members: Tensor) -> "_Inertia":
         """Of several together, ``members (groups, n)``."""
-        second = members @ self.second.flatten(-2)
-        return _Inertia(
-            members @ self.mass, members @ self.first, second.unflatten(-1, (3, 3))
-        )
+        return _Inertia(*(members @ moment for moment in self))
 
 
 class FreeMotion(nn.Module):
-    """Acceleration of a robot on which neither motors nor ground nor limits act.
+    """Acceleration of a robot that neither ground nor limits push.
 
     | attribute | meaning |
     |---|---|
@@ -107,6 +103,7 @@ class FreeMotion(nn.Module):
         self,
         qpos: Tensor,
         qvel: Tensor,
+        torque: Tensor | None,
         rotation: Tensor,
         corners: Tensor,
         places: Tensor,
@@ -116,38 +113,49 @@ class FreeMotion(nn.Module):
         Args:
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
+            torque: of the motors on every dof, ``(*batch, nv)``; None for a robot let go.
             rotation: of the base, ``(*batch, 3, 3)``.
             corners: where ``positions`` are, ``(*batch, 4 B, 3)``, m, in B_t.
             places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m, in B_t.
         """
-        spin, slide = self._axes(places)
-        four = corners.unflatten(-2, (-1, len(CORNERS)))
-        second = (self.mass[..., None] / len(CORNERS)) * (four.mT @ four)
-        bodies = _Inertia(self.mass, self.mass * four.mean(-2), second)
+        rate, position = _rows_last(qvel, 1), _rows_last(qpos, 1)
+        spin, slide = self._axes(_rows_last(places, 2))
+        four = _rows_last(corners, 2).unflatten(1, (-1, len(CORNERS)))
+        second = (four[:, None] * four).sum(3) * (self.mass / len(CORNERS))
+        bodies = _Inertia(self.mass, four.mean(2) * self.mass, second)
         moment, force = bodies.of_groups(self.carries).momentum(spin, slide)
-        upper = self.together * (spin @ moment.mT + slide @ force.mT)
-        mass_matrix = upper + upper.mT * (1.0 - self.together) + self.extra
-        bias = self._bias(bodies, spin, slide, qvel, rotation)
-        push = -self.damping * qvel - bias
-        stretch = self.stiffness * (self.rest - qpos[..., self.qpos_addresses])
-        push = push + nn.functional.pad(stretch, (self.num_whole, 0))
-        acceleration = torch.linalg.solve(mass_matrix, push)
+        products = (
+            spin[:, :, None] * moment[:, None] + slide[:, :, None] * force[:, None]
+        )
+        upper = self.together[..., None] * products.sum(0)
+        lower = (1.0 - self.together)[..., None] * upper.transpose(0, 1)
+        mass_matrix = upper + lower + self.extra[..., None]
+        gravity = _rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
+        push = -self._bias(bodies, spin, slide, rate, gravity)
+        push = push - self.damping[:, None] * rate
+        if torque is not None:
+            push = push + _rows_last(torque, 1)
+        stretch = self.rest[:, None] - position[self.qpos_addresses]
+        stretch = self.stiffness[:, None] * stretch
+        push = torch.cat((push[: self.num_whole], push[self.num_whole :] + stretch))
+        acceleration = _solve(mass_matrix, push).movedim(0, -1).reshape(qvel.shape)
         if not self.num_whole:
             return acceleration
         linear = (rotation @ acceleration[..., :3, None])[..., 0]
         return torch.cat((linear, acceleration[..., 3:]), -1)
 
     def _axes(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """How each dof turns, and moves the base frame's origin, ``(*batch, nv, 3)``."""
-        anchor, tip = places.chunk(2, -2)
+        """How each dof turns, and moves the base frame's origin, ``(3, nv, N)``."""
+        anchor, tip = places.chunk(2, 1)
         axis = tip - anchor
         spin = (1.0 - self.is_slide) * axis
         slide = cross(anchor, spin) + self.is_slide * axis
         if self.num_whole:
             one = torch.eye(6, dtype=axis.dtype, device=axis.device)
-            one = one.expand(*axis.shape[:-2], 6, 6)
-            slide = torch.cat((one[..., :3], slide), -2)
-            spin = torch.cat((one[..., 3:], spin), -2)
+            one = one[..., None].expand(6, 6, axis.shape[-1])
+            slide, spin = (
+                torch.cat((one[k : k + 3], x), 1) for k, x in ((0, slide), (3, spin))
+            )
         return spin, slide
 
     def _bias(
@@ -155,28 +163,51 @@ class FreeMotion(nn.Module):
         bodies: _Inertia,
         spin: Tensor,
         slide: Tensor,
-        qvel: Tensor,
-        rotation: Tensor,
+        rate: Tensor,
+        gravity: Tensor,
     ) -> Tensor:
-        """Forces ``(*batch, nv)`` under which nothing would accelerate.
+        """Forces ``(nv, N)`` under which nothing would accelerate.
 
         As seen by one who moves on with the base's origin at its present velocity.
         """
-        rate = qvel[..., None]
         if self.num_whole:
-            rate = torch.cat((torch.zeros_like(rate[..., :3, :]), rate[..., 3:, :]), -2)
+            rate = torch.cat((torch.zeros_like(rate[:3]), rate[3:]))
         turned, moved = rate * spin, rate * slide
         omega, velocity = self.together.mT @ turned, self.together.mT @ moved
         bend = cross(omega, turned), cross(omega, moved) + cross(velocity, turned)
         omega, velocity = self.carries.mT @ turned, self.carries.mT @ moved
         alpha, acceleration = (self.carries.mT @ x for x in bend)
-        gravity = (rotation.mT @ self.gravity[:, None]).mT
-        moment, force = bodies.momentum(alpha, acceleration - gravity)
+        moment, force = bodies.momentum(alpha, acceleration - gravity[:, None])
         angular, linear = bodies.momentum(omega, velocity)
         force = force + cross(omega, linear)
         moment = moment + cross(omega, angular) + cross(velocity, linear)
-        along = spin * (self.carries @ moment) + slide * (self.carries @ force)
-        return along.sum(-1)
+        return (spin * (self.carries @ moment) + slide * (self.carries @ force)).sum(0)
+
+
+def _rows_last(x: Tensor, size: int) -> Tensor:
+    """``(*batch, n, d)`` (its last ``size`` dimensions) as ``(d, n, N)``."""
+    batch = x.ndim - size
+    flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])
+    return flat.permute(*range(flat.ndim - 1, -1, -1))
+
+
+def _solve(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solutions ``(n, N)`` of positive definite ``(n, n, N)`` by Gauss's elimination.
+
+    No pivots are needed, and all rows go through each step at once.
+    """
+    columns, rows = [], []
+    while len(right):
+        row = matrix[0] / matrix[0, 0]
+        columns.append(row[1:])
+        rows.append(right[0] / matrix[0, 0])
+        right = right[1:] - matrix[1:, 0] * rows[-1]
+        matrix = matrix[1:, 1:] - matrix[1:, :1] * row[1:]
+    found = [rows.pop()]
+    while rows:
+        column = columns[len(rows) - 1]
+        found.insert(0, rows.pop() - (column * torch.stack(found)).sum(0))
+    return torch.stack(found)
 
 
 def _four_points(model: mujoco.MjModel, body: int) -> np.ndarray:

@@ -258,7 +258,7 @@ class PointKinematics(nn.Module):
             motions.append(above)
         position, rotation, omega, velocity = _pick(_join(motions), self.body_of_point)
         arm = _turn(rotation, self.points)
-        velocity = velocity + _cross(omega, arm[..., : v.shape[-1]])
+        velocity = velocity + cross(omega, arm[..., : v.shape[-1]])
         return tuple(  # pyright: ignore
             x.expand(*x.shape[:-1], rows.shape[-1])
             .permute(2, 1, 0)
@@ -274,7 +274,7 @@ class PointKinematics(nn.Module):
         moving = slice(qvel.shape[-1])  # the rows that have velocities
         offset = _turn(rotation, getattr(self, f"pos_{group.name}"))
         position = position + offset
-        velocity = velocity + _cross(omega, offset[..., moving])
+        velocity = velocity + cross(omega, offset[..., moving])
         for slot, kind in enumerate(group.kinds):
             if kind == FREE:
                 continue
@@ -293,7 +293,7 @@ class PointKinematics(nn.Module):
                 if kind == SLIDE:
                     path = axis * q
                     position = position + path
-                    velocity = velocity + _cross(omega, path[..., moving])
+                    velocity = velocity + cross(omega, path[..., moving])
                     velocity = velocity + axis[..., moving] * v
                     rotation = _matmul(rotation, still)
                     continue
@@ -304,8 +304,8 @@ class PointKinematics(nn.Module):
             if not group.is_at_origin[slot]:  # the body swings about the joint's anchor
                 before = _turn(rotation, getattr(self, f"from_{name}"))
                 after = _turn(turned, getattr(self, f"anchor_{name}"))
-                velocity = velocity + _cross(omega, before[..., moving])
-                velocity = velocity - _cross(omega + spin, after[..., moving])
+                velocity = velocity + cross(omega, before[..., moving])
+                velocity = velocity - cross(omega + spin, after[..., moving])
                 position = position + before - after
             omega = omega + spin
             rotation = turned
@@ -327,7 +327,7 @@ def _matmul(a: Tensor, b: Tensor) -> Tensor:
     return torch.addcmul(product, a[:, 2:], b[2])
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
+def cross(a: Tensor, b: Tensor) -> Tensor:
     """Cross products of vectors ``(3, n, N)``: twice as fast as torch's own here."""
     pairs = (1, 2), (2, 0), (0, 1)
     return torch.stack([a[i] * b[j] - a[j] * b[i] for i, j in pairs])

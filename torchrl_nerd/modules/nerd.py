@@ -199,7 +199,7 @@ class SceneTokens(nn.Module):
     ) -> Tensor:
         """Raw tokens ``(*batch, F)`` in the dtype of the state."""
         state = self.robot.state_features(qpos, qvel)
-        contacts = self.contact.contact_features(qpos, qvel, terrain)
+        contacts = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
         return torch.cat((state, joint_torque, *contacts), -1)
 
 

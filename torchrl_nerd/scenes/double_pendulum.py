@@ -77,6 +77,8 @@ def _scene(
             ground=ground,
             clearance=clearance,
         ),
+        foresees_forces=True,
+        foresees_free_motion=True,  # a tip moves by centimetres before it touches
     )
 
 

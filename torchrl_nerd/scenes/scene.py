@@ -63,7 +63,7 @@ class Scene:
     | ``foresees_forces`` | whether the forces of its springs, at limits and contacts (see
       `scenes.penalty`), are among the features: where they decide most steps |
     | ``foresees_free_motion`` | whether contacts are foreseen along the way that the robot
-      takes if it is let go, not at constant velocity: where the onset of touch decides |
+      takes if nothing touches it, not at constant velocity: where onsets decide |
 
     Raises:
         ValueError: the model has something no NeRD can be built for (named).

@@ -10,7 +10,8 @@ Added is what decides an impact: the point's velocity, and how deep it will be i
 on: whether a point touches within the step is a threshold, which a network learns slowly
 from distance and speed. All of it fades to zero at the margin without a jump. Where a scene
 asks for it, the forces that its springs would push with on that way are worked out, too,
-and the way is that of a robot that is let go in place of one at constant velocity.
+and the way is that of a robot that nothing pushes back in place of one that keeps its
+velocity.
 """
 
 import numpy as np
@@ -29,6 +30,7 @@ from torchrl_nerd.keys import (
     CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
+    JOINT_TORQUE,
     QPOS,
     QVEL,
     TERRAIN,
@@ -51,8 +53,8 @@ class ContactFeatures(FeatureTransform):
     |---|---|---|
     | ``contact_distance`` | min(d - xi, 0), m | P |
     | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
-    | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed or, in scenes
-      that foresee free motion, if the robot were let go (see `FreeMotion`), m | K P |
+    | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed; in scenes
+      that foresee free motion, along it (see `FreeMotion`), m | K P |
     | ``contact_force`` | what springs push each dof with on that way, mean, N and N m; in
       scenes that foresee forces, see `GroundForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
@@ -99,6 +101,7 @@ class ContactFeatures(FeatureTransform):
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
         self.layout, self.step_size = scene.layout, scene.control_step
+        self.actuated = scene.actuated
         if terrain is None:
             return
         points = scene.contacts
@@ -129,7 +132,11 @@ class ContactFeatures(FeatureTransform):
             self.register_buffer(name, tensor, persistent=False)
 
     def contact_features(
-        self, qpos: Tensor, qvel: Tensor, terrain: Tensor | None = None
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        terrain: Tensor | None = None,
+        joint_torque: Tensor | None = None,
     ) -> list[Tensor]:
         """The outputs in the order of ``out_keys``, in the dtype of the inputs.
 
@@ -137,6 +144,8 @@ class ContactFeatures(FeatureTransform):
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+            joint_torque: ``(*batch, num_actuated)`` of the coming step, which free motion
+                follows; None where it is not known, as in an observation.
         """
         if self.terrain is None:
             return []
@@ -148,7 +157,11 @@ class ContactFeatures(FeatureTransform):
         mean = qvel  # velocity of the way to the step's end
         if self.free_motion is not None:
             turned = base_pose(self.base, qpos, *mount)[1]
-            gain = self.free_motion(qpos, qvel, turned, corners, places)
+            torque = None
+            if joint_torque is not None:
+                torque = torch.zeros_like(qvel)
+                torque[..., self.actuated] = joint_torque
+            gain = self.free_motion(qpos, qvel, torque, turned, corners, places)
             mean = qvel + 0.5 * self.step_size * (1.0 + 1.0 / self.substeps) * gain
         later = integrate_pos(self.layout, qpos, self.step_size * mean)
         ends, _ = self.later(later, qvel.new_empty(0, qvel.shape[-1]))
@@ -168,38 +181,46 @@ class ContactFeatures(FeatureTransform):
         gate = gate[..., None]
         speed = (velocity[..., None, :] @ normal[..., None])[..., 0]
         sliding = velocity - speed * normal
-        depth = self._coming_depth(distance, self.step_size * speed, end)
+        depth, coming = self._foresee(distance, self.step_size * speed, end)
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
         features.append((gate * depth).flatten(-2))
         if self.force is not None:
-            contact = now, normal, gate * depth, speed, sliding
+            contact = now, normal, gate * depth, coming, sliding
             features.append(self.force(*contact, places))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features
 
-    def _coming_depth(self, distance: Tensor, slope: Tensor, end: Tensor) -> Tensor:
-        """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
+    def _foresee(
+        self, distance: Tensor, slope: Tensor, end: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Penetration at K times of the step, m, at least zero, and speed along the normal.
 
-        The distance is the parabola through its value and slope now and its value
-        ``end`` after the whole step; of free motion it is the discrete one of the solver,
-        which changes velocities before positions.
+        The distance is the parabola through its value and slope now and its value ``end``
+        after the whole step. Of free motion it is the discrete one of the solver, which
+        changes velocities before positions, and the speed changes on the way.
+
+        Returns:
+            ``(*batch, P, K)``, m, and ``(*batch, P, 1)`` or, of free motion, ``(*batch, P,
+            K)``, m/s.
         """
         start = (self.radii - distance)[..., None]
         bend = self.radii[:, None] - end[..., None] - start + slope
-        squares = self.glances**2
+        speed, squares = slope / self.step_size, self.glances**2
         if self.free_motion is not None:
-            squares = (squares + self.glances / self.substeps) / (
-                1.0 + 1.0 / self.substeps
-            )
+            whole = 1.0 + 1.0 / self.substeps
+            squares = (squares + self.glances / self.substeps) / whole
+            speed = speed - bend * (2.0 / (whole * self.step_size)) * self.glances
         powers = torch.stack((-self.glances, squares))
         path = start + torch.cat((slope, bend), -1) @ powers
-        return path.clamp_min(0.0)
+        return path.clamp_min(0.0), speed
 
     def _features(self, tensordict: TensorDictBase) -> dict:
         if self.terrain is None:
             return {}
         terrain = tensordict[TERRAIN] if self.terrain.is_per_row else None
-        values = self.contact_features(tensordict[QPOS], tensordict[QVEL], terrain)
+        torque = tensordict.get(JOINT_TORQUE, None)
+        state = tensordict[QPOS], tensordict[QVEL]
+        values = self.contact_features(*state, terrain, torque)
         return dict(zip(self.out_keys, values, strict=True))
