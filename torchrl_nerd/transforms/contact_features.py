@@ -181,40 +181,33 @@ class ContactFeatures(FeatureTransform):
         gate = gate[..., None]
         speed = (velocity[..., None, :] @ normal[..., None])[..., 0]
         sliding = velocity - speed * normal
-        depth, coming = self._foresee(distance, self.step_size * speed, end)
+        depth = self._coming_depth(distance, self.step_size * speed, end)
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
         features.append((gate * depth).flatten(-2))
         if self.force is not None:
-            contact = now, normal, gate * depth, coming, sliding
+            contact = now, normal, gate * depth, speed, sliding
             features.append(self.force(*contact, places))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features
 
-    def _foresee(
-        self, distance: Tensor, slope: Tensor, end: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Penetration at K times of the step, m, at least zero, and speed along the normal.
+    def _coming_depth(self, distance: Tensor, slope: Tensor, end: Tensor) -> Tensor:
+        """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
 
         The distance is the parabola through its value and slope now and its value ``end``
-        after the whole step. Of free motion it is the discrete one of the solver, which
-        changes velocities before positions, and the speed changes on the way.
-
-        Returns:
-            ``(*batch, P, K)``, m, and ``(*batch, P, 1)`` or, of free motion, ``(*batch, P,
-            K)``, m/s.
+        after the whole step; of free motion it is the discrete one of the solver, which
+        changes velocities before positions.
         """
         start = (self.radii - distance)[..., None]
         bend = self.radii[:, None] - end[..., None] - start + slope
-        speed, squares = slope / self.step_size, self.glances**2
+        squares = self.glances**2
         if self.free_motion is not None:
             whole = 1.0 + 1.0 / self.substeps
             squares = (squares + self.glances / self.substeps) / whole
-            speed = speed - bend * (2.0 / (whole * self.step_size)) * self.glances
         powers = torch.stack((-self.glances, squares))
         path = start + torch.cat((slope, bend), -1) @ powers
-        return path.clamp_min(0.0), speed
+        return path.clamp_min(0.0)
 
     def _features(self, tensordict: TensorDictBase) -> dict:
         if self.terrain is None:

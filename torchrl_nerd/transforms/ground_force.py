@@ -65,7 +65,7 @@ class GroundForce(nn.Module):
             points: ``(*batch, P, 3)``, m, as all that follows in and relative to B_t.
             normal: of the ground at each, ``(*batch, P, 3)``.
             depth: at K times of the step, ``(*batch, P, K)``, m, zero beside the ground.
-            speed: along the normal, then too or once, ``(*batch, P, K or 1)``, m/s.
+            speed: along the normal, ``(*batch, P, 1)``, m/s.
             sliding: across it, ``(*batch, P, 3)``, m/s.
             places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m.
         """
