@@ -14,6 +14,7 @@ from torchrl_nerd.data.generate import (
     generate,
     is_sound,
     load_data,
+    load_data_sets,
     simulate,
 )
 from torchrl_nerd.files import read_json
@@ -46,6 +47,22 @@ def test_layout_is_torchrls(scene, tmp_path, seed):
     card = read_json(tmp_path / "data.json")
     assert (card["trajectories"], card["dropped"]) == (7, 0)
     assert card["scene_hash"] == scene.hash and card["config"]["seed"] == seed
+
+
+def test_sets_follow_each_other_in_the_order_given(scene, tmp_path, seed):
+    folders = [tmp_path / name for name in "abc"]
+    counts = (3, 1, 4)
+    for i, (folder, count) in enumerate(zip(folders, counts, strict=True)):
+        config = DataConfig(trajectories=count, steps=2, seed=seed + i)
+        generate(scene, config, folder, quiet=True)
+    for order in (folders, folders[::-1], folders[:1]):
+        parts = [load_data(scene, folder) for folder in order]
+        assert not unequal(load_data_sets(scene, order), torch.cat(parts))
+    generate(scene, DataConfig(trajectories=2, steps=3), tmp_path / "d", quiet=True)
+    with pytest.raises(ValueError, match=f"of 2 steps in {tmp_path}/d, as .*/a, got 3"):
+        load_data_sets(scene, [*folders, tmp_path / "d"])
+    with pytest.raises(ValueError, match=f"data set in {tmp_path}/none"):
+        load_data_sets(scene, [*folders, tmp_path / "none"])
 
 
 def test_every_transition_obeys_the_true_dynamics(scene, generator):

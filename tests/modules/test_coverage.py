@@ -6,7 +6,8 @@ from safetensors.torch import load_file, save_file
 
 from torchrl_nerd.checkpoint import WEIGHTS, load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.training.sequences import normalised
+from torchrl_nerd.modules.coverage import Coverage
+from torchrl_nerd.training.sequences import cover, normalised
 
 ROWS = 16
 
@@ -44,6 +45,26 @@ def test_whatever_comes_in_speeds_stay_bounded(scene, generator):
             now = dynamics.step(now, torque, terrain)
             assert now["qpos"].isfinite().all()
             assert (model.coverage.sizes(now["qvel"]) <= limit).all()
+
+
+def test_widened_bounds_hold_both_and_trust_stays(scene, generator):
+    model, other = (random_model(scene, generator) for _ in range(2))
+    data = little_data(scene)[::2]
+    data["next", "qvel"] = 3.0 * data["next", "qvel"]
+    cover(other, data)
+    mine, trust = model.coverage, ("center", "whitening", "reach", "still")
+    before = {key: value.clone() for key, value in mine.state_dict().items()}
+    mine.widen(Coverage(scene, model.tokens.size, model.state_delta.size))  # saw none
+    assert all(torch.equal(mine.state_dict()[k], v) for k, v in before.items())
+    mine.widen(other.coverage)
+    for key, value in mine.state_dict().items():
+        theirs = other.coverage.state_dict()[key]
+        if key in trust:
+            assert torch.equal(value, before[key])
+        else:
+            wider = torch.minimum if key.endswith("low") else torch.maximum
+            assert torch.equal(value, wider(before[key], theirs)), key
+    assert (mine.speed > before["speed"]).any()
 
 
 def test_joints_with_limits_stop_where_the_data_end(scene, generator):

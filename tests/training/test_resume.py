@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from dynamics_helpers import random_model
 from safetensors.torch import load_file
 from torch import Generator
 
 from torchrl_nerd.data.generate import simulate
 from torchrl_nerd.files import read_json
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.trainer import TrainConfig, Trainer
@@ -84,11 +86,11 @@ assert statuses == [signal.SIGKILL] * len(statuses), statuses
 """
 
 
-def make_trainer(folder: Path) -> Trainer:
+def make_trainer(folder: Path, start: NeRD | None = None) -> Trainer:
     scene = load_scene(SCENE)
     data = simulate(scene, 60, 10, Generator().manual_seed(1))
-    task = make_task(TASK)
-    return Trainer(scene, data, task, CONFIG, folder, horizons=(2, 4), quiet=True)
+    task, how = make_task(TASK), {"horizons": (2, 4), "quiet": True}
+    return Trainer(scene, data, task, CONFIG, folder, start=start, **how)
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +141,21 @@ def test_a_stopped_run_goes_on_to_the_same_bits(stop, whole, tmp_path):
     assert resumed.step == stop // CONFIG.save_every * CONFIG.save_every
     resumed.run()
     assert_same_bits(tmp_path, whole)
+
+
+def test_a_run_with_a_start_goes_on_to_the_same_bits(tmp_path, generator):
+    start = random_model(load_scene(SCENE), generator, CONFIG.network)
+    for folder in ("whole", "stopped"):
+        until = PHASES["rollout"] if folder == "stopped" else None
+        make_trainer(tmp_path / folder, start).run(until)
+    resumed = make_trainer(tmp_path / "stopped", start)
+    assert 0 < resumed.step < CONFIG.total_steps
+    resumed.run()
+    assert_same_bits(tmp_path / "stopped", tmp_path / "whole")
+    other = random_model(load_scene(SCENE), generator, CONFIG.network)
+    for another in (other, None):
+        with pytest.raises(ValueError, match="stopped holds a run with start"):
+            make_trainer(tmp_path / "stopped", another)
 
 
 @pytest.mark.parametrize(("name", "call"), MOMENTS, ids=lambda value: str(value))

@@ -18,6 +18,7 @@ from torchrl_nerd.cli.options import (
 from torchrl_nerd.data.generate import (
     CARD,
     DataConfig,
+    Draw,
     draw_chunk,
     generate,
     load_data,
@@ -29,6 +30,7 @@ from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training.policy_strategy import along_policy
 from torchrl_nerd.training.recipes import recipe_of
 
 
@@ -43,6 +45,8 @@ class Data(Command):
     Example: nerd data cartpole --inspect
 
     Example: nerd data ant --trajectories 1000000 --ray auto
+
+    Example: nerd data ant --policy runs/ppo_ant --out datasets/ant_policy
     """
 
     scene: Positional[str]
@@ -56,6 +60,11 @@ class Data(Command):
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
+    policy: Path | None = None
+    """Folder of a policy, as examples/ppo.py writes it: draw along its way, with noise on
+    its actions, from the starts of its task."""
+    noise: float = 0.5
+    """Of a policy's actions: a standard deviation from U(0, this) for each trajectory."""
     inspect: bool = False
     """Write a page about the data set, made before or now, to report.html in its folder."""
     ray: str | None = None
@@ -69,13 +78,19 @@ class Data(Command):
         """Where drawn data go."""
         return self.out or Path("datasets") / run_name(self.scene, self.fine)
 
+    def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
+        """What draws: the policy, or the scene's recipe."""
+        if self.policy is not None:
+            return along_policy(scene, self.policy, self.noise)
+        return recipe_of(self.scene).draw(scene)
+
     def plan(self) -> list[str]:
         """How much would be drawn, and how much is there."""
         if self.recorded is not None:
             tosses, _ = load_tosses(self.recorded, real_scene(self.scene))
             return [f"take over {len(tosses)} recorded tosses"]
         scene, out = scene_of(self.scene, self.fine), self.folder
-        _, draw = recipe_of(self.scene).draw(scene) or plain_strategy(scene)
+        _, draw = self.strategy(scene) or plain_strategy(scene)
         one = draw_chunk(draw, self.config, (0, 1)).bytes()
         wanted, there = self.config.trajectories, 0
         if (out / CARD).exists():
@@ -88,10 +103,11 @@ class Data(Command):
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card."""
         if self.recorded is not None:
-            if self.inspect:
-                raise ValueError(
-                    "expected --inspect without --from: it is of drawn data"
-                )
+            for name, is_given in (("inspect", self.inspect), ("policy", self.policy)):
+                if is_given:
+                    raise ValueError(
+                        f"expected --{name} without --from: it is of drawn data"
+                    )
             scene = real_scene(self.scene)
             out = self.out or Path("datasets") / f"{scene.name}_recorded"
             card = write_tosses(self.recorded, scene, out)
@@ -100,7 +116,7 @@ class Data(Command):
             return card
         scene = scene_of(self.scene, self.fine)
         out = self.folder
-        draw = recipe_of(self.scene).draw(scene)
+        draw = self.strategy(scene)
         mapper = partial(ray_map, address=self.ray) if self.ray else map
         generate(scene, self.config, out, self.quiet, draw, mapper)
         card = read_json(out / CARD)

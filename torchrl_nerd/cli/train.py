@@ -6,16 +6,18 @@ from typing import Any
 
 import torch
 
-from torchrl_nerd.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
 from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
-from torchrl_nerd.data.generate import CARD, generate, load_data
+from torchrl_nerd.data.generate import CARD, generate, load_data_sets
 from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName
 from torchrl_nerd.training.recipes import recipe_of
+from torchrl_nerd.training.start import begin_from
 from torchrl_nerd.training.trainer import STATE, TrainConfig, Trainer
 
 
@@ -28,6 +30,8 @@ class Train(Command):
     processors or GPUs: torchrun --nproc-per-node 2 -m torchrl_nerd.cli train SCENE
 
     Example: nerd train cartpole --out runs/cartpole --network mlp
+
+    Example: nerd train ant --start ant --data datasets/ant datasets/ant_policy
     """
 
     scene: Positional[str]
@@ -35,8 +39,12 @@ class Train(Command):
     or an MJCF file."""
     out: Path | None = None
     """Folder of the run; runs/SCENE by default."""
-    data: Path | None = None
-    """Folder of the data set; datasets/SCENE by default."""
+    data: tuple[Path, ...] = ()
+    """Folders of data sets, learned from together; datasets/SCENE by default. A single one
+    is drawn if it is not there."""
+    start: str | None = None
+    """Begin with the weights and statistics of a shipped model, by name, or of a checkpoint
+    folder."""
     fine: bool = False
     """Learn from a finer teacher: MuJoCo's RK4 at four times the scene's substeps;
     runs/SCENE-fine and datasets/SCENE-fine by default."""
@@ -53,21 +61,28 @@ class Train(Command):
     """No progress bar."""
 
     @property
-    def folders(self) -> tuple[Path, Path]:
-        """Of the run and of its data."""
+    def folders(self) -> tuple[Path, tuple[Path, ...]]:
+        """Of the run and of its data sets."""
         name = run_name(self.scene, self.fine)
-        return self.out or Path("runs") / name, self.data or Path("datasets") / name
+        return self.out or Path("runs") / name, self.data or (Path("datasets") / name,)
+
+    def begin(self, scene: Scene) -> NeRD | None:
+        """The model to start from, where there is one."""
+        return None if self.start is None else from_pretrained(self.start, scene)
 
     def plan(self) -> list[str]:
         """What would be trained on what, and what is there."""
-        scene, (out, data) = scene_of(self.scene, self.fine), self.folders
-        network = NeRD(scene, network_config(self.config.network)).network
-        weights = sum(weight.numel() for weight in network.parameters())
+        scene, (out, folders) = scene_of(self.scene, self.fine), self.folders
+        model = NeRD(scene, network_config(self.config.network))
+        start = self.begin(scene)
+        if start is not None:
+            model = begin_from(start, scene, self.config.network)
+        weights = sum(weight.numel() for weight in model.network.parameters())
         count = recipe_of(self.scene).data.trajectories
         return [
-            f"use the data in {data}"
-            if (data / CARD).exists()
-            else f"draw {count} trajectories, to {data}",
+            f"draw {count} trajectories, to {folders[0]}"
+            if _is_drawn(folders)
+            else f"use the data in {', '.join(map(str, folders))}",
             f"go on with the run in {out}"
             if (out / STATE).exists()
             else f"begin a run in {out}",
@@ -77,18 +92,19 @@ class Train(Command):
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the recipe takes."""
         scene = scene_of(self.scene, self.fine)
-        recipe, (out, folder) = recipe_of(self.scene), self.folders
+        recipe, (out, folders) = recipe_of(self.scene), self.folders
+        start = self.begin(scene)
         writable_folder(out)
         ranks.join(torch.device(self.device))
-        if ranks.rank() == 0 and not (folder / CARD).exists():
-            generate(scene, recipe.data, folder, self.quiet, recipe.draw(scene))
+        if ranks.rank() == 0 and _is_drawn(folders):
+            generate(scene, recipe.data, folders[0], self.quiet, recipe.draw(scene))
         ranks.wait()
         if self.threads:
             torch.set_num_threads(self.threads)
         protocol = protocol_of(scene)
         trainer = Trainer(
             scene,
-            load_data(scene, folder),
+            load_data_sets(scene, folders),
             recipe.source(scene),
             self.config,
             out,
@@ -97,6 +113,7 @@ class Train(Command):
             random_actions=bool(protocol.random_actions),
             quiet=self.quiet,
             logger=self.logger,
+            start=start,
         )
         trainer.run()
         made = out / recipe.exports
@@ -108,6 +125,11 @@ class Train(Command):
                 save_checkpoint(load_checkpoint(made, scene), self.export, card)
             print(f"{recipe.exports} checkpoint in {made}: {_curve(card)}")
         return card
+
+
+def _is_drawn(folders: tuple[Path, ...]) -> bool:
+    """Whether the data are yet to be drawn: a single set that is not there."""
+    return len(folders) == 1 and not (folders[0] / CARD).exists()
 
 
 def _curve(card: dict[str, Any]) -> str:

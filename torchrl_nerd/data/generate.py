@@ -7,7 +7,7 @@ JSON card beside it.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -205,6 +205,25 @@ def load_data(scene: Scene, folder: Path) -> TensorDict:
     expect_layout(data, scene, config.steps, folder)
     expect_finite(data, folder)
     return data
+
+
+def load_data_sets(scene: Scene, folders: Sequence[Path]) -> TensorDict:
+    """Finished data sets of one scene, one after the other, ``[trajectories, steps]``.
+
+    A single one stays memory-mapped; several are copied to memory.
+
+    Raises:
+        ValueError: as of `load_data`, or trajectories of several lengths.
+    """
+    sets = [load_data(scene, folder) for folder in folders]
+    for folder, data in zip(folders, sets, strict=True):
+        steps, expected = data.batch_size[1], sets[0].batch_size[1]
+        if steps != expected:
+            raise ValueError(
+                f"expected trajectories of {expected} steps in {folder}, as in "
+                f"{folders[0]}, got {steps}"
+            )
+    return sets[0] if len(sets) == 1 else cast(TensorDict, TensorDict.cat(sets))
 
 
 def _open_card(

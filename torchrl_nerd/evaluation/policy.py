@@ -11,7 +11,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import ACTION, OBSERVATION
-from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks import Task, make_task
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
@@ -120,9 +120,7 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
     Raises:
         ValueError: in one sentence, what is missing, broken or of another shape.
     """
-    if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
-        raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no policy")
-    found = read_json(folder / CARD).get("sizes")
+    found = _read_card(folder).get("sizes")
     sizes = found if isinstance(found, list) else []
     if not 2 <= len(sizes) <= MOST_LAYERS or not all(
         type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes
@@ -142,3 +140,21 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
     policy = Policy(sizes)
     policy.load_state_dict(tensors)
     return policy.eval()
+
+
+def policy_task(folder: Path) -> Task:
+    """The task that a policy was learned for, which its card names.
+
+    Raises:
+        ValueError: no policy there, or a card that names no task.
+    """
+    name = _read_card(folder).get("task")
+    if not isinstance(name, str):
+        raise ValueError(f"expected the task's id in {folder / CARD}, got {name!r}")
+    return make_task(name)
+
+
+def _read_card(folder: Path) -> dict[str, Any]:
+    if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
+        raise ValueError(f"expected {WEIGHTS} and {CARD} in {folder}, found no policy")
+    return read_json(folder / CARD)

@@ -97,9 +97,26 @@ class Coverage(nn.Module):
         ridge = RIDGE * torch.eye(len(center), dtype=some.dtype, device=some.device)
         values, axes = torch.linalg.eigh(spread + ridge)
         self.center.copy_(center)
-        self.whitening.copy_((axes / values.sqrt()).T)
+        # the ridge bounds them from below, but for rounding beside a huge one
+        self.whitening.copy_((axes / values.clamp_min(RIDGE).sqrt()).T)
         length = self.mahalanobis(some.to(tokens.dtype))
         self.reach.copy_(torch.quantile(length, QUANTILE))
+
+    @torch.no_grad()
+    def widen(self, other: "Coverage") -> None:
+        """Take the bounds of another one's data in; trust and rest stay one's own.
+
+        Those are quantiles of data that are not at hand. Nothing is changed where the
+        other one has seen none.
+        """
+        if not other.is_fitted:
+            return
+        for name in ("token", "target", "qpos"):
+            for end, wider in (("low", torch.minimum), ("high", torch.maximum)):
+                mine = self.get_buffer(f"{name}_{end}")
+                theirs = other.get_buffer(f"{name}_{end}").to(mine.device)
+                mine.copy_(wider(mine, theirs))
+        self.speed.copy_(torch.maximum(self.speed, other.speed.to(self.speed.device)))
 
     def clamp_token(self, token: Tensor) -> Tensor:
         """Normalised tokens ``(*batch, F)``, each entry within the box; NaN stays."""

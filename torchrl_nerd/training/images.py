@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl_nerd.transforms import Stats
 
 SAME = 1e-7  # relative to the largest of a column
+ALIKE = 1e-3  # standard deviations: more than rounding, less than a network sees
 
 
 class Images:
@@ -45,6 +46,12 @@ class Images:
         for other in others:
             merged = merged.merge(other)
         return merged
+
+    def keep(self, mean: Tensor, std: Tensor) -> bool:
+        """Whether images of samples of these statistics ``(F,)`` have the same ones."""
+        means, stds = self.signs * mean[self.sources], std[self.sources]
+        apart = torch.maximum((means - mean).abs(), (stds - std).abs())
+        return bool((apart < ALIKE * std).all())
 
     def to(self, device: torch.device) -> "Images":
         """On another device, in place."""

@@ -14,7 +14,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.images import Images, telling_rows
 from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_contact
-from torchrl_nerd.transforms import StateDelta, Stats
+from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 PART = 1024  # trajectories turned into tokens at a time
 LOOK = 8  # parts in which images of tokens are looked for
@@ -60,6 +60,13 @@ class Symmetry:
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
         """Statistics of tokens and targets with all their images."""
         return {key: self.images[str(key)].complete(x) for key, x in stats.items()}
+
+    def keeps(self, normalize: Normalize) -> bool:
+        """Whether images of normalised tokens and targets are those of raw ones."""
+        return all(
+            image.keep(normalize.mean(key), normalize.std(key))
+            for key, image in self.images.items()
+        )
 
     def to(self, device: torch.device) -> "Symmetry":
         """The same on another device."""

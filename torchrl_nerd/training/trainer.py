@@ -4,7 +4,7 @@ import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -29,7 +29,8 @@ from torchrl_nerd.training.loggers import LoggerName, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
 from torchrl_nerd.training.rest import find_rest, resting
-from torchrl_nerd.training.sequences import Sequences, Symmetry, cover, data_stats
+from torchrl_nerd.training.sequences import Sequences, Symmetry, cover
+from torchrl_nerd.training.start import begin_from, fingerprint, fresh_model
 
 STATE = "state.json"  # of a run that can go on
 VALIDATION_SEED = 1_000_003
@@ -124,9 +125,12 @@ class Trainer:
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
         logger: ``tensorboard``, ``wandb``, ``mlflow``, or ``csv`` for the table alone.
+        start: a model to begin with, see `begin_from`; bounds are those of its data and
+            these, trust and rest of these alone.
 
     Raises:
-        ValueError: the folder cannot be written or holds a run of another configuration.
+        ValueError: the folder cannot be written or holds a run of another configuration,
+            or a start that does not fit.
     """
 
     def __init__(
@@ -141,6 +145,7 @@ class Trainer:
         random_actions: bool = False,
         quiet: bool = False,
         logger: LoggerName = "tensorboard",
+        start: NeRD | None = None,
     ) -> None:
         self.logger: LoggerName = logger
         self.scene, self.source, self.config = scene, source, config
@@ -157,15 +162,18 @@ class Trainer:
                 f"got {data.batch_size[1]}"
             )
         torch.manual_seed(config.seed)
-        stats, symmetry = data_stats(scene, data), None
-        if config.use_symmetry:
-            symmetry = Symmetry.of(scene, data)
-            stats = symmetry.complete(stats)
-        model = NeRD(scene, network_config(config.network), stats)
+        symmetry = Symmetry.of(scene, data) if config.use_symmetry else None
+        if start is None:
+            model = fresh_model(scene, data, config.network, symmetry)
+        else:
+            model = begin_from(start, scene, config.network, symmetry)
+        self.start = None if start is None else fingerprint(start)
         self.sequences = Sequences(model, data, self.device, symmetry)
         self.model, self.resting = model.to(self.device), resting(self.sequences.data)
         samples = self.sequences.tokens, self.sequences.targets
         cover(self.model, self.sequences.data, samples)
+        if start is not None:
+            self.model.coverage.widen(start.coverage)
         matrices, others = split_parameters(self.model.network)
         self.optimizers: dict[str, torch.optim.Optimizer] = {
             "muon": Muon(matrices, lr=config.lr),
@@ -333,9 +341,7 @@ class Trainer:
         tensors["step"] = torch.tensor(self.step)
         tensors["best"] = torch.tensor(self.best, dtype=torch.float64)
         write_tensors(self.folder / "state.safetensors", tensors)
-        card = {"config": asdict(self.config), "scene_hash": self.scene.hash}
-        card |= {"seconds": self.seconds}
-        write_json(self.folder / STATE, card)
+        write_json(self.folder / STATE, self._identity | {"seconds": self.seconds})
 
     def _save_model(
         self, name: str, errors: dict[int, dict[str, ErrorSummary]]
@@ -352,16 +358,22 @@ class Trainer:
                 "device": str(self.device),
                 "threads": torch.get_num_threads(),
                 "trajectories": len(self.sequences.tokens),
+                "start": self.start,
             },
             "validation_error": curve,
         }
         model = self.averaged_model()
         save_checkpoint(model, self.folder / name, make_card(model, training))
 
+    @property
+    def _identity(self) -> dict[str, Any]:
+        """What a run that goes on must have in common with the one that stopped."""
+        config, scene_hash = asdict(self.config), self.scene.hash
+        return {"config": config, "scene_hash": scene_hash, "start": self.start}
+
     def _resume(self) -> None:
         card = read_json(self.folder / STATE)
-        expected = {"config": asdict(self.config), "scene_hash": self.scene.hash}
-        for key, value in expected.items():
+        for key, value in self._identity.items():
             if card.get(key) != value:
                 raise ValueError(
                     f"{self.folder} holds a run with {key} {card.get(key)}, asked for "

@@ -100,6 +100,10 @@ class Normalize(Transform):
         mean, std = self._constants(key)
         return (mean + std * x.double()).to(x.dtype)
 
+    def mean(self, key: NestedKey) -> Tensor:
+        """Mean ``(D,)``, float64."""
+        return self._constants(key)[0]
+
     def std(self, key: NestedKey) -> Tensor:
         """Standard deviation ``(D,)``, float64."""
         return self._constants(key)[1]

@@ -1,0 +1,172 @@
+"""A training that begins from a checkpoint: nothing lost, nothing reinterpreted."""
+
+import pytest
+import torch
+from dynamics_helpers import little_data, random_drive, random_model
+from torch import Generator
+
+from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
+from torchrl_nerd.cli import main
+from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.files import read_json
+from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
+from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.training import trainer
+from torchrl_nerd.training.sequences import Symmetry, cover, data_stats
+from torchrl_nerd.training.start import begin_from, fingerprint
+from torchrl_nerd.training.trainer import TrainConfig, Trainer
+
+CONFIG = TrainConfig(
+    network="tiny",
+    steps=6,
+    rollout_steps=2,
+    rows=4,
+    length=3,
+    rollout_rows=4,
+    rollout_length=3,
+    save_every=4,
+    validate_every=8,
+)
+HOW = {"horizons": (2, 3), "quiet": True, "logger": "csv"}
+CARTPOLE = load_scene("cartpole")
+
+
+def path(model, drive):
+    """States along the way of a model."""
+    state, torques, terrain = drive
+    dynamics, states = NeRDDynamics(model.eval()), []
+    now = state.clone()
+    dynamics.reset(now)
+    for torque in torques:
+        now = dynamics.step(now, torque, terrain)
+        states.append(torch.cat((now["qpos"], now["qvel"]), -1))
+    return torch.stack(states)
+
+
+def other_data(scene, seed):
+    data = simulate(scene, 40, 4, Generator().manual_seed(seed))
+    return data[is_sound(data)]
+
+
+def test_without_an_update_nothing_is_other_than_at_the_start(
+    scene, tmp_path, generator
+):
+    start, drive = random_model(scene, generator), random_drive(scene, 4, 6, generator)
+    before = fingerprint(start)
+    trainer = Trainer(
+        scene, little_data(scene), scene, CONFIG, tmp_path, **HOW, start=start
+    )
+    begun = trainer.averaged_model()
+    assert torch.equal(path(begun, drive), path(start, drive))
+    assert fingerprint(start) == before
+
+
+def test_statistics_are_frozen_and_bounds_do_not_shrink(
+    scene, tmp_path, generator, seed
+):
+    start = random_model(scene, generator)
+    data = other_data(scene, seed)
+    trained = Trainer(scene, data, scene, CONFIG, tmp_path, **HOW, start=start).run()
+    old, new = start.state_dict(), load_checkpoint(tmp_path / "last").state_dict()
+    assert all(torch.equal(new[k], v) for k, v in trained.state_dict().items())
+    for key, value in old.items():
+        if key.startswith("normalize."):
+            assert torch.equal(new[key], value)
+        elif key.startswith("coverage.") and key.endswith("_low"):
+            assert (new[key] <= value).all()
+        elif key.startswith("coverage.") and key.endswith(("_high", "speed")):
+            assert (new[key] >= value).all()
+    moved = [k for k in old if k.startswith("network.") and not old[k].equal(new[k])]
+    assert moved
+    own = NeRD(scene, start.config)
+    own.load_state_dict(old)
+    cover(own, data)
+    assert torch.equal(new["coverage.center"], own.coverage.center)
+    card = read_json(tmp_path / "last" / "card.json")
+    assert card["training"]["start"] == fingerprint(start)
+
+
+@pytest.mark.parametrize("name", [n for n in SCENES if load_scene(n).foresees_forces])
+def test_features_of_another_width_are_refused_in_a_sentence(name, generator):
+    scene = load_scene(name)
+    start = random_model(scene.foreseeing(False), generator)
+    begin_from(start, start.scene, "tiny")
+    sizes = start.tokens.size, NeRD(scene, start.config).tokens.size
+    if sizes[0] != sizes[1]:
+        with pytest.raises(ValueError, match=f"{sizes[1]} features.*got {sizes[0]}"):
+            begin_from(start, scene, "tiny")
+
+
+def test_the_scene_is_used_as_it_is_given(generator):
+    """Another scene of the same widths: weights and statistics are kept."""
+    start = random_model(CARTPOLE, generator)
+    scene = CARTPOLE.fine
+    model = begin_from(start, scene, "tiny")
+    assert model.scene is scene
+    for part in ("network", "normalize"):
+        mine, theirs = (getattr(m, part).state_dict() for m in (model, start))
+        assert all(torch.equal(mine[k], v) for k, v in theirs.items())
+    assert not model.coverage.is_fitted
+
+
+def test_other_networks_are_refused(generator):
+    start = random_model(CARTPOLE, generator, "mlp")
+    with pytest.raises(ValueError, match="network.*start from, mlp, got tiny"):
+        begin_from(start, CARTPOLE, "tiny")
+    cube = load_scene("cube_real")
+    residual = ResidualNeRD(cube, ResidualConfig())
+    with pytest.raises(ValueError, match="start from, ResidualConfig.*got mlp"):
+        begin_from(residual, cube, "mlp")
+
+
+def test_images_need_statistics_that_they_share(generator):
+    scene, config = load_scene("ant"), NETWORKS["mlp-nano"]
+    data = simulate(scene, 64, 4, generator)
+    data = data[is_sound(data)]
+    symmetry, stats = Symmetry.of(scene, data), data_stats(scene, data)
+    shared = NeRD(scene, config, symmetry.complete(stats))
+    begin_from(shared, scene, "mlp-nano", symmetry)
+    alone = NeRD(scene, config, stats)
+    begin_from(alone, scene, "mlp-nano")
+    with pytest.raises(ValueError, match="trained on symmetry images"):
+        begin_from(alone, scene, "mlp-nano", symmetry)
+
+
+def test_the_shipped_ant_can_be_shown_images(generator):
+    scene = load_scene("ant")
+    model, data = from_pretrained("ant", scene), simulate(scene, 16, 4, generator)
+    begin_from(model, model.scene, "mlp-larger", Symmetry.of(model.scene, data))
+
+
+ARGS = ["train", "cartpole", "--quiet", "--rows", "4", "--rollout-rows", "4"]
+ARGS += ["--steps", "3", "--rollout-steps", "1", "--length", "2", "--logger", "csv"]
+ARGS += ["--rollout-length", "2", "--validate-every", "4"]
+
+
+def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(trainer, "VALIDATION_ROWS", 2)
+    for out, seed in (("a", "1"), ("b", "2")):
+        sizes = ["--trajectories", "9", "--steps", "110", "--seed", seed, "--quiet"]
+        assert main(["data", "cartpole", "--out", out, *sizes]) == 0
+    argv = [*ARGS, "--data", "a", "b", "--start", "cartpole", "--out", "on"]
+    assert main([*argv, "--dry-run"]) == 0
+    assert "use the data in a, b" in capsys.readouterr().out
+    assert main(argv) == main(argv) == 0
+    training = read_json(tmp_path / "on" / "last" / "card.json")["training"]
+    assert training["trajectories"] == 18
+    assert training["start"] == fingerprint(from_pretrained("cartpole"))
+    assert main([*ARGS, "--data", "a", "--start", "on/last", "--dry-run"]) == 0
+    capsys.readouterr()
+    for options, words in (
+        (["--data", "a", "--start", "ant"], "is for robot 'ant', expected 'cartpole'"),
+        (["--data", "a", "--start", "none"], "checkpoint folder, got 'none'"),
+        (["--data", "a", "--start", "cartpole-micro"], "start from, mlp-micro, got"),
+        (["--data", "a", "none"], "expected a data set in none"),
+        (["--data", "a", "--start", "on/last", "--out", "on"], "run with start"),
+    ):
+        assert main([*ARGS, "--out", "new", *options]) == 2
+        said = capsys.readouterr().err
+        assert words in said and said.count("\n") == 1
