@@ -165,12 +165,18 @@ def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
 
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
     """Tokens and targets of transitions, normalised, ``(trajectories, steps, D)``."""
-    tokens, targets = [], []
-    for part in data.split(PART):
-        token, target = raw_tokens(model.tokens, model.state_delta, part)
-        tokens.append(model.normalize.normalize(TOKEN, token).float())
-        targets.append(model.normalize.normalize(TARGET, target).float())
-    return torch.cat(tokens), torch.cat(targets)
+    rows, steps = data.batch_size
+    tokens, targets = (
+        torch.empty(rows, steps, size, device=data[QPOS].device)
+        for size in (model.tokens.size, model.state_delta.size)
+    )
+    for part, *places in zip(
+        data.split(PART), tokens.split(PART), targets.split(PART), strict=True
+    ):
+        raw = raw_tokens(model.tokens, model.state_delta, part)
+        for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
+            place.copy_(model.normalize.normalize(key, value))
+    return tokens, targets
 
 
 def cover(
