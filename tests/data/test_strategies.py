@@ -285,7 +285,7 @@ def test_nudged_robots_are_stopped_where_they_fell_and_pushed(scene, generator):
 
 
 def test_a_cube_stopped_on_a_steep_slope_begins_to_slide_anew(generator):
-    scene, rows, steps = load_scene("cube_slope"), 24, 40
+    scene, rows, steps = load_scene("cube_slope"), 24, 148
     start = Nudged(Fallen(scene))(rows, generator)
     steep = start["terrain"][:, 2].acos() > math.atan(0.25)  # friction: 0.15
     torque = torch.zeros(rows, steps, 0, dtype=torch.float64)
@@ -294,4 +294,4 @@ def test_a_cube_stopped_on_a_steep_slope_begins_to_slide_anew(generator):
     downhill = start["terrain"][:, None, :2]
     speed = (path["qvel"][..., :2] * downhill).sum(-1) / downhill.norm(dim=-1)
     gained = speed[:, -1] - speed[:, 0]
-    assert steep.any() and (gained[steep] > 0.1).all()
+    assert steep.any() and (gained[steep] > 0.5).all()  # g (sin - mu cos): 0.95
