@@ -98,7 +98,7 @@ def test_a_model_that_does_not_rest_stays_as_it_is(name, generator):
 
 def test_states_at_rest_are_found(generator):
     rows, steps = 30, 40
-    speed = torch.rand(rows, steps, 1, generator=generator).double() * 0.01
+    speed = torch.rand(rows, steps, 1, generator=generator).double() * 10.0 * STILL
     data = TensorDict(
         {QVEL: speed, ("next", QVEL): speed.roll(-1, 1)}, batch_size=[rows, steps]
     )

@@ -16,7 +16,7 @@ from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 
-STILL = 1e-3  # m/s and rad/s: slower is rest in the data
+STILL = 1e-4  # m/s and rad/s: slower is rest in the data; soft friction creeps faster
 ROWS, LEAST_ROWS = 256, 16
 STEPS = 20
 QUANTILE, MARGIN = 0.99, 1.5
