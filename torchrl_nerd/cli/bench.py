@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.report import bench
@@ -13,7 +13,7 @@ from torchrl_nerd.scenes import load_scene
 
 
 @dataclass(frozen=True)
-class Bench(Command):
+class Bench(DeviceCommand):
     """Speed against error: the shipped models and MuJoCo, coarse and fine, in one race.
 
     Example: nerd bench cartpole --json results/bench.json --plot results/bench.png
@@ -51,6 +51,7 @@ class Bench(Command):
             self.steps,
             self.compile,
             self.threads,
+            self.device,
         )
         print(bench_table(report))
         for batch in self.batches if self.budget else ():

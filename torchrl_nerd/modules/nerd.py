@@ -159,7 +159,7 @@ class NeRD(nn.Module):
             )
         model.network.to(self.dtype)
         model.load_state_dict(self.state_dict())
-        return model.to(next(self.parameters()).device).train(self.training)
+        return model.to(self.device).train(self.training)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
         """Move everything, but cast the network alone: constants stay float64."""
@@ -175,6 +175,11 @@ class NeRD(nn.Module):
     def dtype(self) -> torch.dtype:
         """What the network computes in."""
         return next(self.network.parameters()).dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next(self.network.parameters()).device
 
 
 class SceneTokens(nn.Module):
