@@ -39,6 +39,8 @@ class Bench(DeviceCommand):
     """Largest mean errors, in the table's order: names the fastest row within them."""
     plot: Path | None = None
     """Draw the race to this PNG."""
+    quiet: bool = False
+    """No progress bars."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their figures."""
@@ -52,6 +54,7 @@ class Bench(DeviceCommand):
             self.compile,
             self.threads,
             self.device,
+            self.quiet,
         )
         print(bench_table(report))
         for batch in self.batches if self.budget else ():

@@ -28,6 +28,8 @@ class Transfer(DeviceCommand):
     """Per dynamics."""
     seed: int = 500
     """Of the resets."""
+    quiet: bool = False
+    """No progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows."""
@@ -42,6 +44,7 @@ class Transfer(DeviceCommand):
             self.episodes,
             seed=self.seed,
             device=self.device,
+            quiet=self.quiet,
         )
         print(transfer_table(summaries))
         figures = {name: asdict(summary) for name, summary in summaries.items()}

@@ -124,13 +124,13 @@ class NeRD(nn.Module):
         return self.normalize.normalize(TOKEN, raw)
 
     def assemble(self, features: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """The network's token, from the `features` of a state."""
+        """The network's token ``(*batch, F)``, from the `features` of a state."""
         return self.coverage.clamp_token(features).to(self.dtype)
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Next ``qpos`` and ``qvel`` from the network's normalised output."""
+        """Next ``qpos`` and ``qvel`` from normalised outputs ``(*batch, D)``."""
         change = self.coverage.clamp_target(output.to(qpos.dtype))
         delta = self.normalize.denormalize(TARGET, change)
         limit = self.coverage.limit_speed

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import torch
+from tqdm import tqdm
 
 from torchrl_nerd.evaluation.bench.contenders import contenders
 from torchrl_nerd.evaluation.bench.cost import Cost, step_cost
@@ -107,6 +108,7 @@ def bench(
     is_compiling: bool = True,
     threads: int | None = None,
     device: torch.device | str = "cpu",
+    quiet: bool = False,
 ) -> BenchReport:
     """Race MuJoCo and the shipped models of a scene on this machine.
 
@@ -121,6 +123,7 @@ def bench(
         threads: processors to use; torch's own choice by default.
         device: of learned models and of every state whose steps are timed; MuJoCo's
             states then travel to the processor and back within its time.
+        quiet: no progress bars.
 
     Raises:
         ValueError: a scene without a protocol, or a setting out of range.
@@ -136,7 +139,10 @@ def bench(
     protocol = PROTOCOLS[scene.name]()
     everyone = contenders(scene, threads, is_compiling, device)
     ground = courses(protocol, rows, seed, threads, steps)
-    errors = {who.name: contender_errors(who, ground) for who in everyone}
+    errors = {
+        who.name: contender_errors(who, ground)
+        for who in tqdm(everyone, "errors", disable=quiet)
+    }
     floors = chaos_floor(ground, threads, seed)
     tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
     state = states_on_the_way(tasks[-1], COUNTED, seed)
@@ -145,7 +151,7 @@ def bench(
     costs = {name: cost for name, cost in counted.items() if cost is not None}
     speeds = {
         batch: rates(everyone, tasks[-1], batch, rounds, seed, costs, device)
-        for batch in batches
+        for batch in tqdm(batches, "rates", unit=" batches", disable=quiet)
     }
     horizon = ground[0].steps
     return BenchReport(
