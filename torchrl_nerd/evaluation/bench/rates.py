@@ -153,7 +153,7 @@ def _stepper(
     contender: Contender, task: Task, state: TensorDict
 ) -> Callable[[int], None]:
     dynamics, terrain = contender.make(task.scene), state.get(TERRAIN, None)
-    torque = state[QPOS].new_zeros((len(state), len(dynamics.scene.actuated)))
+    torque = torch.zeros(len(state), len(dynamics.scene.actuated)).to(state[QPOS])
     start = state.select(QPOS, QVEL)
 
     def run(steps: int) -> None:
