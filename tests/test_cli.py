@@ -14,6 +14,8 @@ from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training.recipes import RECIPES
 
 NOTHING_RANDOM = ("doctor", "replay")
+TELLS = ("eval", "stability", "doctor")  # a line as each part is done
+SOON_DONE = ("plot", "explain", "replay")
 QUICK = ("cartpole", "double_pendulum", "cube")  # the others take minutes in all
 TINY = ["--network", "mlp", "--rows", "64", "--rollout-rows", "8", "--quiet"]
 
@@ -63,6 +65,7 @@ def test_every_command_explains_itself(command, capsys):
     assert f"Example: nerd {command} " in text
     assert "--json " in text and "--dry-run" in text
     assert ("--seed " in text) == (command not in NOTHING_RANDOM)
+    assert ("--quiet" in text) == (command not in (*TELLS, *SOON_DONE))
 
 
 @pytest.mark.parametrize("command", ["data", "train"])

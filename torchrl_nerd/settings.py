@@ -1,5 +1,7 @@
 """Settings of a configuration class that are out of range."""
 
+import torch
+
 
 class SettingError(ValueError):
     """Says in one sentence which setting was given and what was expected."""
@@ -14,3 +16,18 @@ def expect_at_least(least: float, **settings: float) -> None:
     for name, value in settings.items():
         if value < least:
             raise SettingError(f"expected {name} of at least {least}, got {value}")
+
+
+def expect_device(name: str) -> torch.device:
+    """The device of that name: ``cpu``, ``cuda``, or ``cuda:1`` for the second of several.
+
+    Raises:
+        SettingError: naming the devices that this machine has, if it is none of them.
+    """
+    count = torch.cuda.device_count()
+    found = ["cpu", *["cuda"][:count], *(f"cuda:{index}" for index in range(count))]
+    if name not in found:
+        raise SettingError(
+            f"expected a device that torch finds here ({', '.join(found)}), got '{name}'"
+        )
+    return torch.device(name)

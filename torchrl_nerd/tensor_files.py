@@ -35,7 +35,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file.
+    """The tensors of a file, by name, on the processor.
 
     Raises:
         ValueError: in one sentence, no file there, or something else in it.

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import ray
 import torch
 
 from torchrl_nerd.cli import main
@@ -17,8 +18,6 @@ from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import load_scene
-
-ray = pytest.importorskip("ray")
 
 SCENE = load_scene("double_pendulum")
 CONFIG = DataConfig(trajectories=22, steps=4)

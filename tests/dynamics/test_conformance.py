@@ -12,11 +12,14 @@ from dynamics_helpers import (
     in_small_steps,
     random_drive,
     random_mask,
+    random_model,
     roll,
     unequal_keys,
     warp_too,
 )
 from tensordict import TensorDict
+
+from torchrl_nerd.dynamics import NeRDDynamics
 
 ROWS, STEPS = 6, 4
 
@@ -175,3 +178,26 @@ def test_states_are_float64_and_of_the_scene(scene, dynamics, generator):
     assert isinstance(moved, TensorDict) and moved.batch_size == (ROWS,)
     for key, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv)):
         assert moved[key].shape == (ROWS, size) and moved[key].dtype == torch.float64
+
+
+@pytest.mark.parametrize("inference", LEARNED)
+def test_a_model_answers_where_it_was_asked(scene, inference, monkeypatch, generator):
+    """On meta tensors, which know their device and hold no numbers: zeros come back."""
+    real = torch.Tensor.to
+
+    def to(tensor, *args, **kwargs):
+        if tensor.is_meta and args[:1] == (torch.device("cpu"),):
+            return torch.zeros(tensor.shape, dtype=tensor.dtype)
+        return real(tensor, *args, **kwargs)
+
+    monkeypatch.setattr(torch.Tensor, "to", to)
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda device: False)
+    dynamics = NeRDDynamics(random_model(scene, generator).to("meta"), inference)
+    state, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    after = state.select("qpos", "qvel")
+    dynamics.reset(after)
+    for torque in torques:
+        dynamics.reset(after, random_mask(ROWS, generator))
+        after, distance = dynamics.scored_step(after, torque, terrain)
+        assert {x.device.type for x in (*after.values(), distance)} == {"cpu"}
+    assert dynamics.model.device.type == "meta"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.report import bench
@@ -13,7 +13,7 @@ from torchrl_nerd.scenes import load_scene
 
 
 @dataclass(frozen=True)
-class Bench(Command):
+class Bench(DeviceCommand):
     """Speed against error: the shipped models and MuJoCo, coarse and fine, in one race.
 
     Example: nerd bench cartpole --json results/bench.json --plot results/bench.png
@@ -39,6 +39,8 @@ class Bench(Command):
     """Largest mean errors, in the table's order: names the fastest row within them."""
     plot: Path | None = None
     """Draw the race to this PNG."""
+    quiet: bool = False
+    """No progress bars."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their figures."""
@@ -51,6 +53,8 @@ class Bench(Command):
             self.steps,
             self.compile,
             self.threads,
+            self.device,
+            self.quiet,
         )
         print(bench_table(report))
         for batch in self.batches if self.budget else ():

@@ -1,10 +1,12 @@
-"""What every command has: where its figures go, and a run that does nothing."""
+"""What commands share: where figures go, a run that does nothing, a device."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
+
+from torchrl_nerd.settings import expect_device
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +29,21 @@ class Command(ABC):
     def settings(self) -> list[str]:
         """Every option and its value, a line each."""
         return [f"  {name:<20}{value}" for name, value in _leaves(self)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceCommand(Command):
+    """A command whose model computes where it is told to.
+
+    Raises:
+        SettingError: a device that this machine has not.
+    """
+
+    device: str = "cpu"
+    """Of the model: cpu, cuda, or cuda:1 for the second of several."""
+
+    def __post_init__(self) -> None:
+        expect_device(self.device)
 
 
 def _leaves(options: Any) -> Iterator[tuple[str, Any]]:

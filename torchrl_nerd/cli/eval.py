@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional, real_scene
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
@@ -19,7 +19,7 @@ from torchrl_nerd.scenes import load_scene
 
 
 @dataclass(frozen=True)
-class Eval(Command):
+class Eval(DeviceCommand):
     """Open-loop error of a model against true physics, beside the paper's figures.
 
     Robots of others start within their own sampling ranges, without and with actions.
@@ -51,8 +51,6 @@ class Eval(Command):
     """Of recorded tosses: all, train, validation or test, by the recommended seed."""
     baselines: bool = False
     """Beside it, on recorded tosses: MuJoCo, published and fitted, and no motion."""
-    device: str = "cpu"
-    """cpu or cuda."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
 from torchrl_nerd.data.recorded import load_tosses
 from torchrl_nerd.files import writable_folder
@@ -15,7 +15,7 @@ from torchrl_nerd.training.finetune_run import finetune
 
 
 @dataclass(frozen=True)
-class Finetune(Command):
+class Finetune(DeviceCommand):
     """Fine-tune on recorded tosses a model that was pretrained in MuJoCo.
 
     Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
@@ -48,7 +48,14 @@ class Finetune(Command):
         out = writable_folder(self.out or Path("runs") / f"{scene.name}_finetuned")
         start = self.model if self.scratch is None else None
         card = finetune(
-            scene, self.recorded, out, self.config, start, self.scratch, self.quiet
+            scene,
+            self.recorded,
+            out,
+            self.config,
+            start,
+            self.scratch,
+            self.quiet,
+            self.device,
         )
         figures = card["finetuning"]
         print(

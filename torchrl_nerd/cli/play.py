@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.render.film import Draw, film
@@ -20,7 +20,7 @@ SECONDS = 5.0  # of motion, where neither steps nor the task says less
 
 
 @dataclass(frozen=True)
-class Play(Command):
+class Play(DeviceCommand):
     """A film of one episode, learned beside MuJoCo: same start, same actions.
 
     Example: nerd play cartpole/swingup --policy runs/ppo --out swing_up.gif
@@ -68,8 +68,17 @@ class Play(Command):
         if self.policy is None:
             act = idle(task, steps, self.seed, self.actions)
         else:
-            act = follow(make_actor(load_policy(self.policy, task)))
-        pair = play_pair(self.task, self.model, act, steps, self.seed, self.own_actions)
+            policy = load_policy(self.policy, task).to(self.device)
+            act = follow(make_actor(policy))
+        pair = play_pair(
+            self.task,
+            self.model,
+            act,
+            steps,
+            self.seed,
+            self.own_actions,
+            self.device,
+        )
         drawn = None
         if self.viewer:
             view(pair, self.slow)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.protocols import protocol_of
@@ -18,7 +18,7 @@ from torchrl_nerd.settings import expect_at_least
 
 
 @dataclass(frozen=True)
-class Plot(Command):
+class Plot(DeviceCommand):
     """Error, energy and distance to the ground over time; or the curves of a training run.
 
     Example: nerd plot double_pendulum --case "ground 3" --out rollouts.png
@@ -60,7 +60,7 @@ class Plot(Command):
         expect_at_least(1, steps=steps)
         source = protocol.cases[case]
         place = scene_of(source)
-        model = from_pretrained(self.model or self.what, scene)
+        model = from_pretrained(self.model or self.what, scene).to(self.device)
         traces = compare_traces(
             source,
             NeRDDynamics(model if place is scene else model.over(place)),

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.replay import read_dump, replay
 
 
 @dataclass(frozen=True)
-class Replay(Command):
+class Replay(DeviceCommand):
     """The steps that led to a fault, again in learned and true dynamics.
 
     Envs with a fault_folder leave dumps: make_env(..., fault_folder=Path("faults")).
@@ -29,6 +29,7 @@ class Replay(Command):
         dump = read_dump(self.file)
         about = dump.about
         model = from_pretrained(self.model or about["scene"], dump.scene)
+        model = model.to(self.device)
         steps = replay(dump, model)
         print(
             f"{about['reason']} in row {about.get('row', '?')} of {about['scene']}, "

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.stability.plot import plot_results
@@ -21,7 +21,7 @@ from torchrl_nerd.settings import SettingError
 
 
 @dataclass(frozen=True)
-class Stability(Command):
+class Stability(DeviceCommand):
     """Hard cases: conservation, contact, geometry, bad input, long runs, gradients.
 
     A case whose line is not met stays in the table; the exit status is 0 all the same.
@@ -48,7 +48,7 @@ class Stability(Command):
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
         cases = choose_cases(list(self.cases) or None)
         scene = load_scene(self.scene)
-        model = from_pretrained(self.model or self.scene, scene)
+        model = from_pretrained(self.model or self.scene, scene).to(self.device)
         truth = DynamicsWorld(MujocoDynamics(scene))
         learned = DynamicsWorld(NeRDDynamics(model))
         results = []

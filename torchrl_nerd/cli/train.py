@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
 from torchrl_nerd.data.generate import CARD, generate, load_data_sets
 from torchrl_nerd.evaluation.protocols import protocol_of
@@ -22,7 +22,7 @@ from torchrl_nerd.training.trainer import STATE, TrainConfig, Trainer
 
 
 @dataclass(frozen=True)
-class Train(Command):
+class Train(DeviceCommand):
     """Train a NeRD; without options, exactly as the shipped model of the scene.
 
     Robots of others get one recipe for all, validated from their own sampling ranges.
@@ -51,8 +51,6 @@ class Train(Command):
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
     """Copy the recipe's checkpoint, best or last, to this folder when done."""
-    device: str = "cpu"
-    """cpu or cuda."""
     logger: LoggerName = "tensorboard"
     """Where figures go beside log.csv: tensorboard, wandb, mlflow, or csv for nowhere."""
     threads: int | None = None

@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_nerd.cli.command import Command
+from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
@@ -12,7 +12,7 @@ from torchrl_nerd.tasks import make_task
 
 
 @dataclass(frozen=True)
-class Transfer(Command):
+class Transfer(DeviceCommand):
     """Returns of a policy in learned and in true dynamics, and the gap.
 
     Example: nerd transfer cartpole/swingup --policy runs/ppo
@@ -28,8 +28,8 @@ class Transfer(Command):
     """Per dynamics."""
     seed: int = 500
     """Of the resets."""
-    device: str = "cpu"
-    """cpu or cuda."""
+    quiet: bool = False
+    """No progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows."""
@@ -44,6 +44,7 @@ class Transfer(Command):
             self.episodes,
             seed=self.seed,
             device=self.device,
+            quiet=self.quiet,
         )
         print(transfer_table(summaries))
         figures = {name: asdict(summary) for name, summary in summaries.items()}

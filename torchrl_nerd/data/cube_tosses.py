@@ -102,7 +102,7 @@ class Tosses:
         return len(self.offsets) - 1
 
     def select(self, numbers: Tensor) -> "Tosses":
-        """Some of the tosses, in that order."""
+        """Some of the tosses by their ``numbers (n,)``, in that order."""
         ends = self.offsets[1:]
         rows = [torch.arange(int(self.offsets[i]), int(ends[i])) for i in numbers]
         lengths = (ends - self.offsets[:-1])[numbers]
@@ -120,7 +120,7 @@ class Tosses:
         return torch.cat(found) if found else torch.zeros(0, dtype=torch.long)
 
     def toss_of(self, rows: Tensor) -> Tensor:
-        """Number of the toss each row belongs to."""
+        """Number of the toss each of ``rows (n,)`` belongs to, ``(n,)``."""
         return torch.searchsorted(self.offsets, rows, right=True) - 1
 
     def windows(self, starts: Tensor, length: int) -> TensorDict:
@@ -283,7 +283,11 @@ def estimate_velocities(log: TossLog) -> tuple[Tensor, Tensor]:
 
 
 def backward_differences(log: TossLog) -> tuple[Tensor, Tensor]:
-    """Velocities over the frame before each pose; a toss's first is its second's."""
+    """Velocities over the frame before each pose; a toss's first is its second's.
+
+    Returns:
+        Linear, m/s, world, and angular, rad/s, body axes, ``(N, 3)`` each.
+    """
     quat = quat_normalize(log.quaternion)
     turn = quat_log(quat_multiply(quat_conjugate(quat[:-1]), quat[1:]))
     found = []
@@ -296,7 +300,7 @@ def backward_differences(log: TossLog) -> tuple[Tensor, Tensor]:
 
 
 def split_tosses(count: int) -> dict[str, Tensor]:
-    """Numbers of the tosses to train on, to choose by and to test with.
+    """Numbers ``(n,)`` of the tosses to train on, to choose by and to test with.
 
     Of the published 510: 380, 65 and 65, by the recommended seed.
     """

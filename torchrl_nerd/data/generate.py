@@ -59,6 +59,9 @@ class DataConfig:
     | ``trajectories`` | how many are drawn; broken ones are dropped and counted |
     | ``steps`` | control steps of each |
     | ``seed`` | every chunk of trajectories has a stream of its own |
+
+    Raises:
+        SettingError: fewer than one trajectory or step.
     """
 
     trajectories: int = 10_000

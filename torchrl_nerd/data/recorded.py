@@ -23,7 +23,7 @@ SHIPPED = "cube_tosses"
 
 
 def load_tosses(path: Path, scene: Scene) -> tuple[Tosses, dict[str, Tensor]]:
-    """States of a file that fits physics, and the numbers of its parts' tosses.
+    """States of a file that fits physics, and the numbers ``(n,)`` of its parts' tosses.
 
     Raises:
         ValueError: in one sentence, a file that cannot be read or the check that failed.

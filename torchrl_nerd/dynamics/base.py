@@ -10,7 +10,11 @@ from torchrl_nerd.scenes.scene import Scene
 
 
 class Dynamics(Protocol):
-    """What an env needs of physics. A state holds ``qpos`` and ``qvel``, float64."""
+    """What an env needs of physics. A state holds ``qpos`` and ``qvel``, float64.
+
+    It computes where it lives and answers where it was asked: the next state is on the
+    device of the one before, whichever that is.
+    """
 
     scene: Scene
 

@@ -48,7 +48,7 @@ class DMControlDynamics:
         return {"scene": self.scene, "_rows": []}
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Return the `Physics` of ``rows`` to the state a new one has."""
+        """Return the `Physics` of ``rows (num_envs,)`` to the state a new one has."""
         count = state[QPOS].shape[0]
         if len(self._rows) != count:
             self._rows = [make_physics(self.scene) for _ in range(count)]

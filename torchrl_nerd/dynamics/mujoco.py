@@ -87,7 +87,7 @@ class MujocoDynamics:
         self.__dict__.update(state)
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Clear the warm start of ``rows``."""
+        """Clear the warm start of ``rows (num_envs,)``; see `Dynamics.reset`."""
         count = state[QPOS].shape[0]
         if rows is None or len(self._warmstart) != count:
             self._warmstart = np.zeros((count, self._model.nv))

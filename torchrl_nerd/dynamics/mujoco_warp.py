@@ -93,7 +93,7 @@ class MujocoWarpDynamics:
             self._view("qacc_warmstart").copy_(warmstart)
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Clear the warm start of ``rows``."""
+        """Clear the warm start of ``rows (num_envs,)``; see `Dynamics.reset`."""
         if len(state[QPOS]) != self._rows:
             self._allocate(len(state[QPOS]))
         elif self._rows:

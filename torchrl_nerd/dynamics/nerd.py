@@ -72,7 +72,7 @@ class NeRDDynamics:
         if rows is None or rows.all() or self._rows != count:
             self._memory, self._rows = self.network.empty_memory(count), count
         elif self._memory is not None and rows.any():
-            self._memory.clear(rows.reshape(count))
+            self._memory.clear(rows.reshape(count).to(self.model.device))
 
     def step(
         self,
@@ -96,21 +96,23 @@ class NeRDDynamics:
             The next state, and the distance ``(num_envs,)`` where it was asked for.
         """
         check_step(self.scene, state, joint_torque, terrain)
-        qpos, qvel = state[QPOS], state[QVEL]
+        there, here = state[QPOS].device, self.model.device
+        qpos, qvel = state[QPOS].to(here), state[QVEL].to(here)
+        ground = None if terrain is None else terrain.to(here)
         if self._memory is None or self._rows != len(qpos):
             self._rows = len(qpos)
             self._memory = self.network.empty_memory(self._rows)
         predict = self._run_compiled if self.compile else self._predict
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel, distance = predict(
-                qpos, qvel, joint_torque.to(qpos), terrain, self._memory, is_scored
+                qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
             )
         after = TensorDict(
-            {QPOS: next_qpos, QVEL: next_qvel},
+            {QPOS: next_qpos.to(there), QVEL: next_qvel.to(there)},
             batch_size=state.batch_size,
             device=state.device,
         )
-        return after, distance
+        return after, None if distance is None else distance.to(there)
 
     def _predict(
         self,

@@ -76,7 +76,7 @@ class Policy(nn.Module):
         self.log_std = nn.Parameter(torch.zeros(self.sizes[-1]))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the action before squashing."""
+        """Mean and standard deviation of the action before squashing, ``(*batch, A)``."""
         mean = self.mlp(self.standardize(observation))
         return mean, self.log_std.exp().expand_as(mean)
 

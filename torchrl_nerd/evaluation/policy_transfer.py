@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm import tqdm
 
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
@@ -102,6 +103,7 @@ def transfer(
     slow_episodes: int = 256,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    quiet: bool = True,
 ) -> dict[str, ReturnSummary]:
     """The same policy from the same starts in each dynamics.
 
@@ -113,6 +115,7 @@ def transfer(
         slow_episodes: the first so many of them on dm_control, which steps row by row.
         seed: of the starts.
         device: where all envs live.
+        quiet: no progress bar, as by default.
 
     Returns:
         Summaries by name of the dynamics.
@@ -120,8 +123,8 @@ def transfer(
     Raises:
         ValueError: see `summarize` and `make_env`.
     """
-    returns = {}
-    for name in dict.fromkeys((*map(str, dynamics), TRUTH)):
+    returns, names = {}, dict.fromkeys((*map(str, dynamics), TRUTH))
+    for name in tqdm(names, "dynamics", disable=quiet):
         rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
         env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
         returns[name] = policy_returns(env, actor)

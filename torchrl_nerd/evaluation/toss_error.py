@@ -80,7 +80,7 @@ def first_state(window: TensorDict) -> TensorDict:
 
 
 def no_motion(tosses: Tosses, starts: Tensor, states: int = STATES) -> tuple:
-    """Errors of a cube that stays where it is."""
+    """Errors of a cube that stays where it is; see `toss_errors`."""
     measured = tosses.windows(starts, states)[QPOS]
     return path_errors(measured[:, :1].expand_as(measured[:, 1:]), measured[:, 1:])
 
@@ -135,7 +135,7 @@ def _half_width(means: Tensor) -> Tensor:
 def summarize_both(
     errors: tuple[Tensor, Tensor], tosses: Tosses, starts: Tensor
 ) -> dict[str, TossError]:
-    """``position_error_m`` and ``orientation_error_rad``."""
+    """``position_error_m`` and ``orientation_error_rad`` of what `toss_errors` gives."""
     toss = tosses.toss_of(starts)
     is_first = starts == tosses.offsets[toss]
     names = ("position_error_m", "orientation_error_rad")

@@ -45,7 +45,7 @@ def sphere_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def capsule_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """To a capsule along z; ``size`` is its radius and half the cylinder's length, m."""
+    """To a capsule along z; ``size (*batch, 3)``: radius, half the cylinder's length, m."""
     half = size[..., None, 1]
     along = points[..., 2]
     axis = along.clamp(-half, half)  # the closest point of the capsule's axis
@@ -56,7 +56,7 @@ def capsule_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def box_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """To a box about the origin; ``size`` is half its lengths, m.
+    """To a box about the origin; ``size (*batch, 3)`` is half its lengths, m.
 
     Inside, the closest point lies on the nearest face.
     """

@@ -192,7 +192,7 @@ class Coverage(nn.Module):
         return torch.where(excess > 0.0, 1.0 + spread + excess.sqrt(), spread)
 
     def sizes(self, qvel: Tensor) -> Tensor:
-        """Magnitude of each velocity, of whole vectors for free and ball joints."""
+        """Magnitudes ``(*batch, nv)``, of whole vectors for free and ball joints."""
         sizes = qvel.abs()
         for start in self.vectors:
             norm = torch.linalg.vector_norm(qvel[..., start : start + 3], dim=-1)

@@ -124,13 +124,13 @@ class NeRD(nn.Module):
         return self.normalize.normalize(TOKEN, raw)
 
     def assemble(self, features: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """The network's token, from the `features` of a state."""
+        """The network's token ``(*batch, F)``, from the `features` of a state."""
         return self.coverage.clamp_token(features).to(self.dtype)
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Next ``qpos`` and ``qvel`` from the network's normalised output."""
+        """Next ``qpos`` and ``qvel`` from normalised outputs ``(*batch, D)``."""
         change = self.coverage.clamp_target(output.to(qpos.dtype))
         delta = self.normalize.denormalize(TARGET, change)
         limit = self.coverage.limit_speed
@@ -160,7 +160,7 @@ class NeRD(nn.Module):
             )
         model.network.to(self.dtype)
         model.load_state_dict(self.state_dict())
-        return model.to(next(self.parameters()).device).train(self.training)
+        return model.to(self.device).train(self.training)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
         """Move everything, but cast the network alone: constants stay float64."""
@@ -176,6 +176,11 @@ class NeRD(nn.Module):
     def dtype(self) -> torch.dtype:
         """What the network computes in."""
         return next(self.network.parameters()).dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next(self.network.parameters()).device
 
 
 class SceneTokens(nn.Module):

@@ -128,7 +128,7 @@ class PenaltyStep(nn.Module):
         self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
 
     def scaled(self) -> Tensor:
-        """The `PARAMETERS` in SI units; size and inertia as multiples of the scene's."""
+        """The `PARAMETERS` ``(12,)``, SI units; size and inertia per the scene's."""
         count = len(SCALED)
         factors = (self.share * self.raw[:count]).exp()
         return torch.cat((self.nominal * factors, self.shift * self.raw[count:]))

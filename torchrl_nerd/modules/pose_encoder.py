@@ -65,7 +65,9 @@ class PoseEncoder(nn.Module):
         before = window[:, :-1]
         here = last[:, None].expand_as(before)
         back = differentiate_pos(self.layout, here, before)
-        speeds = -back / self.lags[:, None]  # mean velocities up to the last pose
+        speeds = (
+            -back / self.lags.to(back)[:, None]
+        )  # mean velocities up to the last pose
         linear = rotate_inverse(quat[:, None], speeds[..., :3])
         speeds = torch.cat((linear, speeds[..., 3:]), -1)
         down = torch.zeros_like(last[:, :3])

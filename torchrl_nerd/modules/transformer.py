@@ -62,7 +62,13 @@ class KeyValueCache:
             past[rows] = 0.0  # whatever stood there, a masked NaN would still spread
 
     def write(self, layer: int, key: Tensor, value: Tensor) -> None:
-        """Store one token of one layer; out of place while gradients are recorded."""
+        """Store one token of one layer; out of place while gradients are recorded.
+
+        Args:
+            layer: its number.
+            key: ``(rows, heads, size)``.
+            value: likewise.
+        """
         for past, new in ((self.keys, key), (self.values, value)):
             if torch.is_grad_enabled():
                 size = past[layer].shape[2]
@@ -200,6 +206,9 @@ class CausalTransformer(nn.Module):
         config: its size.
         num_inputs: features per token.
         num_outputs: numbers predicted per token.
+
+    Raises:
+        ValueError: a size that no transformer has.
     """
 
     def __init__(

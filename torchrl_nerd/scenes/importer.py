@@ -37,7 +37,11 @@ class Imported(NamedTuple):
 def import_mjcf(
     path: str | Path, control_step: float | None = None, **ranges: Any
 ) -> Imported:
-    """See `Scene.from_mjcf`."""
+    """See `Scene.from_mjcf`.
+
+    Raises:
+        ValueError: a control step of no whole number of timesteps; see `read_model`.
+    """
     model = compile_mjcf(Path(path))
     timestep = model.opt.timestep
     if control_step is None:

@@ -38,7 +38,8 @@ class FineTuner:
     """Trains a model on windows of tosses; `run` returns the best one on validation.
 
     Args:
-        model: pretrained; left as it is. Its statistics are frozen.
+        model: pretrained; left as it is, and trained on its device. Its statistics are
+            frozen.
         tosses: recorded.
         train: numbers of the tosses to train on.
         validation: numbers of the tosses that choose the best model and when to stop.
@@ -64,7 +65,7 @@ class FineTuner:
         self.config, self.tosses, self.quiet = config, tosses, quiet
         self.train = train
         self.model, self.keep = copy.deepcopy(model), keep
-        self.view = TossView(model.scene, tosses, config)
+        self.view = TossView(model.scene, tosses, config, model.device)
         states = STATES if config.update == "physics" else config.length + 1
         self.starts = self.view.starts(states, train)
         self.checks = self.view.starts(STATES, validation)[::VALIDATION_STRIDE]
@@ -170,7 +171,7 @@ class FineTuner:
             self.isometries[i](cast(TensorDict, part))
             for i, part in zip(order.tolist(), parts, strict=False)
         ]
-        return cast(TensorDict, TensorDict.cat(images))
+        return cast(TensorDict, TensorDict.cat(images)).to(self.model.device)
 
     def _update(self, window: TensorDict) -> float:
         """One step of the optimiser; its loss."""

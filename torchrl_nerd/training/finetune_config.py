@@ -34,6 +34,9 @@ class FinetuneConfig:
     | ``pose_noise`` | m, added to every observed pose: a worse camera |
     | ``poses`` | in the encoder's window |
     | ``seed`` | of batches and fresh weights |
+
+    Raises:
+        SettingError: a value that cannot be.
     """
 
     update: Update = "physics"

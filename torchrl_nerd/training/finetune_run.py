@@ -34,6 +34,7 @@ def finetune(
     start: str | None = None,
     scratch: str | None = None,
     quiet: bool = False,
+    device: torch.device | str = "cpu",
 ) -> dict[str, Any]:
     """Train on the training tosses of a file; writes checkpoint and ``curve.json``.
 
@@ -46,6 +47,7 @@ def finetune(
             the shipped pretrained model where None.
         scratch: fresh weights instead; see `from_scratch`.
         quiet: no progress bar.
+        device: of the model; the tosses stay on the processor.
 
     Returns:
         The card of the best model on the validation tosses.
@@ -54,14 +56,14 @@ def finetune(
     if scratch is not None:
         model = from_scratch(scene, tosses.select(split["train"]), scratch, config.seed)
     elif start == "new" or (start is None and PRETRAINED_NAME not in shipped_models()):
-        model, tuner = pretrain(scene, quiet=quiet)
+        model, tuner = pretrain(scene, quiet=quiet, device=device)
         card = make_card(model, {"pretraining": tuner.card()["finetuning"]})
         save_checkpoint(model, out / "pretrained", card)
     else:
         model = from_pretrained(start or PRETRAINED_NAME, scene)
     made = {
         "start": "fresh weights" if scratch else start or PRETRAINED_NAME,
-        "device": "cpu",
+        "device": str(device),
         "threads": torch.get_num_threads(),
         "tosses": {name: len(members) for name, members in split.items()},
     }
@@ -75,7 +77,7 @@ def finetune(
         write_json(out / "curve.json", {"curve": tuner.curve})
 
     parts = split["train"], split["validation"]
-    tuner = FineTuner(model, tosses, *parts, config, quiet, keep)
+    tuner = FineTuner(model.to(device), tosses, *parts, config, quiet, keep)
     keep(tuner.run())
     if tuner.view.encoder is not None:
         write_tensors(out / "encoder.safetensors", tuner.view.encoder.state_dict())

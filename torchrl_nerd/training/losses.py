@@ -27,7 +27,7 @@ def relative_error(errors: Tensor, size: Tensor, softening: float) -> Tensor:
 
 
 def one_step_loss(outputs: Tensor, targets: Tensor, softening: float) -> Tensor:
-    """Mean relative error of normalised targets, in place of the square of NeRD eq. 2.
+    """Mean relative error of targets ``(*batch, D)``, for the square of NeRD eq. 2.
 
     Random torques set the scale of targets; without the division the quiet motions that
     decide a passive rollout vanish beside the violent ones.

@@ -141,7 +141,7 @@ class Sequences:
 def raw_tokens(
     tokens: SceneTokens, state_delta: StateDelta, data: TensorDict
 ) -> tuple[Tensor, Tensor]:
-    """Unnormalised tokens and targets of transitions, float64."""
+    """Unnormalised tokens ``(*batch, F)`` and targets ``(*batch, D)``, float64."""
     terrain = data.get(TERRAIN, None)
     token = tokens(data[QPOS], data[QVEL], data[JOINT_TORQUE], terrain)
     target = state_delta.delta(data[QPOS], data[QVEL], data[NEXT_QPOS], data[NEXT_QVEL])

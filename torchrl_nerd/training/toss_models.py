@@ -39,7 +39,10 @@ def toss_stats(scene: Scene, tosses: Tosses) -> dict[NestedKey, Stats]:
 
 
 def pretrain(
-    scene: Scene, config: FinetuneConfig = PRETRAINING, quiet: bool = False
+    scene: Scene,
+    config: FinetuneConfig = PRETRAINING,
+    quiet: bool = False,
+    device: torch.device | str = "cpu",
 ) -> tuple[NeRD, FineTuner]:
     """A residual model that has seen tosses of many cubes in MuJoCo, and no real one.
 
@@ -49,6 +52,7 @@ def pretrain(
         scene: of the cube.
         config: of the training on simulated tosses.
         quiet: no progress bar.
+        device: of the model.
     """
     tosses = simulate_tosses(scene, CUBES, TOSSES, STATES, config.seed)
     torch.manual_seed(config.seed)
@@ -58,7 +62,7 @@ def pretrain(
     model.simulator.set_values(published)
     number = torch.arange(len(tosses))
     parts = number[CHECKED:], number[:CHECKED]
-    tuner = FineTuner(model, tosses, *parts, config, quiet)
+    tuner = FineTuner(model.to(device), tosses, *parts, config, quiet)
     return tuner.run(), tuner
 
 

@@ -30,13 +30,21 @@ class TossView:
         scene: of the cube.
         tosses: recorded.
         config: what of them is seen.
+        device: of the encoder; the tosses stay where they are.
     """
 
-    def __init__(self, scene: Scene, tosses: Tosses, config: FinetuneConfig) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        tosses: Tosses,
+        config: FinetuneConfig,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.encoder: PoseEncoder | None = None
         self.every, self.seen = config.every, tosses
         if config.observe == "poses":
-            self.encoder = PoseEncoder(scene, config.poses, config.every)
+            encoder = PoseEncoder(scene, config.poses, config.every)
+            self.encoder = encoder.to(device)
             self.seen = replace(tosses, qpos=noisy_poses(tosses.qpos, config))
 
     @property
@@ -82,8 +90,8 @@ class TossView:
         dynamics, truth = NeRDDynamics(model), truth or self.seen
         if self.encoder is None:
             return toss_errors(dynamics, truth, rows)
-        qpos, qvel, _ = self.observe(self.windows(rows, STATES))
-        start = TensorDict({QPOS: qpos, QVEL: qvel}, [len(rows)])
+        qpos, qvel, _ = self.observe(self.windows(rows, STATES).to(model.device))
+        start = TensorDict({QPOS: qpos, QVEL: qvel}, [len(rows)]).cpu()
         measured = truth.windows(rows + self.before, STATES)[QPOS][:, 1:]
         return path_errors(open_loop(dynamics, start, STATES - 1), measured)
 

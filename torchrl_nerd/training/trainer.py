@@ -69,6 +69,9 @@ class TrainConfig:
     | ``save_every`` | updates between saves: what a kill can lose |
     | ``validate_every`` | updates between rollouts in true physics |
     | ``seed`` | of weights and batches |
+
+    Raises:
+        SettingError: an unknown network, or a number that is too small.
     """
 
     network: str = "tiny"

@@ -91,12 +91,12 @@ class Normalize(Transform):
             self.register_buffer(f"{name}_std", stats[key].std.clone())
 
     def normalize(self, key: NestedKey, x: Tensor) -> Tensor:
-        """``(x - mean) / std`` in float64, returned in the dtype of ``x``."""
+        """``(x - mean) / std`` of ``(*batch, D)`` in float64, in the dtype of ``x``."""
         mean, std = self._constants(key)
         return ((x.double() - mean) / std).to(x.dtype)
 
     def denormalize(self, key: NestedKey, x: Tensor) -> Tensor:
-        """``mean + std * x`` in float64, returned in the dtype of ``x``."""
+        """``mean + std * x`` of ``(*batch, D)`` in float64, in the dtype of ``x``."""
         mean, std = self._constants(key)
         return (mean + std * x.double()).to(x.dtype)
 

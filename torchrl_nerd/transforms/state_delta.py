@@ -108,7 +108,11 @@ class StateDelta(Transform):
         return _replace(x, v, turn(qpos[..., q : q + 4], x[..., v : v + 3]))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
-        """Write the change between the state and the one under ``next``."""
+        """Write the change between the state and the one under ``next``.
+
+        Raises:
+            KeyError: naming the keys that are not there.
+        """
         missing = [key for key in self.in_keys if key not in tensordict.keys(True)]
         if missing:
             found = sorted(map(str, tensordict.keys(True, True)))

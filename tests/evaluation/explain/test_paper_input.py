@@ -12,6 +12,7 @@ from torchrl_nerd.evaluation.explain import paper_input as paper
 from torchrl_nerd.evaluation.explain.states import draw_states
 from torchrl_nerd.geometry.kinematics import FREE
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import load_scene
 
 ROWS = 40
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
@@ -101,7 +102,6 @@ def is_free(model, dof):
     return model.jnt_type[model.dof_jntid[dof]] == FREE
 
 
-def test_widths_are_those_of_the_released_networks(scene):
-    if scene.name not in paper.PUBLISHED:
-        pytest.skip("not in the paper")
-    assert paper.PaperInput(scene).size == paper.PUBLISHED[scene.name]
+@pytest.mark.parametrize("name", paper.PUBLISHED)
+def test_widths_are_those_of_the_released_networks(name):
+    assert paper.PaperInput(load_scene(name)).size == paper.PUBLISHED[name]

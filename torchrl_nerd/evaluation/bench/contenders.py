@@ -40,7 +40,10 @@ class Contender:
 
 
 def contenders(
-    scene: Scene, threads: int, is_compiling: bool = True
+    scene: Scene,
+    threads: int,
+    is_compiling: bool = True,
+    device: torch.device | str = "cpu",
 ) -> list[Contender]:
     """Everyone who takes part in a scene's race.
 
@@ -48,10 +51,11 @@ def contenders(
         scene: the robot.
         threads: of MuJoCo's pool.
         is_compiling: let learned models also run compiled.
+        device: of learned models.
     """
     return [
         *mujoco_contenders(scene, threads),
-        *learned_contenders(scene, is_compiling),
+        *learned_contenders(scene, is_compiling, device),
     ]
 
 
@@ -74,12 +78,14 @@ def mujoco_contenders(scene: Scene, threads: int) -> Iterator[Contender]:
             yield row(f"MuJoCo {name} x{substeps}", substeps, int(integrator))
 
 
-def learned_contenders(scene: Scene, is_compiling: bool) -> Iterator[Contender]:
+def learned_contenders(
+    scene: Scene, is_compiling: bool, device: torch.device | str = "cpu"
+) -> Iterator[Contender]:
     """The scene's shipped models, streaming and otherwise."""
     for name in shipped_models():
         if name != scene.name and not name.startswith(f"{scene.name}-"):
             continue
-        model = from_pretrained(name, scene)
+        model = from_pretrained(name, scene).to(device)
         yield _learned(name, model)
         yield Contender(f"{name}, guarded", True, _guarded(model))
         if is_compiling:

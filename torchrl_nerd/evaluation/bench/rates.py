@@ -3,11 +3,13 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from statistics import median
 from typing import cast
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl.collectors import Collector
 
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -57,15 +59,21 @@ class Race:
         task: its starts, observation, reward and resets.
         batch: rows.
         seed: of the moments and of the envs.
+        device: of all states.
     """
 
     def __init__(
-        self, contenders: list[Contender], task: Task, batch: int, seed: int
+        self,
+        contenders: list[Contender],
+        task: Task,
+        batch: int,
+        seed: int,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.batch = batch
-        state = states_on_the_way(task, batch, seed)
+        state = states_on_the_way(task, batch, seed).to(device)
         steppers = {c.name: _stepper(c, task, state) for c in contenders}
-        envs = {c.name: _env_stepper(c, task, batch, seed) for c in contenders}
+        envs = {c.name: _env_stepper(c, task, batch, seed, device) for c in contenders}
         self.warm_up_s = {name: _seconds(run, 2) for name, run in steppers.items()}
         self._runs = {
             name: (Runner(steppers[name]), Runner(envs[name])) for name in steppers
@@ -86,14 +94,16 @@ def rates(
     rounds: int,
     seed: int,
     costs: Mapping[str, Cost],
+    device: torch.device | str = "cpu",
 ) -> tuple[dict[str, Rate], float]:
     """Medians of a `Race` over so many rounds; arguments as there.
 
     Returns:
-        Name -> speed, and the machine's matrix rate, FLOP/s: of large float32 products
+        Name -> speed, and the device's matrix rate, FLOP/s: of large float32 products
         that take turns with the contenders.
     """
-    race, matrix = Race(contenders, task, batch, seed), Runner(_multiply)
+    race = Race(contenders, task, batch, seed, device)
+    matrix = Runner(partial(_multiply, torch.full((MATRIX, MATRIX), 0.5).to(device)))
     turns, products = [], []
     for _ in range(rounds):
         turns.append(race.round())
@@ -133,8 +143,7 @@ def states_on_the_way(source: Source, batch: int, seed: int) -> TensorDict:
     return there
 
 
-def _multiply(steps: int) -> None:
-    matrix = torch.full((MATRIX, MATRIX), 0.5)
+def _multiply(matrix: Tensor, steps: int) -> None:
     product = torch.empty_like(matrix)
     for _ in range(steps):
         torch.mm(matrix, matrix, out=product)
@@ -144,7 +153,7 @@ def _stepper(
     contender: Contender, task: Task, state: TensorDict
 ) -> Callable[[int], None]:
     dynamics, terrain = contender.make(task.scene), state.get(TERRAIN, None)
-    torque = torch.zeros(len(state), len(dynamics.scene.actuated)).double()
+    torque = torch.zeros(len(state), len(dynamics.scene.actuated)).to(state[QPOS])
     start = state.select(QPOS, QVEL)
 
     def run(steps: int) -> None:
@@ -157,9 +166,9 @@ def _stepper(
 
 
 def _env_stepper(
-    contender: Contender, task: Task, batch: int, seed: int
+    contender: Contender, task: Task, batch: int, seed: int, device: torch.device | str
 ) -> Callable[[int], None]:
-    env = make_env(task, dynamics="mujoco", num_envs=batch, seed=seed)
+    env = make_env(task, dynamics="mujoco", num_envs=batch, seed=seed, device=device)
     env.dynamics = contender.make(task.scene)
     collected: dict[int, Collector] = {}
 
@@ -187,6 +196,8 @@ def _seconds(
 ) -> float:
     began = clock()
     run(steps)
+    if torch.cuda.is_initialized():  # a GPU may still be at work
+        torch.cuda.synchronize()
     return clock() - began
 
 

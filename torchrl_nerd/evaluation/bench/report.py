@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import torch
+from tqdm import tqdm
 
 from torchrl_nerd.evaluation.bench.contenders import contenders
 from torchrl_nerd.evaluation.bench.cost import Cost, step_cost
@@ -106,6 +107,8 @@ def bench(
     steps: int | None = None,
     is_compiling: bool = True,
     threads: int | None = None,
+    device: torch.device | str = "cpu",
+    quiet: bool = False,
 ) -> BenchReport:
     """Race MuJoCo and the shipped models of a scene on this machine.
 
@@ -118,6 +121,9 @@ def bench(
         steps: horizon of the errors; the protocol's by default.
         is_compiling: have compiled rows.
         threads: processors to use; torch's own choice by default.
+        device: of learned models and of every state whose steps are timed; MuJoCo's
+            states then travel to the processor and back within its time.
+        quiet: no progress bars.
 
     Raises:
         ValueError: a scene without a protocol, or a setting out of range.
@@ -131,9 +137,12 @@ def bench(
         torch.set_num_threads(threads)
     threads = torch.get_num_threads()
     protocol = PROTOCOLS[scene.name]()
-    everyone = contenders(scene, threads, is_compiling)
+    everyone = contenders(scene, threads, is_compiling, device)
     ground = courses(protocol, rows, seed, threads, steps)
-    errors = {who.name: contender_errors(who, ground) for who in everyone}
+    errors = {
+        who.name: contender_errors(who, ground)
+        for who in tqdm(everyone, "errors", disable=quiet)
+    }
     floors = chaos_floor(ground, threads, seed)
     tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
     state = states_on_the_way(tasks[-1], COUNTED, seed)
@@ -141,8 +150,8 @@ def bench(
     counted = {who.name: step_cost(who.make(here), state) for who in everyone}
     costs = {name: cost for name, cost in counted.items() if cost is not None}
     speeds = {
-        batch: rates(everyone, tasks[-1], batch, rounds, seed, costs)
-        for batch in batches
+        batch: rates(everyone, tasks[-1], batch, rounds, seed, costs, device)
+        for batch in tqdm(batches, "rates", unit=" batches", disable=quiet)
     }
     horizon = ground[0].steps
     return BenchReport(
@@ -158,10 +167,17 @@ def bench(
         machine={
             "processor": platform.processor() or platform.machine(),
             "threads": threads,
+            "device": _device_name(device),
             "torch": torch.__version__,
             "mujoco": mujoco.__version__,
         },
     )
+
+
+def _device_name(device: torch.device | str) -> str:
+    """What learned models ran on: cpu, or the GPU's name."""
+    here = torch.device(device)
+    return torch.cuda.get_device_name(here) if here.type == "cuda" else here.type
 
 
 def _published(protocol: Protocol, horizon: int) -> dict[str, float]:

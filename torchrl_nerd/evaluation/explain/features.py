@@ -88,7 +88,11 @@ class Kind:
 
 
 def token_slices(tokens: SceneTokens) -> dict[str, slice]:
-    """Where each kind lies in the token; kinds that the scene lacks are left out."""
+    """Where each kind lies in the token; kinds that the scene lacks are left out.
+
+    Raises:
+        ValueError: the kinds do not fill the token.
+    """
     joints, contact = tokens.robot.joints, tokens.contact.sizes
     base = 3 * tokens.robot.base.is_floating
     widths = {

@@ -112,7 +112,15 @@ def rebuild(scene: Scene, paper: PaperInput, token: Tensor) -> dict[str, Tensor]
 
 
 def recover_state(scene: Scene, part: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """``qpos``, ``qvel`` up to place, heading and whole turns, from parts of tokens."""
+    """State up to place, heading and whole turns, from parts of tokens.
+
+    Args:
+        scene: the robot.
+        part: ``(rows, width)`` of each kind, see `token_slices`.
+
+    Returns:
+        ``qpos (rows, nq)`` and ``qvel (rows, nv)``.
+    """
     any_part, joints = next(iter(part.values())), SceneTokens(scene).robot.joints
     rows = len(any_part)
     qpos = any_part.new_tensor(scene.model.qpos0).repeat(rows, 1)

@@ -56,7 +56,11 @@ def film(
 
 
 def make_renderer(pair: Pair, draw: Draw = "auto") -> OpenGLRenderer | DrawingRenderer:
-    """What draws, looking at the true motion; see `film`."""
+    """What draws, looking at the true motion; see `film`.
+
+    Raises:
+        ValueError: no OpenGL where it was asked for.
+    """
     gl = None if draw == "drawing" else find_gl()
     if gl is None and draw == "opengl":
         raise ValueError(

@@ -81,6 +81,7 @@ def play_pair(
     steps: int,
     seed: int = 0,
     own_actions: bool = False,
+    device: torch.device | str = "cpu",
 ) -> Pair:
     """Both dynamics from one start of the task, until the true episode ends.
 
@@ -92,8 +93,14 @@ def play_pair(
         seed: of the start.
         own_actions: show each dynamics' own state and act on it, so that a policy can
             mend what the model gets wrong; by default both get the same actions.
+        device: of the envs, and of what ``act`` is shown.
+
+    Returns:
+        The episode, on the processor.
     """
-    learned, truth = (make_env(task, name, 1, seed) for name in (model, "mujoco"))
+    learned, truth = (
+        make_env(task, name, 1, seed, device) for name in (model, "mujoco")
+    )
     start = truth.reset()
     shown = [learned.reset(start.clone(), set_state=True), start]
     paths: list[list[Tensor]] = [[td[QPOS]] for td in shown]
@@ -110,14 +117,14 @@ def play_pair(
         if shown[1]["done"].item():
             ending = "terminated" if shown[1]["terminated"].item() else "horizon"
             break
-    positions = [torch.cat(path) for path in paths]
+    positions = [torch.cat(path).cpu() for path in paths]
     scene, terrain = truth.scene, start.get(TERRAIN, None)
     return Pair(
         scene=scene,
         step_size=scene.control_step * truth.task.steps_per_action,
         learned=positions[0],
         truth=positions[1],
-        terrain=None if terrain is None else terrain[0],
+        terrain=None if terrain is None else terrain[0].cpu(),
         errors=position_errors(scene, positions[1], positions[0]),
         returns=(returns[0], returns[1]),
         ending=ending,
@@ -125,4 +132,5 @@ def play_pair(
 
 
 def _step(env: SceneEnv, action: Tensor) -> TensorDictBase:
-    return env.step(TensorDict({ACTION: action}, env.batch_size))["next"]
+    shown = TensorDict({ACTION: action}, env.batch_size, device=env.device)
+    return env.step(shown)["next"]

@@ -58,7 +58,7 @@ def length(x: Tensor) -> Tensor:
 
 
 def largest(value: np.ndarray | Tensor) -> float:
-    """The largest entry; infinity if any is no number."""
+    """The largest entry ``(*any)``; infinity if any is no number, or there is none."""
     array = np.asarray(value, dtype=float)
     return (
         float(array.max()) if array.size and np.isfinite(array).all() else float("inf")

@@ -73,7 +73,7 @@ def _at_rest(scene: Scene, drops: int, generator: Generator) -> TensorDict:
 
 
 def rows_of(states: TensorDict, rows: Tensor) -> TensorDict:
-    """Some of the states, by index or mask; a copy."""
+    """Some of the states ``[n]``, by index or mask ``(n,)``; a copy."""
     return cast(TensorDict, states[rows])
 
 

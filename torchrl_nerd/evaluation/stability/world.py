@@ -94,7 +94,11 @@ class EnvWorld:
         torque: Tensor | None = None,
         every: int = 1,
     ) -> TensorDict:
-        """See `World.roll`; ends of episodes are stepped over."""
+        """See `World.roll`; ends of episodes are stepped over.
+
+        Raises:
+            ValueError: another number of states than the env has rows.
+        """
         rows = self.env.batch_size
         if rows != start.batch_size:
             raise ValueError(

@@ -53,7 +53,7 @@ def _over(world: World, scene: Scene) -> World:
     old = world.dynamics.model
     model = type(old)(scene, old.config)
     model.load_state_dict(old.state_dict())
-    return DynamicsWorld(NeRDDynamics(model))
+    return DynamicsWorld(NeRDDynamics(model.to(old.device)))
 
 
 CASE = Case(

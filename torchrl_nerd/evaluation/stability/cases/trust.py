@@ -73,6 +73,7 @@ def _stretched(data: TensorDict, generator: Generator) -> TensorDict:
 
 def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
     """Scores of inputs, and the normalised one-step errors that they should foretell."""
+    data = data.to(model.device)
     terrain, torque = data.get(TERRAIN, None), data[JOINT_TORQUE]
     now = data[QPOS], data[QVEL]
     after = MujocoDynamics(model.scene).step(data, torque, terrain)
@@ -84,12 +85,13 @@ def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
         output = model.network.step(token, model.network.empty_memory(len(token)))
     error = output.double() - model.normalize.normalize(TARGET, target)
     coverage = model.coverage
-    return {
-        "error": error.square().mean(-1).sqrt()[fine],
-        "distance": coverage.distance(features)[fine],
-        "mahalanobis": coverage.mahalanobis(features)[fine],
-        "excess": coverage.excess(features)[fine],
+    scores = {
+        "error": error.square().mean(-1).sqrt(),
+        "distance": coverage.distance(features),
+        "mahalanobis": coverage.mahalanobis(features),
+        "excess": coverage.excess(features),
     }
+    return {name: score[fine].cpu() for name, score in scores.items()}
 
 
 def _auc(score: Tensor, is_large: Tensor) -> float:
