@@ -164,10 +164,9 @@ def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
 
 
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
-    """Tokens and targets of transitions, normalised, ``(trajectories, steps, D)``."""
-    rows, steps = data.batch_size
+    """Tokens and targets of transitions, normalised, float32 ``(*batch, D)``."""
     tokens, targets = (
-        torch.empty(rows, steps, size, device=data[QPOS].device)
+        torch.empty(*data.batch_size, size, device=data[QPOS].device)
         for size in (model.tokens.size, model.state_delta.size)
     )
     for part, *places in zip(
