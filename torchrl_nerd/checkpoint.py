@@ -34,7 +34,8 @@ WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
 LARGEST_SIZE = 2**14  # of any number in a network's configuration
 COVERAGE = "coverage."
-REST = {"coverage.still"}
+GAIN = {"coverage.gain"}
+REST = {"coverage.still", *GAIN}
 NEWEST = {"coverage.qpos_low", "coverage.qpos_high", *REST}
 KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
@@ -138,7 +139,7 @@ def read_checkpoint(
             ) from None
     bounds = {k: v for k, v in model.state_dict().items() if k.startswith(COVERAGE)}
     missing = bounds.keys() - tensors.keys()
-    if missing in (bounds.keys(), NEWEST, REST):  # weights of before 0.2
+    if missing in (bounds.keys(), NEWEST, REST, GAIN):  # weights of before 0.2
         tensors |= {key: bounds[key] for key in missing}
     what = f"weights in {folder}"
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}

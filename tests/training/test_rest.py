@@ -63,6 +63,28 @@ def test_what_moves_is_left_alone(name, generator):
     assert torch.equal(after(model, states, 3)[QPOS], before[QPOS])
 
 
+@each_grounded
+def test_what_gains_more_speed_than_at_rest_is_awake(name, generator):
+    scene = load_scene(name)
+    model, states = (
+        sluggish_model(scene, generator, 1e-5),
+        states_at_rest(scene, generator),
+    )
+    find_rest(model, states)
+    cover, qpos, asleep = model.coverage, states[QPOS], states[QVEL]
+    assert (cover.gain < cover.still).all()  # one step of it, not twenty
+    for share in (0.5, 2.0):
+        push = torch.zeros_like(asleep)
+        push[:, 0] = share * cover.gain[0]
+        assert (push < cover.still).all()
+        is_awake = share > 1.0
+        moved, speed = cover.stay((qpos, asleep), (qpos + 1.0, push))
+        assert torch.equal(speed, push if is_awake else asleep)
+        assert torch.equal(moved, qpos + 1.0 if is_awake else qpos)
+        moved, speed = cover.stay((qpos, push), (qpos + 1.0, 0.5 * push))
+        assert torch.equal(moved, qpos) and not speed.any()  # it was slowing down
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_a_model_that_does_not_rest_stays_as_it_is(name, generator):
     scene = load_scene(name)
@@ -76,7 +98,7 @@ def test_a_model_that_does_not_rest_stays_as_it_is(name, generator):
 
 def test_states_at_rest_are_found(generator):
     rows, steps = 30, 40
-    speed = torch.rand(rows, steps, 1, generator=generator).double() * 0.01
+    speed = torch.rand(rows, steps, 1, generator=generator).double() * 10.0 * STILL
     data = TensorDict(
         {QVEL: speed, ("next", QVEL): speed.roll(-1, 1)}, batch_size=[rows, steps]
     )

@@ -64,16 +64,17 @@ class Fallen:
 
 @dataclass(frozen=True)
 class Nudged:
-    """Robots at rest, pushed a little: what a model must know to come to rest again.
+    """Fallen robots, stopped and pushed a little: what a model must know to come to rest.
 
     Without them nothing near rest is in the data but rest itself, and whatever small
-    error a model makes there may grow. Sizes are log-uniform over four decades, that of the
-    velocity and that of the displacement each by itself: a cube that slides fast lies as
-    deep in the ground as one at rest.
+    error a model makes there may grow. Stopped, since what lies on a steep slope slides on
+    and on: how it begins to would not be in the data. Sizes are log-uniform over four
+    decades, that of the velocity and that of the displacement each by itself: a cube that
+    slides fast lies as deep in the ground as one at rest.
 
     | field | meaning |
     |---|---|
-    | ``fallen`` | where they rest |
+    | ``fallen`` | where they lie |
     | ``least`` | smallest push as a share of the largest: 1 m/s, 3 rad/s, 1 cm, 0.03 rad |
     """
 
@@ -90,4 +91,4 @@ class Nudged:
         if scene.base.is_floating:
             unit[scene.base.dof_address : scene.base.dof_address + 3] = 1.0
         moved = integrate_pos(scene.layout, start[QPOS], 0.01 * unit * push[0])
-        return start | {QPOS: moved, QVEL: start[QVEL] + unit * push[1]}
+        return start | {QPOS: moved, QVEL: unit * push[1]}

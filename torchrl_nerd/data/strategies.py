@@ -52,7 +52,7 @@ def strategies(
     | ``scales`` | torque scales log-uniform over two decades |
     | ``correlated`` | torques that keep for one control step to a second |
     | ``starts`` | equal parts of ``shares``, standing and fallen starts |
-    | ``resting`` | two parts of ``shares``, one of robots at rest pushed a little |
+    | ``resting`` | two parts of ``shares``, one of the fallen, stopped and pushed |
     | ``policy`` | the way of an exploring policy |
     | ``mixed`` | equal parts of ranges, standing, fallen and policy |
 

@@ -41,6 +41,7 @@ class Coverage(nn.Module):
     is_limited: Tensor
     qpos_high: Tensor
     still: Tensor
+    gain: Tensor
     center: Tensor
     whitening: Tensor
     reach: Tensor
@@ -62,6 +63,7 @@ class Coverage(nn.Module):
         self.register_buffer("qpos_low", one.new_full((scene.model.nq,), -UNLIMITED))
         self.register_buffer("qpos_high", one.new_full((scene.model.nq,), UNLIMITED))
         self.register_buffer("still", one.new_zeros(scene.model.nv))
+        self.register_buffer("gain", one.new_full((scene.model.nv,), UNLIMITED))
         self.register_buffer("center", one.new_zeros(num_inputs))
         self.register_buffer("whitening", one.new_zeros(num_inputs, num_inputs))
         self.register_buffer("reach", one)
@@ -151,8 +153,10 @@ class Coverage(nn.Module):
         """The state after, or the one before at rest, where both are as good as still.
 
         Still is what is slower than the model moves a robot that rests: that motion is
-        its noise, which would carry a robot away in time. Found by `training.rest`; zero,
-        and so nothing stays, for a model that has seen no rest.
+        its noise, which would carry a robot away in time. What gains more speed in the
+        step than a robot at rest does is not still, however slow: it begins to move, as
+        on a slope that friction does not hold. Both found by `training.rest`; zero, and so
+        nothing stays, for a model that has seen no rest.
 
         Args:
             before: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
@@ -160,8 +164,9 @@ class Coverage(nn.Module):
         """
         if not self.can_rest:
             return after
-        speed = torch.maximum(self.sizes(before[1]), self.sizes(after[1]))
-        is_still = (speed < self.still).all(-1, keepdim=True)
+        old, new = self.sizes(before[1]), self.sizes(after[1])
+        is_slow = torch.maximum(old, new) < self.still
+        is_still = (is_slow & (new - old < self.gain)).all(-1, keepdim=True)
         qpos = torch.where(is_still, before[0], after[0])
         return qpos, after[1].masked_fill(is_still, 0.0)
 

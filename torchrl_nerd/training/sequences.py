@@ -171,16 +171,18 @@ def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
 
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
     """Tokens and targets of transitions, normalised, ``(trajectories, steps, D)``."""
-    device, sizes = data[QPOS].device, (model.tokens.size, model.state_delta.size)
-    # filled in place: the parts beside their whole would take twice the memory
-    filled = [torch.empty(*data.batch_size, size, device=device) for size in sizes]
+    rows, steps = data.batch_size
+    tokens, targets = (
+        torch.empty(rows, steps, size, device=data[QPOS].device)
+        for size in (model.tokens.size, model.state_delta.size)
+    )
     for part, *places in zip(
-        data.split(PART), *(x.split(PART) for x in filled), strict=True
+        data.split(PART), tokens.split(PART), targets.split(PART), strict=True
     ):
         raw = raw_tokens(model.tokens, model.state_delta, part)
-        for place, key, x in zip(places, (TOKEN, TARGET), raw, strict=True):
-            place.copy_(model.normalize.normalize(key, x))
-    return filled[0], filled[1]
+        for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
+            place.copy_(model.normalize.normalize(key, value))
+    return tokens, targets
 
 
 def cover(
