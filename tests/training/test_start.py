@@ -5,7 +5,12 @@ import torch
 from dynamics_helpers import little_data, random_drive, random_model
 from torch import Generator
 
-from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
+from torchrl_nerd.checkpoint import (
+    from_pretrained,
+    load_checkpoint,
+    make_card,
+    save_checkpoint,
+)
 from torchrl_nerd.cli import main
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
@@ -99,12 +104,17 @@ def test_features_of_another_width_are_refused_in_a_sentence(name, generator):
             begin_from(start, scene, "tiny")
 
 
-def test_the_scene_is_used_as_it_is_given(generator):
-    """Another scene of the same widths: weights and statistics are kept."""
-    start = random_model(CARTPOLE, generator)
-    scene = CARTPOLE.fine
+@pytest.mark.parametrize("name", [n for n in SCENES if load_scene(n).terrain])
+def test_the_scene_is_used_as_it_is_given(name, tmp_path, generator):
+    """Features of other values but the same widths: weights and statistics are kept."""
+    known = load_scene(name)
+    known, scene = (known.foreseeing(known.foresees_forces, x) for x in (False, True))
+    start = random_model(known, generator)
+    save_checkpoint(start, tmp_path, make_card(start))
+    start = from_pretrained(tmp_path, scene)
+    assert not start.scene.foresees_free_motion
     model = begin_from(start, scene, "tiny")
-    assert model.scene is scene
+    assert model.scene is scene and scene.foresees_free_motion
     for part in ("network", "normalize"):
         mine, theirs = (getattr(m, part).state_dict() for m in (model, start))
         assert all(torch.equal(mine[k], v) for k, v in theirs.items())

@@ -42,9 +42,15 @@ class Symmetry:
         isometries = find_isometries(scene)
         tokens, targets = SceneTokens(scene), StateDelta(scene)
         low = states_in_contact(scene, LOW_ROWS, SUNKEN)
-        flat = cast(TensorDict, data[: LOOK * PART].flatten(0, 1))
-        token, target = raw_tokens(tokens, targets, flat)
-        some = flat[torch.cat((telling_rows(token), telling_rows(target))).unique()]
+
+        def telling(flat: TensorDict) -> TensorDict:
+            rows = [telling_rows(x) for x in raw_tokens(tokens, targets, flat)]
+            return cast(TensorDict, flat[torch.cat(rows).unique()])
+
+        # the largest of all are among the largest of each part, which takes less memory
+        parts = data[: LOOK * PART].split(PART)
+        found = [telling(cast(TensorDict, part.flatten(0, 1))) for part in parts]
+        some = telling(cast(TensorDict, TensorDict.cat(found)))
         token_images, target_images = [], []
         for isometry in isometries:
             token, target = raw_tokens(tokens, targets, isometry(some))
@@ -53,8 +59,8 @@ class Symmetry:
             other = tokens(*(image[k] for k in keys), image.get(TERRAIN, None))
             token_images.append(torch.cat((token, other)))
             target_images.append(target)
-        found = {TOKEN: token_images, TARGET: target_images}
-        images = {key: Images(x[0], x) for key, x in found.items()}
+        pairs = ((TOKEN, token_images), (TARGET, target_images))
+        images = {key: Images(x[0], x) for key, x in pairs}
         return cls(isometries, images)
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
