@@ -18,9 +18,10 @@ TORCH := $(shell sed -n 's/^ *"\(torch==[^";]*\).*/\1/p' pyproject.toml)
 DM_CONTROL := $(shell sed -n 's/^ *"\(dm-control==[^";]*\).*/\1/p' pyproject.toml)
 MADE_FROM := $(shell { pwd; cat pyproject.toml $(CONSTRAINTS); } | cksum | cut -d' ' -f1)
 STAMP := $(VENV)/.installed-$(MADE_FROM)
+NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -59,6 +60,16 @@ test-gpu: $(STAMP) ## the tests that need a CUDA device
 
 bench-check: $(STAMP) ## whether anything got slower, against a baseline of ratios
 	$(PY) benchmarks/bench_check.py $(ARGS)
+
+model-ant: $(STAMP) ## the shipped Ant anew: learned, tried by a policy, learned on
+	$(NERD) train ant
+	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant/best --out runs/ppo_ant \
+		--horizon 16 --minibatch 8192 --lr 1e-3 --total-frames 8000000 --episodes 512
+	$(NERD) data ant --policy runs/ppo_ant --trajectories 12000 --out datasets/ant_policy
+	$(NERD) train ant --start runs/ant/best --data datasets/ant datasets/ant_policy \
+		--steps 12000 --rollout-steps 4000 --rollout-rounds 1 --lr 0.004 --lr-other 0.0012 \
+		--rollout-lr 0.25 --validate-every 2000 --out runs/ant_policy \
+		--export torchrl_nerd/pretrained/ant
 
 format: $(STAMP) ## repair what ruff can repair
 	$(PY) -m ruff check --fix .
