@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from shutil import copyfile
 
@@ -21,6 +22,7 @@ from tensordict import TensorDict
 import torchrl_nerd
 from torchrl_nerd import load_scene
 from torchrl_nerd.cli import main
+from torchrl_nerd.evaluation.policy import Policy, save_policy
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -73,7 +75,7 @@ def test_every_relative_link_leads_somewhere(page):
 
 @each_page
 def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
-    """Dry: of what it reads, the recorded tosses alone must be there."""
+    """Dry: of what it reads, the recorded tosses and policies alone must be there."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     lines = "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
@@ -82,6 +84,9 @@ def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
             continue
         for name in (word for word in words if word.endswith(".npz")):
             copyfile(EXCERPT, name)
+        for option, folder in pairwise(words):
+            if option == "--policy":
+                save_policy(Policy([29, 8]), Path(folder), {"task": "ant/run"})
         assert main([*words[1:], "--dry-run"]) == 0, capsys.readouterr().err
 
 

@@ -119,6 +119,8 @@ def test_features_are_mujocos_distances_and_velocities(scene, generator):
 
 @touching_scene
 def test_foreseen_depths_are_those_of_the_coming_states(scene, generator):
+    """At constant velocity; along free motion, see test_foresight."""
+    scene = scene.foreseeing(scene.foresees_forces, False)
     rows, foreseen = near_ground(scene, generator), 0
     rows[QVEL] /= rows[QVEL].abs().amax(-1, keepdim=True)
     features, points = contact_features(scene, rows), scene.contacts
