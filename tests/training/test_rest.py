@@ -34,13 +34,14 @@ def sluggish_model(scene, generator, size):
     return model
 
 
+def sluggish_and_at_rest(scene, generator):
+    """Such a model of little noise, and states for it."""
+    return sluggish_model(scene, generator, 1e-5), states_at_rest(scene, generator)
+
+
 @each_grounded
 def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
-    scene = load_scene(name)
-    model, states = (
-        sluggish_model(scene, generator, 1e-5),
-        states_at_rest(scene, generator),
-    )
+    model, states = sluggish_and_at_rest(load_scene(name), generator)
     assert not torch.equal(after(model, states, 50)[QPOS], states[QPOS])
     find_rest(model, states)
     found = model.coverage.still.clone()
@@ -53,10 +54,7 @@ def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
 @each_grounded
 def test_what_moves_is_left_alone(name, generator):
     scene = load_scene(name)
-    model, states = (
-        sluggish_model(scene, generator, 1e-5),
-        states_at_rest(scene, generator),
-    )
+    model, states = sluggish_and_at_rest(scene, generator)
     states[QVEL] += 2 * LARGEST
     before = after(model, states, 3)
     find_rest(model, states_at_rest(scene, generator))
@@ -65,11 +63,7 @@ def test_what_moves_is_left_alone(name, generator):
 
 @each_grounded
 def test_what_gains_more_speed_than_at_rest_is_awake(name, generator):
-    scene = load_scene(name)
-    model, states = (
-        sluggish_model(scene, generator, 1e-5),
-        states_at_rest(scene, generator),
-    )
+    model, states = sluggish_and_at_rest(load_scene(name), generator)
     find_rest(model, states)
     cover, qpos, asleep = model.coverage, states[QPOS], states[QVEL]
     assert (cover.gain < cover.still).all()  # one step of it, not twenty

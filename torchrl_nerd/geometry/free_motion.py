@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import Base, cross, quat_matrix
 
@@ -84,20 +85,18 @@ class FreeMotion(nn.Module):
         together[self.num_whole :] = 0.0
         together[self.num_whole :, self.num_whole :] = axes.carries(below)
         braked = 0.5 * period * model.dof_damping
-        constants = {
-            "mass": model.body_mass[found, None],
-            "carries": carries,
-            "together": together,
-            "gravity": model.opt.gravity,
-            "damping": model.dof_damping,
-            "stiffness": model.jnt_stiffness[joints],
-            "rest": model.qpos_spring[self.qpos_addresses],
-            "extra": np.diag(model.dof_armature + braked),
-            "is_slide": axes.is_slide[:, None],
-        }
-        for name, value in constants.items():
-            tensor = torch.as_tensor(np.array(value, dtype=np.float64))
-            self.register_buffer(name, tensor, persistent=False)
+        keep_constants(
+            self,
+            mass=model.body_mass[found, None],
+            carries=carries,
+            together=together,
+            gravity=model.opt.gravity,
+            damping=model.dof_damping,
+            stiffness=model.jnt_stiffness[joints],
+            rest=model.qpos_spring[self.qpos_addresses],
+            extra=np.diag(model.dof_armature + braked),
+            is_slide=axes.is_slide[:, None],
+        )
 
     def forward(
         self,

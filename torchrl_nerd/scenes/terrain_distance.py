@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.geometry.height_fields import height_field_distance
 from torchrl_nerd.geometry.kinematics import matrix_from_quat
@@ -29,19 +30,16 @@ class TerrainDistance(nn.Module):
     def __init__(self, terrain: Terrain, reach: float) -> None:
         super().__init__()
         self.terrain, self.reach = terrain, reach
-        self._constant("default", terrain.default)
+        constants: dict[str, object] = {"default": terrain.default}
         for index, surface in enumerate(terrain.surfaces):
-            self._constant(f"position_{index}", surface.position)
-            self._constant(f"rotation_{index}", surface.rotation)
-            self._constant(f"size_{index}", surface.size)
+            constants[f"position_{index}"] = surface.position
+            constants[f"rotation_{index}"] = surface.rotation
+            constants[f"size_{index}"] = surface.size
             if surface.kind == PLANE:
-                self._constant(f"plane_{index}", surface.plane)
+                constants[f"plane_{index}"] = surface.plane
             if surface.heights is not None:
-                self._constant(f"heights_{index}", surface.heights)
-
-    def _constant(self, name: str, value: object) -> None:
-        tensor = torch.as_tensor(value, dtype=torch.float64).clone()
-        self.register_buffer(name, tensor, persistent=False)
+                constants[f"heights_{index}"] = surface.heights
+        keep_constants(self, **constants)
 
     def forward(
         self,

@@ -20,6 +20,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics, base_pose
@@ -124,12 +125,14 @@ class ContactFeatures(FeatureTransform):
         self.count, self.num_known = count, count + self.num_places
         self.substeps = scene.substeps // scene.refinement
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
-        constants = {"radii": points.radii, "margins": points.margins}
-        constants |= {"glances": np.arange(glances) / glances}
-        constants |= dict(zip(("mount_pos", "mount_rot"), scene.mount, strict=True))
-        for name, value in constants.items():
-            tensor = torch.as_tensor(value, dtype=torch.float64).clone()
-            self.register_buffer(name, tensor, persistent=False)
+        keep_constants(
+            self,
+            radii=points.radii,
+            margins=points.margins,
+            glances=np.arange(glances) / glances,
+            mount_pos=scene.mount[0],
+            mount_rot=scene.mount[1],
+        )
 
     def contact_features(
         self,
@@ -154,19 +157,20 @@ class ContactFeatures(FeatureTransform):
         now, places, corners = found.split(sizes, -2)
         velocity = velocity[..., : self.count, :]
         mount = self.mount_pos, self.mount_rot
+        pose = base_pose(self.base, qpos, *mount)
         mean = qvel  # velocity of the way to the step's end
         if self.free_motion is not None:
-            turned = base_pose(self.base, qpos, *mount)[1]
             torque = None
             if joint_torque is not None:
                 torque = torch.zeros_like(qvel)
                 torque[..., self.actuated] = joint_torque
-            gain = self.free_motion(qpos, qvel, torque, turned, corners, places)
+            gain = self.free_motion(qpos, qvel, torque, pose[1], corners, places)
             mean = qvel + 0.5 * self.step_size * (1.0 + 1.0 / self.substeps) * gain
         later = integrate_pos(self.layout, qpos, self.step_size * mean)
         ends, _ = self.later(later, qvel.new_empty(0, qvel.shape[-1]))
         points = torch.stack((now, ends))
-        position, rotation = base_pose(self.base, torch.stack((qpos, later)), *mount)
+        poses = zip(pose, base_pose(self.base, later, *mount), strict=True)
+        position, rotation = (torch.stack(both) for both in poses)
         if terrain is not None:
             terrain = terrain.expand(2, *terrain.shape)
         (distance, end), (normal, _) = self.ground(points, terrain, position, rotation)

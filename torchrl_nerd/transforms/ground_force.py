@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.scenes.penalty import PenaltyLaw
 from torchrl_nerd.scenes.scene import Scene
@@ -41,14 +42,12 @@ class GroundForce(nn.Module):
             scene.contacts.stands_for.count(i) for i in range(len(scene.contacts))
         ]
         numbers = law.stiffness, law.damping, law.slip, law.friction, merged
-        constants = {
-            "law": np.stack(numbers),
-            "carries": axes.carries(scene.contacts.bodies),
-            "is_slide": axes.is_slide,
-        }
-        for name, value in constants.items():
-            tensor = torch.as_tensor(np.array(value, dtype=np.float64))
-            self.register_buffer(name, tensor, persistent=False)
+        keep_constants(
+            self,
+            law=np.stack(numbers),
+            carries=axes.carries(scene.contacts.bodies),
+            is_slide=axes.is_slide,
+        )
 
     def forward(
         self,
