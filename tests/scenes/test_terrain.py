@@ -9,8 +9,10 @@ from torchrl_nerd.geometry.frames import rotate
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.scenes.double_pendulum import (
     GROUNDS,
+    LEVEL_TILT,
     evaluation_ground,
     sample_ground,
+    sample_level_ground,
 )
 from torchrl_nerd.scenes.terrain import Terrain
 
@@ -111,10 +113,11 @@ def test_there_are_seven_evaluation_grounds(number):
         evaluation_ground(number)
 
 
-def test_sampled_grounds_reach_from_touching_to_out_of_reach(generator):
+@pytest.mark.parametrize("sample", [sample_ground, sample_level_ground])
+def test_sampled_grounds_reach_from_touching_to_out_of_reach(sample, generator):
     scene = load_scene("double_pendulum")
-    start, _ = scene.sample_initial(ROWS, generator)
-    qpos, planes = start["qpos"], start["terrain"]
+    qpos = scene.sample_initial(ROWS, generator)[0]["qpos"]
+    planes = sample(qpos, generator)
     lengths = torch.linalg.vector_norm(planes[:, :3], dim=-1)
     assert (lengths - 1.0).abs().max() < 1e-14
     gap = clearances(scene, qpos, planes)
@@ -135,3 +138,11 @@ def test_sampled_normals_are_a_cubes(generator):
     assert (share - 1.0 / 3.0).abs().max() < 0.02
     # uniform in the cube: more towards the corners than on a sphere
     assert (normal.amin(-1) > 0.4).double().mean() > 0.16
+
+
+def test_level_grounds_are_hit_head_on(generator):
+    planes = sample_level_ground(torch.zeros(20_000, 2).double(), generator)
+    out_of_plane = planes[:, 1]
+    assert out_of_plane.abs().max() <= np.sin(LEVEL_TILT)
+    assert abs((out_of_plane == 0.0).double().mean() - 0.5) < 0.02
+    assert (planes[:, :3].mean(0).abs() < 0.03).all()  # from above and below alike

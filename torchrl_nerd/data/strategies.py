@@ -52,11 +52,13 @@ def strategies(
     | ``scales`` | torque scales log-uniform over two decades |
     | ``correlated`` | torques that keep for one control step to a second |
     | ``starts`` | equal parts of ``shares``, standing and fallen starts |
+    | ``level`` | two parts of ``shares``, one of it over grounds that are hit head-on |
     | ``resting`` | two parts of ``shares``, one of the fallen, stopped and pushed |
     | ``policy`` | the way of an exploring policy |
     | ``mixed`` | equal parts of ranges, standing, fallen and policy |
 
     All but the policy's part of ``mixed`` have scales and correlation.
+    Scenes without such grounds have no ``level``.
     Scenes whose torques follow the state have no correlation; without an explorer there is
     no ``policy``, nor a part of it in ``mixed``.
 
@@ -74,12 +76,14 @@ def strategies(
     def along(**ranges: Any) -> Draw:
         return partial(simulate, resample(scene, **ranges))
 
+    level = scene.sampling.level_ground
     found = {
         "uniform": along(passive_share=0.0, quiet_share=0.0),
         "shares": along(),
         "scales": along(**calm),
         "correlated": along(**held) if can_hold else None,
         "starts": mix(along(), along(**standing), along(**fallen)),
+        "level": mix(along(), along(), along(ground=level)) if level else None,
         "resting": mix(along(), along(), along(starts=Nudged(Fallen(scene)))),
     }
     mixed = [along(**both), along(**both, **standing), along(**both, **fallen)]

@@ -18,6 +18,7 @@ SUBSTEPS = 5  # of 1/300 s: control step 1/60 s
 CONTACT = {"ke": 1e4, "kd": 1e3, "kf": 1e4, "mu": 0.5}  # N/m, N s/m, N s/m, -
 LINK_LENGTH = 1.5  # m
 RADIUS = 0.1  # m
+LEVEL_TILT = 0.15  # rad
 ROOT = (0.0, -1.0, 2.0)  # m, world; (0, 2, 1) in the reference's axes
 
 # Evaluation grounds: offset (m) along the up axis of the plane's point, and extrinsic
@@ -75,6 +76,7 @@ def _scene(
             qvel_high=(2 * pi, 4 * pi),
             torque=(GAIN, GAIN),
             ground=ground,
+            level_ground=None if ground is None else sample_level_ground,
             clearance=clearance,
         ),
         foresees_forces=True,
@@ -89,17 +91,36 @@ def sample_ground(qpos: Tensor, generator: Generator) -> Tensor:
     the stretched pendulum (3.5 m from the root) and touching its lowest point.
     Source: reference code, ``generate/trajectory_sampler_pendulum.py``.
     """
-    rows = len(qpos)
-    draw = torch.rand(rows, 4, dtype=torch.float64, generator=generator)
+    draw = torch.rand(len(qpos), 4, dtype=torch.float64, generator=generator)
     normal = 2.0 * draw[:, :3] - 1.0
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    return _plane(normal, qpos, draw[:, 3])
+
+
+def sample_level_ground(qpos: Tensor, generator: Generator) -> Tensor:
+    """Planes ``(n, 4)`` that the links hit head-on; not in the paper.
+
+    Four of its grounds have normals in the plane of motion, of which `sample_ground` draws
+    none. Here half of the rows have one, the others tilt out of it by up to
+    `LEVEL_TILT`; offsets as there.
+    """
+    draw = torch.rand(len(qpos), 4, dtype=torch.float64, generator=generator)
+    angle = 2.0 * pi * draw[:, 0]
+    tilt = (2.0 * draw[:, 1] - 1.0) * LEVEL_TILT * (draw[:, 2] < 0.5)
+    across = tilt.cos()
+    normal = torch.stack((across * angle.cos(), tilt.sin(), across * angle.sin()), -1)
+    return _plane(normal, qpos, draw[:, 3])
+
+
+def _plane(normal: Tensor, qpos: Tensor, draw: Tensor) -> Tensor:
+    """At a uniform offset from out of reach of the links to touching them."""
     root = normal @ torch.tensor(ROOT, dtype=torch.float64)
     first, second = qpos[:, 0], qpos[:, 0] + qpos[:, 1]
     elbow = LINK_LENGTH * (normal[:, 0] * first.cos() + normal[:, 2] * first.sin())
     tip = LINK_LENGTH * (normal[:, 0] * second.cos() + normal[:, 2] * second.sin())
     lowest = root + torch.stack((torch.zeros_like(root), elbow, elbow + tip)).amin(0)
     low, high = root - 3.5, lowest - RADIUS
-    return torch.cat((normal, (low + (high - low) * draw[:, 3])[:, None]), -1)
+    return torch.cat((normal, (low + (high - low) * draw)[:, None]), -1)
 
 
 def evaluation_ground(number: int) -> Tensor:

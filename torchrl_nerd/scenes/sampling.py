@@ -73,6 +73,7 @@ class Sampling:
     | ``torque`` | largest torque of each actuated dof, N and N m |
     | ``base`` | start of a floating base, whose joint comes before the others |
     | ``ground`` | draws each row's ground, where it varies |
+    | ``level_ground`` | draws grounds that the robot hits head-on, see `strategies` |
     | ``drive`` | torques that depend on the state, in place of uniform ones |
     | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
     | ``passive_share`` | share of trajectories with no torque at all |
@@ -95,6 +96,7 @@ class Sampling:
     torque: tuple[float, ...]
     base: BaseSampling | None = None
     ground: GroundSampler | None = None
+    level_ground: GroundSampler | None = None
     drive: Drive | None = None
     clearance: float | None = None
     passive_share: float = 0.25

@@ -24,7 +24,6 @@ from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics, base_pose
-from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -39,9 +38,9 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
+from torchrl_nerd.transforms.coming_depth import ComingDepth, num_glances, over_ground
 from torchrl_nerd.transforms.ground_force import GroundForce
 
-MAX_GLANCES = 5  # times within a step at which the coming penetration is foreseen
 FADE = 0.25  # share of the way from margin to touching over which velocities fade in
 
 
@@ -60,9 +59,8 @@ class ContactFeatures(FeatureTransform):
       scenes that foresee forces, see `GroundForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
-    The K = min(substeps, 5) times are spread evenly from the step's start on: with few
-    substeps they are just those at which the true solver looks for contact. A scene
-    without contact gives no keys at all.
+    The K = min(substeps, 5) times are those of `ComingDepth`. A scene without contact gives
+    no keys at all.
 
     Args:
         scene: the robot and its ground.
@@ -78,17 +76,15 @@ class ContactFeatures(FeatureTransform):
     margins: Tensor
     mount_pos: Tensor
     mount_rot: Tensor
-    glances: Tensor
 
     def __init__(self, scene: Scene) -> None:
         count, terrain = len(scene.contacts), scene.terrain
-        glances = min(scene.substeps // scene.refinement, MAX_GLANCES)
         sizes: dict[NestedKey, int] = {}
         in_keys: list[NestedKey] = []
         if terrain is not None:
             in_keys = [QPOS, QVEL]
             sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
-            sizes[CONTACT_DEPTH] = glances * count
+            sizes[CONTACT_DEPTH] = num_glances(scene) * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
             if scene.foresees_forces:
@@ -101,14 +97,12 @@ class ContactFeatures(FeatureTransform):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
-        self.layout, self.step_size = scene.layout, scene.control_step
-        self.actuated = scene.actuated
+        self.actuated, self.step_size = scene.actuated, scene.control_step
         if terrain is None:
             return
         points = scene.contacts
         bodies, positions = points.bodies, points.positions
         self.force, self.free_motion, self.num_places = None, None, 0
-        self.later = PointKinematics(scene.model, scene.base, bodies, positions)
         if scene.foresees_forces or scene.foresees_free_motion:
             axes = JointAxes.of(scene.model, scene.base)  # places found along the way
             self.num_places = len(axes.bodies)
@@ -123,13 +117,12 @@ class ContactFeatures(FeatureTransform):
                 positions = np.concatenate((positions, self.free_motion.positions))
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
         self.count, self.num_known = count, count + self.num_places
-        self.substeps = scene.substeps // scene.refinement
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
+        self.coming_depth = ComingDepth(scene, self.ground)
         keep_constants(
             self,
             radii=points.radii,
             margins=points.margins,
-            glances=np.arange(glances) / glances,
             mount_pos=scene.mount[0],
             mount_rot=scene.mount[1],
         )
@@ -156,62 +149,33 @@ class ContactFeatures(FeatureTransform):
         sizes = (self.count, self.num_places, found.shape[-2] - self.num_known)
         now, places, corners = found.split(sizes, -2)
         velocity = velocity[..., : self.count, :]
-        mount = self.mount_pos, self.mount_rot
-        pose = base_pose(self.base, qpos, *mount)
-        mean = qvel  # velocity of the way to the step's end
+        pose = base_pose(self.base, qpos, self.mount_pos, self.mount_rot)
+        distance, normal = self.ground(now, terrain, *pose)
+        velocity = over_ground(self.base, qvel, now, velocity, pose[1])
+        beyond = distance - self.margins
+        gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
+        gate = gate[..., None]
+        speed = (velocity * normal).sum(-1)
+        sliding = velocity - speed[..., None] * normal
+        gain = None
         if self.free_motion is not None:
             torque = None
             if joint_torque is not None:
                 torque = torch.zeros_like(qvel)
                 torque[..., self.actuated] = joint_torque
             gain = self.free_motion(qpos, qvel, torque, pose[1], corners, places)
-            mean = qvel + 0.5 * self.step_size * (1.0 + 1.0 / self.substeps) * gain
-        later = integrate_pos(self.layout, qpos, self.step_size * mean)
-        ends, _ = self.later(later, qvel.new_empty(0, qvel.shape[-1]))
-        points = torch.stack((now, ends))
-        poses = zip(pose, base_pose(self.base, later, *mount), strict=True)
-        position, rotation = (torch.stack(both) for both in poses)
-        if terrain is not None:
-            terrain = terrain.expand(2, *terrain.shape)
-        (distance, end), (normal, _) = self.ground(points, terrain, position, rotation)
-        if self.base.is_floating:  # from riding on the base to standing on the ground
-            v = self.base.dof_address
-            linear = (rotation[0].mT @ qvel[..., v : v + 3, None])[..., 0]
-            angular = qvel[..., None, v + 3 : v + 6].expand_as(velocity)
-            turning = torch.linalg.cross(angular, now)
-            velocity = velocity + linear[..., None, :] + turning
-        beyond = distance - self.margins
-        gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
-        gate = gate[..., None]
-        speed = (velocity[..., None, :] @ normal[..., None])[..., 0]
-        sliding = velocity - speed * normal
-        depth = self._coming_depth(distance, self.step_size * speed, end)
+            gain = self.step_size * gain
+        depth = self.radii - distance
+        depth = gate * self.coming_depth(qpos, qvel, terrain, gain, depth, speed)
         features = [beyond.clamp_max(0.0)]
-        features.append((gate * torch.cat((speed, sliding), -1)).flatten(-2))
-        features.append((gate * depth).flatten(-2))
+        features.append((gate * torch.cat((speed[..., None], sliding), -1)).flatten(-2))
+        features.append(depth.flatten(-2))
         if self.force is not None:
-            contact = now, normal, gate * depth, speed, sliding
+            contact = now, normal, depth, speed[..., None], sliding
             features.append(self.force(*contact, places))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features
-
-    def _coming_depth(self, distance: Tensor, slope: Tensor, end: Tensor) -> Tensor:
-        """Penetration ``(*batch, P, K)`` at K times of the step, m, at least zero.
-
-        The distance is the parabola through its value and slope now and its value ``end``
-        after the whole step; of free motion it is the discrete one of the solver, which
-        changes velocities before positions.
-        """
-        start = (self.radii - distance)[..., None]
-        bend = self.radii[:, None] - end[..., None] - start + slope
-        squares = self.glances**2
-        if self.free_motion is not None:
-            whole = 1.0 + 1.0 / self.substeps
-            squares = (squares + self.glances / self.substeps) / whole
-        powers = torch.stack((-self.glances, squares))
-        path = start + torch.cat((slope, bend), -1) @ powers
-        return path.clamp_min(0.0)
 
     def _features(self, tensordict: TensorDictBase) -> dict:
         if self.terrain is None:
