@@ -39,7 +39,8 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, network_config
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training.losses import one_step_loss
 from torchrl_nerd.training.muon import Muon
-from torchrl_nerd.training.trainer import TrainConfig, split_parameters
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import split_parameters
 from torchrl_nerd.transforms import Stats
 
 PART = 20_000  # transitions turned into tokens at a time

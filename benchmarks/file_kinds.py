@@ -24,7 +24,8 @@ from torchrl_nerd.files import folder_name
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training.log import TrainingLog
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 Found = dict[str, Tensor]
 """What a loader found: tensors by name, all of which must be finite."""

@@ -33,7 +33,8 @@ from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.tensor_files import read_tensors
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 SCENE = "cartpole"
 CHUNK = 4  # trajectories, in place of the package's own chunk

@@ -30,7 +30,8 @@ from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.tasks.ppo import PPO_CONFIGS
 from torchrl_nerd.training.recipes import RECIPES
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 TEST_SEED = 500  # of starts and episodes; never one of training or validation
 PPO = Path(__file__).parents[1] / "examples" / "ppo.py"

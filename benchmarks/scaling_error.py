@@ -23,7 +23,8 @@ from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training.recipes import recipe_of
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 TEST_SEED = 500  # of starts; never one of training or validation
 STEPS = 100  # of a trajectory

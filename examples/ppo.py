@@ -68,7 +68,7 @@ def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperato
     """Both see observations standardised by what random actions meet."""
     seen = env.rollout(cfg.horizon, break_when_any_done=False)["observation"]
     size, num_actions = seen.shape[-1], env.action_spec.shape[-1]
-    policy = Policy((size, *cfg.widths, num_actions))
+    policy = Policy((size, *cfg.widths, num_actions), cfg.std)
     policy.standardize.fit(seen)
     critic = nn.Sequential(Standardize(size).fit(seen), mlp((size, *cfg.widths, 1)))
     return policy, ValueOperator(critic)

@@ -25,7 +25,8 @@ from torchrl_nerd.files import write_json
 from torchrl_nerd.scenes import Scene, load_scene
 from torchrl_nerd.scenes.importer import load_suite
 from torchrl_nerd.tasks.suite import SuiteTask
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 
 @dataclass(frozen=True)

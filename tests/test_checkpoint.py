@@ -30,7 +30,7 @@ from torchrl_nerd.files import read_json, write_atomically, write_json
 from torchrl_nerd.modules.nerd import NETWORKS
 from torchrl_nerd.scenes import SCENES
 from torchrl_nerd.training.recipes import RECIPES
-from torchrl_nerd.training.trainer import TrainConfig
+from torchrl_nerd.training.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]
 SCENE = load_scene(next(iter(SCENES)))

@@ -8,9 +8,10 @@ import pytest
 import torch
 from helpers import make_scene, random_transitions
 
+from torchrl_nerd.geometry.base import base_pose
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import PointKinematics, base_pose
+from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import SCENES, load_scene
 

@@ -6,12 +6,9 @@ import pytest
 import torch
 from helpers import every_scene, random_quats, random_states, random_tree
 
-from torchrl_nerd.geometry.kinematics import (
-    Base,
-    PointKinematics,
-    matrix_from_quat,
-    mount_pose,
-)
+from torchrl_nerd.geometry.base import Base, mount_pose
+from torchrl_nerd.geometry.frames import matrix_from_quat
+from torchrl_nerd.geometry.kinematics import PointKinematics
 
 ROWS, POINTS = 20, 7
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 from helpers import random_quats
 
-from torchrl_nerd.geometry.frames import rotate, rotate_inverse
-from torchrl_nerd.geometry.kinematics import matrix_from_quat
+from torchrl_nerd.geometry.frames import matrix_from_quat, rotate, rotate_inverse
 from torchrl_nerd.geometry.surfaces import (
     SHAPES,
     into_frame,

@@ -13,7 +13,7 @@ from helpers import (
     true_step,
 )
 
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.scenes.explain import base_effects

@@ -14,7 +14,7 @@ from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.cli import main
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD, SceneTokens
 from torchrl_nerd.scenes import Scene, load_scene

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torchrl_nerd.data.generate import DataConfig, generate
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training import ranks
-from torchrl_nerd.training.trainer import TrainConfig
+from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.transforms import Stats
 
 BRIEF = (

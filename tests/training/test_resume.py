@@ -18,7 +18,8 @@ from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.tasks import make_task
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 SCENE, TASK = "cartpole", "cartpole/swingup"
 CONFIG = TrainConfig(

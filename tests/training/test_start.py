@@ -21,7 +21,8 @@ from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training import trainer
 from torchrl_nerd.training.sequences import Symmetry, cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 
 CONFIG = TrainConfig(
     network="tiny",

@@ -16,7 +16,8 @@ from torchrl_nerd.training.images import Images
 from torchrl_nerd.training.losses import rollout_loss
 from torchrl_nerd.training.sequences import Sequences, Symmetry, data_stats, raw_tokens
 from torchrl_nerd.training.symmetry import find_isometries
-from torchrl_nerd.training.trainer import TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer
 from torchrl_nerd.transforms import StateDelta
 
 # Quarter turns and mirrors of the ant; the cube's whole group; ANYmal's trunk and the

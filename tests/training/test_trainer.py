@@ -18,7 +18,8 @@ from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss
 from torchrl_nerd.training.recipes import RECIPES
-from torchrl_nerd.training.trainer import TrainConfig, Trainer, split_parameters
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import Trainer, split_parameters
 
 SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
 BRIEF = TrainConfig(

@@ -13,7 +13,7 @@ from helpers import (
 )
 from tensordict import TensorDict
 
-from torchrl_nerd.geometry.kinematics import HINGE
+from torchrl_nerd.geometry.manifold import HINGE
 from torchrl_nerd.keys import QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.transforms import RobotCentric

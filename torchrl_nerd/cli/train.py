@@ -18,7 +18,8 @@ from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName
 from torchrl_nerd.training.recipes import recipe_of
 from torchrl_nerd.training.start import begin_from
-from torchrl_nerd.training.trainer import STATE, TrainConfig, Trainer
+from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.training.trainer import STATE, Trainer
 
 
 @dataclass(frozen=True)

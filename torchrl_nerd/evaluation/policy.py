@@ -1,5 +1,6 @@
 """A policy that TorchRL can train and that two plain files can hold."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -66,14 +67,15 @@ class Policy(nn.Module):
 
     Args:
         sizes: D, the widths of the hidden layers, A.
+        std: what the standard deviation begins at.
     """
 
-    def __init__(self, sizes: Sequence[int]) -> None:
+    def __init__(self, sizes: Sequence[int], std: float = 1.0) -> None:
         super().__init__()
         self.sizes = tuple(sizes)
         self.standardize = Standardize(self.sizes[0])
         self.mlp = mlp(self.sizes, last_gain=0.01)
-        self.log_std = nn.Parameter(torch.zeros(self.sizes[-1]))
+        self.log_std = nn.Parameter(torch.full((self.sizes[-1],), math.log(std)))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the action before squashing, ``(*batch, A)``."""

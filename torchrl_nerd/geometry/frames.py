@@ -5,6 +5,8 @@ Sola, "Quaternion kinematics for the error-state Kalman filter", sections 1 and 
 (https://arxiv.org/abs/1711.02508); the sign and order conventions are MuJoCo's.
 """
 
+import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -108,3 +110,21 @@ def orientation_error(a: Tensor, b: Tensor) -> Tensor:
     return torch.linalg.vector_norm(
         quat_log(quat_multiply(quat_conjugate(a), b)), dim=-1
     )
+
+
+def matrix_from_quat(q: Tensor) -> Tensor:
+    """Rotation matrices ``(*batch, 3, 3)`` of unit quaternions ``(*batch, 4)``."""
+    w, x, y, z = q.unbind(-1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def quat_matrix(quat: np.ndarray) -> np.ndarray:
+    """Rotation matrix ``(3, 3)`` of one quaternion ``wxyz``."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)

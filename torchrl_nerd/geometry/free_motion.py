@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.frames import quat_matrix
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import Base, cross, quat_matrix
+from torchrl_nerd.geometry.kinematics import cross
 
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float)
 

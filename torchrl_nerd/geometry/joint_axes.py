@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE, Base
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 
 
 @dataclass(frozen=True, eq=False)

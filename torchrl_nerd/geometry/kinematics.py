@@ -13,93 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.frames import quat_normalize
-
-FREE, BALL, SLIDE, HINGE = (
-    int(mujoco.mjtJoint.mjJNT_FREE),
-    int(mujoco.mjtJoint.mjJNT_BALL),
-    int(mujoco.mjtJoint.mjJNT_SLIDE),
-    int(mujoco.mjtJoint.mjJNT_HINGE),
-)
-
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.frames import matrix_from_quat, quat_matrix, quat_normalize
+from torchrl_nerd.geometry.manifold import BALL, FREE, SLIDE
 
 Motion = tuple[Tensor, Tensor, Tensor, Tensor]
 """Of n bodies in N rows: origins ``(3, n, N)`` m, rotations ``(3, 3, n, N)``, angular
 velocities rad/s and velocities of the origins m/s, both ``(3, n, N)``, in B_t and relative
 to it. N is 1 where all rows are alike; velocities may be of the first rows alone. Rows come
 last, so that a product of many small matrices is a few operations on long rows."""
-
-
-@dataclass(frozen=True)
-class Base:
-    """The body whose pose defines B_t.
-
-    A floating base is the body of the free joint. A fixed base is the mount: the pose,
-    constant in the world, of the first moving body's frame before its joints move.
-    """
-
-    body: int
-    is_floating: bool
-    qpos_address: int = 0
-    dof_address: int = 0
-
-    @classmethod
-    def from_model(cls, model: mujoco.MjModel) -> "Base":
-        """Find the base.
-
-        Raises:
-            ValueError: the model has no joint, or more than one moving tree.
-        """
-        roots = [
-            body
-            for body in range(1, model.nbody)
-            if model.body_dofnum[body] > 0
-            and model.body_weldid[body] == body
-            and model.body_weldid[model.body_parentid[body]] == 0
-        ]
-        if len(roots) != 1:
-            found = "no joint" if not roots else f"{len(roots)} moving trees"
-            raise ValueError(f"expected a model with one robot, got {found}")
-        joint = int(model.body_jntadr[roots[0]])
-        if model.jnt_type[joint] != FREE:
-            return cls(roots[0], False)
-        q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        return cls(roots[0], True, q, v)
-
-
-def mount_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
-    """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base's mount."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    parent = int(model.body_parentid[base.body])
-    rotation = data.xmat[parent].reshape(3, 3)
-    position = data.xpos[parent] + rotation @ model.body_pos[base.body]
-    return position, rotation @ quat_matrix(model.body_quat[base.body])
-
-
-def base_pose(
-    base: Base, qpos: Tensor, mount_position: Tensor, mount_rotation: Tensor
-) -> tuple[Tensor, Tensor]:
-    """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t.
-
-    Args:
-        base: floating, read from ``qpos (*batch, nq)``, or fixed, where its mount is.
-        qpos: of the robot.
-        mount_position: ``(3,)``, m, world.
-        mount_rotation: ``(3, 3)``.
-    """
-    if not base.is_floating:
-        batch = qpos.shape[:-1]
-        return mount_position.expand(*batch, 3), mount_rotation.expand(*batch, 3, 3)
-    q = base.qpos_address
-    return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
-
-
-def quat_matrix(quat: np.ndarray) -> np.ndarray:
-    """Rotation matrix ``(3, 3)`` of one quaternion ``wxyz``."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quat)
-    return matrix.reshape(3, 3)
 
 
 def skew(v: np.ndarray) -> np.ndarray:
@@ -376,17 +298,6 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
 def eye_like(x: Tensor) -> Tensor:
     """The 3 x 3 identity with the dtype and device of ``x``."""
     return torch.eye(3, dtype=x.dtype, device=x.device)
-
-
-def matrix_from_quat(q: Tensor) -> Tensor:
-    """Rotation matrices ``(*batch, 3, 3)`` of unit quaternions ``(*batch, 4)``."""
-    w, x, y, z = q.unbind(-1)
-    rows = (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def _bodies_on_path(model: mujoco.MjModel, base: Base, bodies: list[int]) -> list[int]:

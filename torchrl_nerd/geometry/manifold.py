@@ -20,6 +20,13 @@ from torchrl_nerd.geometry.frames import (
     quat_normalize,
 )
 
+FREE, BALL, SLIDE, HINGE = (
+    int(mujoco.mjtJoint.mjJNT_FREE),
+    int(mujoco.mjtJoint.mjJNT_BALL),
+    int(mujoco.mjtJoint.mjJNT_SLIDE),
+    int(mujoco.mjtJoint.mjJNT_HINGE),
+)
+
 
 @dataclass(frozen=True)
 class JointLayout:
@@ -45,10 +52,10 @@ class JointLayout:
         for joint in range(model.njnt):
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             kind = int(model.jnt_type[joint])
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
+            if kind == FREE:
                 linear += [(q + i, v + i) for i in range(3)]
                 rotations.append((q + 3, v + 3))
-            elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            elif kind == BALL:
                 rotations.append((q, v))
             else:
                 linear.append((q, v))

@@ -11,7 +11,7 @@ number that can be looked at, see `Coverage.distance`.
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.scenes.scene import Scene
 
 MARGIN = 0.1  # of a range's width, on either side

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 
 Row = tuple[float, ...]
 UNLIMITED = 1e300  # N or N m: finite, so that the card of a data set can hold it

@@ -12,7 +12,7 @@ from itertools import product
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.kinematics import Base
+from torchrl_nerd.geometry.base import Base
 
 MARGIN_PER_RADIUS = 4.0  # paper, appendix A: xi = max(4 thickness, 0.1 m)
 MIN_MARGIN = 0.1  # m

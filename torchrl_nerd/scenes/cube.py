@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 from torch import Tensor
 
-from torchrl_nerd.geometry.kinematics import matrix_from_quat
+from torchrl_nerd.geometry.frames import matrix_from_quat
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty import set_penalty_contact
 from torchrl_nerd.scenes.sampling import BaseSampling, GroundSampler, Sampling

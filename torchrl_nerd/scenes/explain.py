@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.kinematics import HINGE, SLIDE, Base, quat_matrix
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.frames import quat_matrix
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.quiet import quiet_mujoco
 from torchrl_nerd.scenes.support import unit_gravity

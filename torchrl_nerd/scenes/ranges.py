@@ -15,7 +15,8 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, SLIDE, Base
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE
 from torchrl_nerd.scenes.actuators import ActuatorController, RandomActions
 from torchrl_nerd.scenes.contact_points import contact_points, ground_geoms
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling, uniform

@@ -11,13 +11,9 @@ import numpy as np
 import torch
 from torch import Generator
 
+from torchrl_nerd.geometry.base import Base, base_pose, mount_pose
 from torchrl_nerd.geometry.frames import quat_normalize
-from torchrl_nerd.geometry.kinematics import (
-    Base,
-    PointKinematics,
-    base_pose,
-    mount_pose,
-)
+from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.scenes.actuators import driven_dofs
 from torchrl_nerd.scenes.contact_points import (

@@ -14,7 +14,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, Base
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 
 JOINT, IN_PARENT, TENDON = (
     int(mujoco.mjtTrn.mjTRN_JOINT),

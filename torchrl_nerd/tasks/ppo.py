@@ -21,6 +21,7 @@ class PPOConfig:
     gamma: float = 0.99  # discount per action
     lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
     clip: float = 0.2  # how far an action's probability ratio counts
+    std: float = 1.0  # of actions at the start, before they are squashed
     widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic
 
 
@@ -39,6 +40,7 @@ _FRANKA = PPOConfig(
     epochs=8,
     minibatch=8192,
     lr=3e-4,
+    std=0.3,  # at 1 the arm wanders off, whose velocity the policy does not see
 )
 
 PPO_CONFIGS: dict[str, PPOConfig] = {

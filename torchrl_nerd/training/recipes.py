@@ -8,7 +8,7 @@ from torchrl_nerd.data.strategies import strategies
 from torchrl_nerd.evaluation.rollout_error import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import make_task
-from torchrl_nerd.training.trainer import TrainConfig
+from torchrl_nerd.training.train_config import TrainConfig
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.frames import quat_multiply
-from torchrl_nerd.geometry.kinematics import SLIDE
+from torchrl_nerd.geometry.manifold import SLIDE
 from torchrl_nerd.geometry.surfaces import PLANE_PARAMETERS
 from torchrl_nerd.keys import (
     JOINT_TORQUE,

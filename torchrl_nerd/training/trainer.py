@@ -2,7 +2,7 @@
 
 import time
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,9 +19,8 @@ from torchrl_nerd.evaluation.rollout_error import (
     passive_errors,
 )
 from torchrl_nerd.files import read_json, writable_folder, write_json
-from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
@@ -29,83 +28,14 @@ from torchrl_nerd.training.loggers import LoggerName, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.muon import Muon
 from torchrl_nerd.training.rest import find_rest, resting
+from torchrl_nerd.training.run_state import like_packed, pack, unpack
 from torchrl_nerd.training.sequences import Sequences, Symmetry, cover
 from torchrl_nerd.training.start import begin_from, fingerprint, fresh_model
+from torchrl_nerd.training.train_config import TrainConfig
 
 STATE = "state.json"  # of a run that can go on
 VALIDATION_SEED = 1_000_003
 VALIDATION_ROWS = 256
-COUNTS = (
-    *("rows", "length", "rollout_rows", "rollout_length"),
-    *("save_every", "validate_every", "rollout_rounds"),
-)
-
-LIKE = {"muon": ("momentum",), "adamw": ("exp_avg", "exp_avg_sq")}
-"""What an optimiser remembers of a weight, of the weight's shape."""
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """How to train.
-
-    | field | meaning |
-    |---|---|
-    | ``network`` | name in `NETWORKS` |
-    | ``steps`` | updates on one-step targets |
-    | ``rollout_steps`` | further updates on the model's own rollouts |
-    | ``rows``, ``length`` | sequences per update and tokens of each |
-    | ``single_share`` | share of updates on as many single states instead |
-    | ``use_symmetry`` | show each sample as a random one of its mirror images |
-    | ``rollout_rows``, ``rollout_length`` | the same for rollouts |
-    | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
-    | ``rollout_lr`` | share of the peak at which the rollout updates begin |
-    | ``rollout_rounds`` | how often, in equal parts of them, they begin there anew |
-    | ``warmup`` | updates over which the step size rises from zero |
-    | ``bf16_share`` | share of the one-step updates, the first ones, whose matrices are
-      multiplied in bfloat16: faster on processors that have it; all updates on CUDA |
-    | ``softening`` | of the relative loss; see `losses.relative_error` |
-    | ``clip`` | largest norm of the gradient |
-    | ``ema`` | decay of the averaged weights, which are the ones saved |
-    | ``save_every`` | updates between saves: what a kill can lose |
-    | ``validate_every`` | updates between rollouts in true physics |
-    | ``seed`` | of weights and batches |
-
-    Raises:
-        SettingError: an unknown network, or a number that is too small.
-    """
-
-    network: str = "tiny"
-    steps: int = 20_000
-    rollout_steps: int = 2_000
-    rows: int = 64
-    length: int = 16
-    single_share: float = 0.75
-    use_symmetry: bool = False
-    rollout_rows: int = 128
-    rollout_length: int = 8
-    lr: float = 0.01
-    lr_other: float = 3e-3
-    rollout_lr: float = 0.1
-    rollout_rounds: int = 1
-    warmup: int = 200
-    bf16_share: float = 0.0
-    softening: float = 0.01
-    clip: float = 1.0
-    ema: float = 0.995
-    save_every: int = 1_000
-    validate_every: int = 2_000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        network_config(self.network)  # or refuse its name
-        for name, value in asdict(self).items():
-            if name != "network":
-                expect_at_least(1 if name in COUNTS else 0, **{name: value})
-
-    @property
-    def total_steps(self) -> int:
-        """Updates of both kinds."""
-        return self.steps + self.rollout_steps
 
 
 class Trainer:
@@ -336,11 +266,7 @@ class Trainer:
     def save(self) -> None:
         """Everything a resumed run needs; the state's card is written last."""
         self._save_model("last", self.errors)
-        tensors = {f"model.{k}": v for k, v in self.model.network.state_dict().items()}
-        tensors |= {f"average.{k}": v for k, v in self.average.items()}
-        for name, optimizer in self.optimizers.items():
-            for index, state in optimizer.state_dict()["state"].items():
-                tensors |= {f"{name}.{index}.{k}": v for k, v in state.items()}
+        tensors = pack(self.model.network, self.average, self.optimizers)
         tensors["step"] = torch.tensor(self.step)
         tensors["best"] = torch.tensor(self.best, dtype=torch.float64)
         write_tensors(self.folder / "state.safetensors", tensors)
@@ -385,7 +311,9 @@ class Trainer:
         path = self.folder / "state.safetensors"
         tensors = read_tensors(path)
         best = tensors.pop("best", torch.tensor([]))  # infinite before any validation
-        expect_fit(tensors, self._expected(tensors), f"tensors in {path}", "this run")
+        parts = self.model.network, self.average, self.optimizers
+        expected = {**like_packed(tensors, *parts), "step": torch.tensor(0)}
+        expect_fit(tensors, expected, f"tensors in {path}", "this run")
         if best.shape or best.dtype != torch.float64 or best.isnan():
             raise ValueError(f"expected the best error in {path}, got {best}")
         self.step, self.best = int(tensors["step"]), float(best)
@@ -396,33 +324,7 @@ class Trainer:
                 f"{self.step} and {seconds!r}"
             )
         self.seconds = seconds
-        pick = _with_prefix(tensors, "model.")
-        self.model.network.load_state_dict(pick)
-        for name, value in _with_prefix(tensors, "average.").items():
-            self.average[name].copy_(value)
-        for name, optimizer in self.optimizers.items():
-            state: dict[int, dict[str, Tensor]] = {}
-            for key, value in _with_prefix(tensors, f"{name}.").items():
-                index, entry = key.split(".", 1)
-                state.setdefault(int(index), {})[entry] = value
-            groups = optimizer.state_dict()["param_groups"]
-            optimizer.load_state_dict({"state": state, "param_groups": groups})
-
-    def _expected(self, found: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Tensors like those that a state must hold, for the parameters it has seen."""
-        weights = self.model.network.state_dict()
-        expected = {f"model.{k}": v for k, v in weights.items()}
-        expected |= {f"average.{k}": v for k, v in self.average.items()}
-        for name, optimizer in self.optimizers.items():
-            groups = optimizer.param_groups
-            parameters = [weight for group in groups for weight in group["params"]]
-            seen = {key.split(".")[0] for key in _with_prefix(found, f"{name}.")}
-            for index, weight in enumerate(parameters):
-                if str(index) in seen:
-                    expected |= {f"{name}.{index}.{k}": weight for k in LIKE[name]}
-                    if name == "adamw":
-                        expected[f"{name}.{index}.step"] = torch.tensor(0.0)
-        return {**expected, "step": torch.tensor(0)}
+        unpack(tensors, *parts)
 
 
 def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
@@ -432,9 +334,3 @@ def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
         is_matrix = weight.ndim == 2 and "offset_bias" not in name
         (matrices if is_matrix else others).append(weight)
     return matrices, others
-
-
-def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {
-        k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)
-    }

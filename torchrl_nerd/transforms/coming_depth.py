@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.base import base_pose, over_ground
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.kinematics import Base, PointKinematics, base_pose
+from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
@@ -112,23 +113,3 @@ class ComingDepth(nn.Module):
 def num_glances(scene: Scene) -> int:
     """K: at how many times of the step."""
     return min(scene.substeps // scene.refinement, MAX_GLANCES)
-
-
-def over_ground(
-    base: Base, qvel: Tensor, points: Tensor, velocity: Tensor, rotation: Tensor
-) -> Tensor:
-    """Velocities ``(*batch, P, 3)`` over the ground of points that the base carries.
-
-    Args:
-        base: of the robot.
-        qvel: ``(*batch, nv)``.
-        points: ``(*batch, P, 3)``, m, as all that follows in B_t.
-        velocity: as seen by one who rides on the base, ``(*batch, P, 3)``, m/s.
-        rotation: of the base, ``(*batch, 3, 3)``.
-    """
-    if not base.is_floating:
-        return velocity
-    v = base.dof_address
-    linear = (rotation.mT @ qvel[..., v : v + 3, None])[..., 0]
-    angular = qvel[..., None, v + 3 : v + 6].expand_as(velocity)
-    return velocity + linear[..., None, :] + torch.linalg.cross(angular, points)

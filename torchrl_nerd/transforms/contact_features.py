@@ -20,10 +20,11 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_nerd.geometry.base import base_pose, over_ground
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import PointKinematics, base_pose
+from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -38,7 +39,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
-from torchrl_nerd.transforms.coming_depth import ComingDepth, num_glances, over_ground
+from torchrl_nerd.transforms.coming_depth import ComingDepth, num_glances
 from torchrl_nerd.transforms.ground_force import GroundForce
 
 FADE = 0.25  # share of the way from margin to touching over which velocities fade in

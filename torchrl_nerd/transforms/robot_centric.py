@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import rotate_inverse
-from torchrl_nerd.geometry.kinematics import BALL, FREE, HINGE, matrix_from_quat
+from torchrl_nerd.geometry.frames import matrix_from_quat, rotate_inverse
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
 from torchrl_nerd.scenes.penalty import limit_springs
 from torchrl_nerd.scenes.scene import Scene

@@ -10,7 +10,7 @@ from helpers import every_scene
 
 from torchrl_nerd.evaluation.explain import paper_input as paper
 from torchrl_nerd.evaluation.explain.states import draw_states
-from torchrl_nerd.geometry.kinematics import FREE
+from torchrl_nerd.geometry.manifold import FREE
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import load_scene
 

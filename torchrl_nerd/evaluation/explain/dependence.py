@@ -20,8 +20,12 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.explain import features as kinds
-from torchrl_nerd.geometry.frames import quat_exp, quat_multiply, rotate
-from torchrl_nerd.geometry.kinematics import matrix_from_quat
+from torchrl_nerd.geometry.frames import (
+    matrix_from_quat,
+    quat_exp,
+    quat_multiply,
+    rotate,
+)
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import SceneTokens

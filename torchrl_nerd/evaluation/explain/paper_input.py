@@ -9,7 +9,8 @@ Contact-free robots with a fixed base get the state and the torques alone.
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.kinematics import BALL, FREE, PointKinematics
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.manifold import BALL, FREE
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import (
     MARGIN_PER_RADIUS,

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
-from torchrl_nerd.geometry.kinematics import HINGE
+from torchrl_nerd.geometry.manifold import HINGE
 from torchrl_nerd.scenes import Scene
 
 PLANE, HEIGHT_FIELD, MESH = (
