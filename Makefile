@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant model-double-pendulum format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant model-double_pendulum format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -71,7 +71,7 @@ model-ant: $(STAMP) ## the shipped Ant anew: learned, tried by a policy, learned
 		--rollout-lr 0.25 --validate-every 2000 --out runs/ant_policy \
 		--export torchrl_nerd/pretrained/ant
 
-model-double-pendulum: $(STAMP) ## the shipped double pendulum anew: learned, then learned on
+model-double_pendulum: $(STAMP) ## the shipped double pendulum anew: learned, then learned on
 	$(NERD) train double_pendulum
 	$(NERD) train double_pendulum --start runs/double_pendulum/best --data datasets/double_pendulum \
 		--steps 24000 --rollout-steps 3000 --lr 0.004 --lr-other 0.0012 --rollout-lr 0.08 \

@@ -195,7 +195,7 @@ def last_training(target: str) -> tuple[dict, int]:
         ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.replace("\\\n", " ")
     lines = [shlex.split(line) for line in plan.splitlines() if "cli" in line]
-    drawn = next(words for words in lines if "data" in words)
+    drawn = [words for words in lines if "data" in words]
     words = next(words for words in reversed(lines) if "train" in words)
     given = {a[2:].replace("-", "_"): b for a, b in pairwise(words) if a[:2] == "--"}
     changes = {
@@ -203,4 +203,5 @@ def last_training(target: str) -> tuple[dict, int]:
         for key, value in asdict(TrainConfig()).items()
         if key in given
     }
-    return changes, int(drawn[drawn.index("--trajectories") + 1])
+    more = sum(int(words[words.index("--trajectories") + 1]) for words in drawn)
+    return changes, more
