@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.frames import matrix_from_quat, quat_matrix
 from torchrl_nerd.geometry.manifold import FREE
 
@@ -74,6 +75,27 @@ def base_pose(
         return mount_position.expand(*batch, 3), mount_rotation.expand(*batch, 3, 3)
     q = base.qpos_address
     return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
+
+
+class BasePose(nn.Module):
+    """`base_pose` of one robot.
+
+    Args:
+        base: of the robot.
+        mount: position ``(3,)``, m, and rotation ``(3, 3)``, see `mount_pose`.
+    """
+
+    position: Tensor
+    rotation: Tensor
+
+    def __init__(self, base: Base, mount: tuple[np.ndarray, np.ndarray]) -> None:
+        super().__init__()
+        self.base = base
+        keep_constants(self, position=mount[0], rotation=mount[1])
+
+    def forward(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
+        """Position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` for ``qpos``."""
+        return base_pose(self.base, qpos, self.position, self.rotation)
 
 
 def over_ground(

@@ -20,8 +20,7 @@ def pack(
         average: of its weights, by their names.
         optimizers: by names of `REMEMBERED`.
     """
-    tensors = {f"model.{k}": v for k, v in network.state_dict().items()}
-    tensors |= {f"average.{k}": v for k, v in average.items()}
+    tensors = _weights(network, average)
     for name, optimizer in optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
             tensors |= {f"{name}.{index}.{k}": v for k, v in state.items()}
@@ -42,8 +41,7 @@ def like_packed(
         average: of its weights.
         optimizers: its own.
     """
-    expected = {f"model.{k}": v for k, v in network.state_dict().items()}
-    expected |= {f"average.{k}": v for k, v in average.items()}
+    expected = _weights(network, average)
     for name, optimizer in optimizers.items():
         groups = optimizer.param_groups
         parameters = [weight for group in groups for weight in group["params"]]
@@ -74,6 +72,11 @@ def unpack(
             state.setdefault(int(index), {})[entry] = value
         groups = optimizer.state_dict()["param_groups"]
         optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def _weights(network: nn.Module, average: Average) -> dict[str, Tensor]:
+    tensors = {f"model.{k}": v for k, v in network.state_dict().items()}
+    return tensors | {f"average.{k}": v for k, v in average.items()}
 
 
 def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import base_pose, over_ground
+from torchrl_nerd.geometry.base import BasePose, over_ground
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
@@ -28,24 +28,20 @@ class ComingDepth(nn.Module):
     Args:
         scene: the robot and its ground.
         ground: distances to that ground.
+        pose: of its base.
     """
 
     radii: Tensor
-    mount_pos: Tensor
-    mount_rot: Tensor
     parabola: Tensor
     cubic: Tensor
 
-    def __init__(self, scene: Scene, ground: TerrainDistance) -> None:
+    def __init__(self, scene: Scene, ground: TerrainDistance, pose: BasePose) -> None:
         super().__init__()
         points = scene.contacts
-        self.base, self.layout, self.period = (
-            scene.base,
-            scene.layout,
-            scene.control_step,
-        )
+        self.base, self.layout = scene.base, scene.layout
+        self.period = scene.control_step
         self.substeps = scene.substeps // scene.refinement
-        self.ground = ground
+        self.ground, self.pose = ground, pose
         self.kinematics = PointKinematics(
             scene.model, scene.base, points.bodies, points.positions
         )
@@ -56,8 +52,6 @@ class ComingDepth(nn.Module):
         keep_constants(
             self,
             radii=points.radii,
-            mount_pos=scene.mount[0],
-            mount_rot=scene.mount[1],
             parabola=np.stack((1.0 - two, one - two, two)),
             cubic=np.stack((1.0 - blend, one - 2.0 * two + three, blend, three - two)),
         )
@@ -86,13 +80,10 @@ class ComingDepth(nn.Module):
             depth: of every point now, ``(*batch, P)``, m.
             speed: of every point along its normal now, ``(*batch, P)``, m/s.
         """
-        mount = self.mount_pos, self.mount_rot
         if gain is None:
             later = integrate_pos(self.layout, qpos, self.period * qvel)
             points, _ = self.kinematics(later, qvel.new_empty(0, qvel.shape[-1]))
-            distance, _ = self.ground(
-                points, terrain, *base_pose(self.base, later, *mount)
-            )
+            distance, _ = self.ground(points, terrain, *self.pose(later))
             ends = depth, -self.period * speed, self.radii - distance
             return (torch.stack(ends, -1) @ self.parabola).clamp_min(0.0)
         first = qvel + 0.5 / self.substeps * gain  # the solver pushes, then it moves
@@ -100,7 +91,7 @@ class ComingDepth(nn.Module):
         later = integrate_pos(self.layout, qpos, self.period * mean)
         states, rates = torch.stack((qpos, later)), torch.stack((first, last))
         points, velocity = self.kinematics(states, rates)
-        pose = base_pose(self.base, states, *mount)
+        pose = self.pose(states)
         if terrain is not None:
             terrain = terrain.expand(2, *terrain.shape)
         distance, normal = self.ground(points, terrain, *pose)

@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_nerd.geometry.base import base_pose, over_ground
+from torchrl_nerd.geometry.base import BasePose, over_ground
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
@@ -75,8 +75,6 @@ class ContactFeatures(FeatureTransform):
     why_no_inverse = "distances do not determine a pose"
     radii: Tensor
     margins: Tensor
-    mount_pos: Tensor
-    mount_rot: Tensor
 
     def __init__(self, scene: Scene) -> None:
         count, terrain = len(scene.contacts), scene.terrain
@@ -119,14 +117,9 @@ class ContactFeatures(FeatureTransform):
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
         self.count, self.num_known = count, count + self.num_places
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
-        self.coming_depth = ComingDepth(scene, self.ground)
-        keep_constants(
-            self,
-            radii=points.radii,
-            margins=points.margins,
-            mount_pos=scene.mount[0],
-            mount_rot=scene.mount[1],
-        )
+        self.pose = BasePose(scene.base, scene.mount)
+        self.coming_depth = ComingDepth(scene, self.ground, self.pose)
+        keep_constants(self, radii=points.radii, margins=points.margins)
 
     def contact_features(
         self,
@@ -150,7 +143,7 @@ class ContactFeatures(FeatureTransform):
         sizes = (self.count, self.num_places, found.shape[-2] - self.num_known)
         now, places, corners = found.split(sizes, -2)
         velocity = velocity[..., : self.count, :]
-        pose = base_pose(self.base, qpos, self.mount_pos, self.mount_rot)
+        pose = self.pose(qpos)
         distance, normal = self.ground(now, terrain, *pose)
         velocity = over_ground(self.base, qvel, now, velocity, pose[1])
         beyond = distance - self.margins
