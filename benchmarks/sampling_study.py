@@ -23,6 +23,7 @@ from torchrl_nerd.data.generate import CARD, DataConfig, Draw, generate, load_da
 from torchrl_nerd.data.strategies import strategies
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.envs import make_env
+from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.rollout_error import passive_errors
@@ -120,7 +121,8 @@ class Study:
         """Of one episode from each of the same starts."""
         episodes = self.options.episodes
         env = make_env(self.task_id, dynamics, episodes, seed=TEST_SEED)
-        return policy_returns(env, make_actor(load_policy(policy, env.task)))
+        loaded = load_policy(policy, env.task)
+        return policy_returns(remember(env, loaded.memory), make_actor(loaded))
 
     def measure(self, model: Path, name: str, seed: int) -> dict[str, Any]:
         """Errors by test, and returns."""
@@ -163,8 +165,11 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
         sizes = options.policy_frames
         policy = policy or learned_policy(folder / "measured", *where, 0, sizes)
         explorer = explorer or learned_policy(folder / "explorer", *where, 1, sizes)
-    actor = make_actor(load_policy(explorer, task)) if explorer else None
-    known = strategies(task.scene, task, actor)
+    exploring = load_policy(explorer, task) if explorer else None
+    known = strategies(task.scene, task)
+    if exploring is not None:
+        actor = make_actor(exploring)
+        known = strategies(task.scene, task, actor, exploring.memory)
     for name in options.only or known:
         if name not in known:
             raise ValueError(f"expected a strategy of {', '.join(known)}, got '{name}'")

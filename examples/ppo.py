@@ -28,14 +28,9 @@ from tqdm import tqdm
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.actor import Actor
+from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.evaluation import plots, policy_transfer
-from torchrl_nerd.evaluation.policy import (
-    Policy,
-    Standardize,
-    make_actor,
-    mlp,
-    save_policy,
-)
+from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
 from torchrl_nerd.files import write_json
 from torchrl_nerd.tasks import Task, make_task
 from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
@@ -65,12 +60,11 @@ def parse(kind: type[Run] = Run) -> Run:
 
 
 def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperator]:
-    """Both see observations standardised by what random actions meet."""
+    """Both see observations standardised by all that were met, by random actions first."""
     seen = env.rollout(cfg.horizon, break_when_any_done=False)["observation"]
     size, num_actions = seen.shape[-1], env.action_spec.shape[-1]
-    policy = Policy((size, *cfg.widths, num_actions), cfg.std)
-    policy.standardize.fit(seen)
-    critic = nn.Sequential(Standardize(size).fit(seen), mlp((size, *cfg.widths, 1)))
+    policy = Policy((size, *cfg.widths, num_actions), cfg.std, cfg.memory)
+    critic = nn.Sequential(policy.standardize.fit(seen), mlp((size, *cfg.widths, 1)))
     return policy, ValueOperator(critic)
 
 
@@ -127,6 +121,7 @@ def train(
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
     task = task or cfg.task
     env = make_env(task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed)
+    env = remember(env, cfg.memory)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
     advantage, loss, optimizer = make_learning(actor, critic, cfg)
@@ -136,12 +131,15 @@ def train(
     progress = tqdm(total=total, unit="frame", unit_scale=True)
     for number, batch in enumerate(collect(cfg, env, actor), 1):
         update(batch, advantage, loss, optimizer, cfg)
+        policy.standardize.fit(batch["observation"])
         schedule.step()
         progress.update(frames)
         if number % cfg.evaluate_every == 0 or number * frames == total:
             where, seed = [cfg.dynamics], cfg.seed + 1
             episodes = min(256, cfg.episodes)
-            returns = policy_transfer.transfer(task, actor, where, episodes, seed=seed)
+            returns = policy_transfer.transfer(
+                task, actor, where, episodes, seed=seed, memory=cfg.memory
+            )
             means = {name: summary.mean for name, summary in returns.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})
@@ -159,11 +157,12 @@ def main(cfg: Run, collect: Collect = collect) -> None:
     scene = make_task(cfg.task).scene
     learned = ("nerd",) if scene.name in shipped_models() else ()
     everywhere = (cfg.dynamics, *learned, "mujoco", "dm_control")
-    where = (cfg.task, actor, everywhere)
-    returns = policy_transfer.transfer(*where, cfg.episodes, seed=seed)
+    memory, where = cfg.memory, (cfg.task, actor, everywhere)
+    returns = policy_transfer.transfer(*where, cfg.episodes, seed=seed, memory=memory)
     print(policy_transfer.transfer_table(returns))
     write_json(cfg.out / "returns.json", {k: asdict(v) for k, v in returns.items()})
-    episodes = policy_transfer.hardest_episode(cfg.task, actor, everywhere[:3], seed)
+    where = (cfg.task, actor, everywhere[:3])
+    episodes = policy_transfer.hardest_episode(*where, seed=seed, memory=memory)
     plots.plot_states(episodes, scene, cfg.out / "episode.png")
 
 

@@ -24,6 +24,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_nerd import make_env
+from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.settings import expect_at_least
 
 
@@ -35,12 +36,13 @@ class Run(ppo.Run):
     address: str = "local"  # HOST:PORT of a cluster; auto: find it; local: this machine
 
 
-def make_worker_env(task: str, dynamics: str, rows: int, seed: int) -> EnvBase:
+def make_worker_env(cfg: Run, rows: int, seed: int) -> EnvBase:
     """A worker's rows; its exploration has a seed of its own, too."""
     # the other processors have other workers
     os.environ.setdefault("NERD_THREADS", "1")
     torch.manual_seed(seed)
-    return make_env(task, dynamics=dynamics, num_envs=rows, seed=seed)
+    env = make_env(cfg.task, dynamics=cfg.dynamics, num_envs=rows, seed=seed)
+    return remember(env, cfg.memory)
 
 
 def make_collector(
@@ -51,9 +53,7 @@ def make_collector(
     seeds = (
         1000 * (cfg.seed + 1) + start * cfg.workers + i for i in range(cfg.workers)
     )
-    makers = [
-        partial(make_worker_env, cfg.task, cfg.dynamics, rows, seed) for seed in seeds
-    ]
+    makers = [partial(make_worker_env, cfg, rows, seed) for seed in seeds]
     return RayCollector(
         makers,
         actor,

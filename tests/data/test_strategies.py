@@ -25,6 +25,7 @@ from torchrl_nerd.data.starts import Fallen, Nudged, Standing
 from torchrl_nerd.data.strategies import mix, resample, strategies
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import GroundTruthEnv
+from torchrl_nerd.envs.memory import recall
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
@@ -39,9 +40,9 @@ STATE = ("qpos", "qvel")
 class Linear:
     """A policy: squashed sums of what it sees."""
 
-    def __init__(self, task: Task, seed: int) -> None:
+    def __init__(self, task: Task, seed: int, memory: int = 1) -> None:
         generator = Generator().manual_seed(seed)
-        size = (task.observation_size, task.controller.num_actions)
+        size = (memory * task.observation_size, task.controller.num_actions)
         self.weight = 0.3 * torch.randn(size, generator=generator)
 
     def __call__(self, td: TensorDict) -> TensorDict:
@@ -191,17 +192,19 @@ def test_the_ant_has_fallen_and_lies_still(generator):
     assert slow < 0.1 * fast  # the median: one may still be rolling
 
 
-def test_policy_data_is_what_the_env_does(task_id, seed):
+@pytest.mark.parametrize("memory", [1, 3])
+def test_policy_data_is_what_the_env_does(task_id, memory, seed):
     task, rows, steps = make_task(task_id), 4, 6
-    actor = Linear(task, seed)
-    data = policy_data(task, actor, rows, steps, seeded(seed), noise=0.0)
+    actor = Linear(task, seed, memory)
+    data = policy_data(task, actor, rows, steps, seeded(seed), 0.0, memory)
     size = (rows, task.num_uniforms)
     u = torch.rand(size, dtype=torch.float64, generator=seeded(seed))
     env = GroundTruthEnv(task, num_envs=rows)
     td = env.reset(TensorDict(task.initial_state(u), [rows]), set_state=True)
-    every = task.steps_per_action
+    every, recent = task.steps_per_action, None
     for step in range(every - 1, steps, every):
-        td = env.step(actor(td))["next"]
+        recent = recall(recent, td["observation"], memory)
+        td = env.step(actor(td.set("observation", recent)))["next"]
         for key in (*STATE, "joint_torque"):
             assert torch.equal(data["next", key][:, step], td[key])
 

@@ -8,7 +8,13 @@ from torch import nn
 
 from torchrl_nerd import make_env
 from torchrl_nerd.evaluation.plots import plot_learning_curve, plot_states
-from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
+from torchrl_nerd.evaluation.policy import (
+    Policy,
+    Standardize,
+    load_policy,
+    make_actor,
+    save_policy,
+)
 from torchrl_nerd.evaluation.policy_transfer import (
     hardest_episode,
     policy_returns,
@@ -107,12 +113,40 @@ def test_hardest_episode_begins_in_one_state(policy: Policy) -> None:
     assert abs(true["qpos"][0, 1]) > 0.9 * angle.max()
 
 
-def test_policy_survives_disk(policy: Policy, tmp_path) -> None:
+@pytest.mark.parametrize("memory", [1, 3])
+def test_policy_survives_disk(memory: int, tmp_path) -> None:
+    policy = Policy((4 * memory, 16, 16, 1), memory=memory)
+    policy.standardize.fit(torch.randn(50, 4 * memory) * 3.0 + 1.0)
     save_policy(policy, tmp_path / "policy", {"task": TASK})
     loaded = load_policy(tmp_path / "policy", make_task(TASK))
-    observation = torch.randn(7, 4)
+    observation = torch.randn(7, 4 * memory)
     for one, other in zip(policy(observation), loaded(observation), strict=True):
         assert torch.equal(one, other)
+
+
+def test_constants_are_those_of_all_that_was_seen() -> None:
+    batches = [torch.randn(n, 5, 4) * n + n for n in (3, 1, 20)]
+    standardize = Standardize(4)
+    for batch in batches:
+        standardize.fit(batch)
+    together = torch.cat(batches).flatten(0, 1).double()
+    torch.testing.assert_close(standardize.mean.double(), together.mean(0))
+    std = together.std(0, correction=0)
+    torch.testing.assert_close(standardize.std.double(), std)
+
+
+def test_changes_have_a_spread_of_their_own() -> None:
+    speed = torch.randn(500, 2)
+    path = (
+        100.0 * torch.randn(500, 1, 2)
+        + 0.01 * torch.arange(3)[:, None] * speed[:, None]
+    )
+    seen = path.double().flatten(1)
+    shown = Standardize(6, memory=3).double().fit(seen)(seen)
+    torch.testing.assert_close(shown.std(0), torch.ones(6).double(), rtol=0, atol=0.01)
+    for change in (shown[:, 2:4], shown[:, 4:]):  # speed, and nothing else
+        matched = torch.corrcoef(torch.stack((change[:, 0], speed[:, 0].double())))
+        assert matched[0, 1] > 0.999
 
 
 def test_actions_stay_in_the_spec(policy: Policy) -> None:
@@ -122,7 +156,9 @@ def test_actions_stay_in_the_spec(policy: Policy) -> None:
         assert env.action_spec.is_in(make_actor(policy)(rows)["action"])
 
 
-@pytest.mark.parametrize("damage", ["missing", "truncated", "sizes", "card", "task"])
+@pytest.mark.parametrize(
+    "damage", ["missing", "truncated", "sizes", "card", "memory", "task"]
+)
 def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> None:
     save_policy(policy, tmp_path)
     weights, card = tmp_path / "policy.safetensors", tmp_path / "policy.json"
@@ -134,6 +170,8 @@ def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> Non
         card.write_text('{"sizes": [4, 8, 1]}')
     elif damage == "card":
         card.write_text('{"sizes": "many"}')
+    elif damage == "memory":
+        card.write_text('{"sizes": [4, 16, 16, 1], "memory": 3}')
     task = make_task("double_pendulum/passive") if damage == "task" else None
     with pytest.raises(ValueError, match=str(tmp_path)):
         load_policy(tmp_path, task)

@@ -65,11 +65,12 @@ class Play(DeviceCommand):
         if self.steps is not None:
             expect_at_least(1, steps=self.steps)
             steps = self.steps
+        memory = 1
         if self.policy is None:
             act = idle(task, steps, self.seed, self.actions)
         else:
             policy = load_policy(self.policy, task).to(self.device)
-            act = follow(make_actor(policy))
+            act, memory = follow(make_actor(policy)), policy.memory
         pair = play_pair(
             self.task,
             self.model,
@@ -78,6 +79,7 @@ class Play(DeviceCommand):
             self.seed,
             self.own_actions,
             self.device,
+            memory,
         )
         drawn = None
         if self.viewer:

@@ -18,6 +18,7 @@ from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 MOST_LAYERS, LARGEST_SIZE = 2**7, 2**14
 MIN_STD = 1e-3  # of an observation: a constant one is not blown up
+FURTHEST = 10.0  # standard deviations from the mean that a network is shown
 
 
 def mlp(sizes: Sequence[int], last_gain: float = 1.0) -> nn.Sequential:
@@ -37,26 +38,49 @@ def mlp(sizes: Sequence[int], last_gain: float = 1.0) -> nn.Sequential:
 
 
 class Standardize(nn.Module):
-    """(x - mean) / std, with constants that are saved with the weights."""
+    """(x - mean) / std, with constants that are saved with the weights.
+
+    Of several observations side by side x is the last one and the changes that led to it,
+    which have a mean and a spread of their own: velocities are not lost beside positions.
+
+    Args:
+        size: of all observations together.
+        memory: how many they are.
+    """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, memory: int = 1) -> None:
         super().__init__()
+        self.memory, self.count = memory, 0
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("std", torch.ones(size))
 
-    def fit(self, samples: Tensor) -> "Standardize":
-        """Take mean and standard deviation from ``samples``, ``(*batch, size)``."""
-        samples = samples.flatten(0, -2).double()
-        self.mean.copy_(samples.mean(0))
-        self.std.copy_(samples.std(0).clamp_min(MIN_STD))
+    @torch.no_grad()
+    def fit(self, observations: Tensor) -> "Standardize":
+        """Mean and deviation of all that were ever given, these ``(*batch, size)`` too."""
+        samples = self._last_and_changes(observations.flatten(0, -2).double())
+        self.count += len(samples)
+        share = len(samples) / self.count
+        gap = samples.mean(0) - self.mean
+        within = samples.var(0, correction=0)
+        between = share * (1.0 - share) * gap.square()
+        variance = (1.0 - share) * self.std.square() + share * within + between
+        self.mean.add_(share * gap)
+        self.std.copy_(variance.sqrt().clamp_min(MIN_STD))
         return self
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Of ``x``, ``(*batch, size)``."""
-        return (x - self.mean) / self.std
+    def forward(self, observations: Tensor) -> Tensor:
+        """Of ``(*batch, size)``, to within `FURTHEST`."""
+        x = (self._last_and_changes(observations) - self.mean) / self.std
+        return x.clamp(-FURTHEST, FURTHEST)
+
+    def _last_and_changes(self, observations: Tensor) -> Tensor:
+        if self.memory == 1:
+            return observations
+        each = observations.unflatten(-1, (self.memory, -1))
+        return torch.cat((each[..., -1:, :], each.diff(dim=-2)), -2).flatten(-2)
 
 
 class Policy(nn.Module):
@@ -68,12 +92,13 @@ class Policy(nn.Module):
     Args:
         sizes: D, the widths of the hidden layers, A.
         std: what the standard deviation begins at.
+        memory: how many observations D holds, see `remember`.
     """
 
-    def __init__(self, sizes: Sequence[int], std: float = 1.0) -> None:
+    def __init__(self, sizes: Sequence[int], std: float = 1.0, memory: int = 1) -> None:
         super().__init__()
-        self.sizes = tuple(sizes)
-        self.standardize = Standardize(self.sizes[0])
+        self.sizes, self.memory = tuple(sizes), memory
+        self.standardize = Standardize(self.sizes[0], memory)
         self.mlp = mlp(self.sizes, last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((self.sizes[-1],), math.log(std)))
 
@@ -106,9 +131,8 @@ def save_policy(
     """
     folder = writable_folder(folder)
     write_tensors(folder / WEIGHTS, policy.state_dict())
-    write_json(
-        folder / CARD, {"format": 1, "sizes": list(policy.sizes), **(card or {})}
-    )
+    shape = {"format": 1, "sizes": list(policy.sizes), "memory": policy.memory}
+    write_json(folder / CARD, {**shape, **(card or {})})
     return folder
 
 
@@ -122,14 +146,20 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
     Raises:
         ValueError: in one sentence, what is missing, broken or of another shape.
     """
-    found = _read_card(folder).get("sizes")
+    card = _read_card(folder)
+    found, memory = card.get("sizes"), card.get("memory", 1)
     sizes = found if isinstance(found, list) else []
     if not 2 <= len(sizes) <= MOST_LAYERS or not all(
         type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes
     ):
         raise ValueError(f"expected the layer sizes in {folder / CARD}, got {found!r}")
+    if type(memory) is not int or memory < 1 or sizes[0] % memory:
+        raise ValueError(
+            f"expected how many observations make {sizes[0]} inputs as memory in "
+            f"{folder / CARD}, got {memory!r}"
+        )
     if task is not None:
-        expected = (task.observation_size, task.controller.num_actions)
+        expected = (memory * task.observation_size, task.controller.num_actions)
         if (sizes[0], sizes[-1]) != expected:
             raise ValueError(
                 f"the policy in {folder} has {sizes[0]} observations and {sizes[-1]} "
@@ -137,9 +167,9 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
             )
     tensors = read_tensors(folder / WEIGHTS)
     with torch.device("meta"):  # shapes alone, whatever memory the sizes would take
-        expected = Policy(sizes).state_dict()
+        expected = Policy(sizes, memory=memory).state_dict()
     expect_fit(tensors, expected, f"weights in {folder}", f"layers of {sizes}")
-    policy = Policy(sizes)
+    policy = Policy(sizes, memory=memory)
     policy.load_state_dict(tensors)
     return policy.eval()
 

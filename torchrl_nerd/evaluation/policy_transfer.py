@@ -17,6 +17,7 @@ from tqdm import tqdm
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.tasks import Task
 
 TRUTH = "mujoco"
@@ -103,6 +104,7 @@ def transfer(
     slow_episodes: int = 256,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    memory: int = 1,
     quiet: bool = True,
 ) -> dict[str, ReturnSummary]:
     """The same policy from the same starts in each dynamics.
@@ -115,6 +117,7 @@ def transfer(
         slow_episodes: the first so many of them on dm_control, which steps row by row.
         seed: of the starts.
         device: where all envs live.
+        memory: how many observations the policy sees, see `remember`.
         quiet: no progress bar, as by default.
 
     Returns:
@@ -127,13 +130,17 @@ def transfer(
     for name in tqdm(names, "dynamics", disable=quiet):
         rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
         env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
-        returns[name] = policy_returns(env, actor)
+        returns[name] = policy_returns(remember(env, memory), actor)
     return {name: summarize(value, returns[TRUTH]) for name, value in returns.items()}
 
 
 @torch.no_grad()
 def hardest_episode(
-    task: str | Task, actor: Actor, dynamics: Sequence[str | Path], seed: int = 0
+    task: str | Task,
+    actor: Actor,
+    dynamics: Sequence[str | Path],
+    seed: int = 0,
+    memory: int = 1,
 ) -> dict[str, TensorDictBase]:
     """What the policy does in each dynamics from the start that earns least, of 64.
 
@@ -144,6 +151,7 @@ def hardest_episode(
     episodes, row = {}, 0
     for name in dict.fromkeys(map(str, dynamics)):
         env = make_env(task, dynamics=name, num_envs=64, seed=seed)
+        env = remember(env, memory)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             steps = env.rollout(env.task.horizon, actor, break_when_any_done=False)[
                 "next"

@@ -37,7 +37,8 @@ def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, D
             f"the policy in {folder} acts in scene '{task.scene.name}' "
             f"({task.scene.hash}), expected '{scene.name}' ({scene.hash})"
         )
-    actor = make_actor(load_policy(folder, task))
+    policy = load_policy(folder, task)
     digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:16]
-    draw = partial(policy_data, task, actor, noise=noise)
+    actor, memory = make_actor(policy), policy.memory
+    draw = partial(policy_data, task, actor, noise=noise, memory=memory)
     return f"policy {digest} with noise {noise:g}", draw

@@ -10,18 +10,20 @@ from torchrl_nerd.tasks import make_task
 STEPS = 8
 
 
-def policy_of(task_id: str):
+def policy_of(task_id: str, memory: int):
     task = make_task(task_id)
-    policy = Policy((task.observation_size, 8, task.controller.num_actions))
+    sizes = (memory * task.observation_size, 8, task.controller.num_actions)
+    policy = Policy(sizes, memory=memory)
     torch.nn.init.normal_(policy.mlp[-1].weight)
     return follow(make_actor(policy.eval()))
 
 
 def test_equal_dynamics_have_no_error(task_id, seed):
-    acts = {False: idle(make_task(task_id), STEPS, seed, "random")}
-    acts[True] = policy_of(task_id)
-    for own_actions, act in acts.items():
-        pair = play_pair(task_id, "mujoco", act, STEPS, seed, own_actions)
+    acts = {0: idle(make_task(task_id), STEPS, seed, "random")}
+    acts |= {memory: policy_of(task_id, memory) for memory in (1, 3)}
+    for memory, act in acts.items():
+        how = {"own_actions": memory > 0, "memory": max(memory, 1)}
+        pair = play_pair(task_id, "mujoco", act, STEPS, seed, **how)
         assert torch.equal(pair.learned, pair.truth)
         assert max(float(error.max()) for error in pair.errors.values()) < 1e-6
         assert pair.returns[0] == pair.returns[1]

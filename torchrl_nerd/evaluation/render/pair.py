@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.keys import ACTION, QPOS, TERRAIN
 from torchrl_nerd.scenes import Scene
@@ -82,6 +83,7 @@ def play_pair(
     seed: int = 0,
     own_actions: bool = False,
     device: torch.device | str = "cpu",
+    memory: int = 1,
 ) -> Pair:
     """Both dynamics from one start of the task, until the true episode ends.
 
@@ -94,15 +96,17 @@ def play_pair(
         own_actions: show each dynamics' own state and act on it, so that a policy can
             mend what the model gets wrong; by default both get the same actions.
         device: of the envs, and of what ``act`` is shown.
+        memory: how many observations ``act`` is shown, see `remember`.
 
     Returns:
         The episode, on the processor.
     """
     learned, truth = (
-        make_env(task, name, 1, seed, device) for name in (model, "mujoco")
+        remember(make_env(task, name, 1, seed, device), memory)
+        for name in (model, "mujoco")
     )
-    start = truth.reset()
-    shown = [learned.reset(start.clone(), set_state=True), start]
+    shown = [learned.reset(), truth.reset()]  # one seed, one start
+    terrain = shown[1].get(TERRAIN, None)
     paths: list[list[Tensor]] = [[td[QPOS]] for td in shown]
     returns, ending = [0.0, 0.0], "steps"
     for step in range(steps):
@@ -118,7 +122,7 @@ def play_pair(
             ending = "terminated" if shown[1]["terminated"].item() else "horizon"
             break
     positions = [torch.cat(path).cpu() for path in paths]
-    scene, terrain = truth.scene, start.get(TERRAIN, None)
+    scene = truth.scene
     return Pair(
         scene=scene,
         step_size=scene.control_step * truth.task.steps_per_action,

@@ -1,0 +1,55 @@
+"""Policies that see their last observations, in envs and in loops without one."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_nerd.envs import make_env
+from torchrl_nerd.envs.memory import recall, remember
+from torchrl_nerd.tasks import make_task
+
+ROWS, STEPS = 4, 6
+
+
+@pytest.fixture(params=["nerd", "mujoco"])
+def dynamics(request) -> str:
+    return request.param
+
+
+def test_one_observation_is_the_env_itself(dynamics):
+    env = make_env("franka/reach", dynamics, ROWS)
+    assert remember(env, 1) is env
+
+
+@pytest.mark.parametrize("memory", [2, 3])
+def test_it_shows_what_was_seen(memory, dynamics, seed):
+    env, plain = (make_env("franka/reach", dynamics, ROWS, seed) for _ in range(2))
+    env = remember(env, memory)
+    check_env_specs(env)
+    env.set_seed(seed)
+    plain.set_seed(seed)
+    actions = torch.rand(STEPS, ROWS, 7) * 2.0 - 1.0
+    td, one = env.reset(), plain.reset()
+    recent = recall(None, one["observation"], memory)
+    assert torch.equal(td["observation"], recent)
+    for action in actions:
+        td = env.step(td.set("action", action))["next"]
+        one = plain.step(one.set("action", action))["next"]
+        recent = recall(recent, one["observation"], memory)
+        assert torch.equal(td["observation"], recent)
+
+
+def test_a_partial_reset_forgets_its_rows_alone(dynamics, seed):
+    env = remember(make_env("franka/reach", dynamics, ROWS, seed), 3)
+    last = env.rollout(4, break_when_any_done=False)[:, -1]["next"].clone()
+    which = torch.tensor([False, True, True, False])
+    again = env.reset(last.clone().set("_reset", which[:, None]))["observation"]
+    assert torch.equal(again[~which], last["observation"][~which])
+    first = again[which].unflatten(-1, (3, -1))
+    assert torch.equal(first, first[:, :1].expand_as(first))
+
+
+def test_no_memory_at_all_is_refused():
+    task = make_task("cartpole/swingup")
+    with pytest.raises(ValueError, match="memory"):
+        remember(make_env(task, "mujoco"), 0)
