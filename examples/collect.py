@@ -73,6 +73,7 @@ def one_process(cfg: Config, dynamics: Sequence[str]) -> Collector:
         make_policy(cfg),
         frames_per_batch=frames,
         total_frames=cfg.batches * frames,
+        auto_register_policy_transforms=False,
     )
 
 
@@ -87,6 +88,7 @@ def processes(
         make_policy(cfg),
         frames_per_batch=frames,
         total_frames=cfg.batches * frames,
+        auto_register_policy_transforms=False,
     )
 
 
@@ -98,6 +100,7 @@ def parallel_envs(cfg: Config, dynamics: Sequence[str]) -> Collector:
         make_policy(cfg),
         frames_per_batch=frames,
         total_frames=cfg.batches * frames,
+        auto_register_policy_transforms=False,
     )
 
 

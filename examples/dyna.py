@@ -83,6 +83,7 @@ def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer, TensorDictReplayB
         frames_per_batch=frames,
         total_frames=cfg.frames,
         track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )
     for batch in tqdm(collector, total=-(-cfg.frames // frames), unit="round"):
         true.extend(transitions(batch, is_true=True))

@@ -108,7 +108,12 @@ def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:
     """Batches ``[num_envs, horizon]`` of an actor that learns between them."""
     frames, total = num_frames(cfg)
     return Collector(
-        env, actor, frames_per_batch=frames, total_frames=total, track_traj_ids=False
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=total,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,  # the actor needs none
     )
 
 

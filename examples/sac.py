@@ -86,6 +86,7 @@ def make_collectors(cfg: Config, agent: Agent) -> dict[str, Iterator[TensorDictB
             frames_per_batch=num_envs * cfg.horizon,
             total_frames=cfg.frames,
             track_traj_ids=False,
+            auto_register_policy_transforms=False,
         )
         for dynamics, num_envs in rows.items()
         if num_envs
