@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant model-double_pendulum format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant model-anymal model-double_pendulum format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -70,6 +70,22 @@ model-ant: $(STAMP) ## the shipped Ant anew: learned, tried by a policy, learned
 		--steps 12000 --rollout-steps 4000 --rollout-rounds 1 --lr 0.004 --lr-other 0.0012 \
 		--rollout-lr 0.25 --validate-every 2000 --out runs/ant_policy \
 		--export torchrl_nerd/pretrained/ant
+
+model-anymal: $(STAMP) ## the shipped ANYmal anew: learned, tried by two policies, learned on
+	$(NERD) train anymal
+	for task in forward sideways; do \
+		$(PY) examples/ppo.py --task anymal/$$task --dynamics runs/anymal/best \
+			--out runs/ppo_anymal_$$task --horizon 16 --minibatch 8192 --lr 1e-3 \
+			--total-frames 8000000 --episodes 512 || exit 1; \
+	done
+	$(NERD) data anymal --policy runs/ppo_anymal_forward --noise 0.3 --trajectories 5000 \
+		--out datasets/anymal_forward
+	$(NERD) data anymal --policy runs/ppo_anymal_sideways --noise 0.3 --trajectories 5000 \
+		--out datasets/anymal_sideways
+	$(NERD) train anymal --start runs/anymal/best --out runs/anymal_on \
+		--data datasets/anymal datasets/anymal_forward datasets/anymal_sideways \
+		--steps 7000 --rollout-steps 1000 --lr 0.004 --lr-other 0.0012 \
+		--validate-every 1000 --export torchrl_nerd/pretrained/anymal
 
 model-double_pendulum: $(STAMP) ## the shipped double pendulum anew: learned, then learned on
 	$(NERD) train double_pendulum
