@@ -23,8 +23,9 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.modules.free_step import FreeStep
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
-from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.sequences import cover, data_stats
 from torchrl_nerd.transforms import Stats
@@ -39,6 +40,19 @@ warp_too = pytest.mark.parametrize(
     "dynamics", (*DYNAMICS, WARP) if is_warp_installed() else DYNAMICS
 )
 """With MuJoCo Warp where it is installed, on the CPU, where it takes minutes."""
+
+
+def is_free(scene: Scene) -> bool:
+    """Whether a `FreeStep` can move the robot."""
+    try:
+        FreeStep(scene)
+    except ValueError:
+        return False
+    return True
+
+
+FREE = [load_scene(name) for name in SCENES if is_free(load_scene(name))]
+each_free = pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.name)
 
 
 def enliven(network: nn.Module, generator: Generator) -> nn.Module:

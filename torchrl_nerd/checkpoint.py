@@ -7,18 +7,22 @@ local scene and warns, in one sentence, of what differs.
 import os
 import platform
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import mujoco
 import torch
+from tensordict.utils import NestedKey
 
 from torchrl_nerd import __version__
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
-from torchrl_nerd.modules.nerd import NeRD, NetworkConfig
-from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
+from torchrl_nerd.modules.correction import FreeConfig, ResidualConfig
+from torchrl_nerd.modules.free import FreeNeRD
+from torchrl_nerd.modules.nerd import Config, NeRD, NetworkConfig
+from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene, is_import, load_scene
 from torchrl_nerd.selfcheck import PREFIX as CHECK
@@ -29,6 +33,7 @@ from torchrl_nerd.selfcheck import (
     warn_of_differences,
 )
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
+from torchrl_nerd.transforms import Stats
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -42,14 +47,25 @@ KINDS: dict[str, type] = {
     "mlp": MLPConfig,
     "gru": GRUConfig,
     "residual-mlp": ResidualConfig,
+    "free-mlp": FreeConfig,
 }
 
 
-def make_model(scene: Scene, config: NetworkConfig | ResidualConfig) -> NeRD:
-    """A model of that configuration whose weights are yet to be loaded."""
+def make_model(
+    scene: Scene,
+    config: Config,
+    stats: Mapping[NestedKey, Stats] | None = None,
+) -> NeRD:
+    """A model of that configuration whose weights are yet to be loaded or trained.
+
+    Raises:
+        ValueError: a robot that no model of that configuration is for.
+    """
     if isinstance(config, ResidualConfig):
-        return ResidualNeRD(scene, config)
-    return NeRD(scene, config)
+        return ResidualNeRD(scene, config, stats)
+    if isinstance(config, FreeConfig):
+        return FreeNeRD(scene, config, stats)
+    return NeRD(scene, config, stats)
 
 
 def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, Any]:

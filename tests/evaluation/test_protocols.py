@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from torchrl_nerd.checkpoint import make_model
 from torchrl_nerd.evaluation.protocols import PROTOCOLS, protocol_of
 from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
-from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.modules.nerd import NETWORKS, network_config
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.tasks import TASKS, make_task
 from torchrl_nerd.training.recipes import RECIPES, recipe_of
@@ -55,7 +56,7 @@ def test_protocols_fit_their_scene(scene):
 def test_recipes_fit_their_scene(name):
     recipe = RECIPES[name]
     assert recipe.task in TASKS and make_task(recipe.task).scene is load_scene(name)
-    assert recipe.train.network in NETWORKS
+    assert make_model(load_scene(name), network_config(recipe.train.network))
     assert recipe.data.steps >= max(recipe.train.length, recipe.train.rollout_length)
 
 

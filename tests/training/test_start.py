@@ -15,8 +15,9 @@ from torchrl_nerd.cli import main
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json
+from torchrl_nerd.modules.correction import ResidualConfig
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
-from torchrl_nerd.modules.residual import ResidualConfig, ResidualNeRD
+from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training import trainer
 from torchrl_nerd.training.sequences import Symmetry, cover, data_stats

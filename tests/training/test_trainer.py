@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from dynamics_helpers import each_free
 from torch import Generator
 
 from torchrl_nerd.checkpoint import load_checkpoint
@@ -67,6 +68,21 @@ def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
     card = read_json(tmp_path / "best" / "card.json")
     assert card["training"]["network"] == network
     assert set(card["validation_error"]) == {"2", "5"}
+
+
+@each_free
+def test_a_step_that_is_corrected_learns_too(scene, tmp_path, seed):
+    config = replace(BRIEF, network="free", seed=seed, steps=200, single_share=1.0)
+    trainer = make_trainer(scene, config, tmp_path)
+    before = loss_of(trainer, seed)
+    path = open_loop(NeRDDynamics(trainer.run()), initial_states(scene, 5, seed), 20)
+    assert loss_of(trainer, seed) < before and path.isfinite().all()
+    again = load_checkpoint(tmp_path / "last")
+    assert torch.equal(
+        open_loop(NeRDDynamics(again), initial_states(scene, 5, seed), 20), path
+    )
+    with pytest.raises(ValueError, match="without use_symmetry for a model with a sim"):
+        make_trainer(scene, replace(config, use_symmetry=True), tmp_path / "other")
 
 
 @pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])

@@ -6,7 +6,12 @@ from typing import Any
 
 import torch
 
-from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
+from torchrl_nerd.checkpoint import (
+    from_pretrained,
+    load_checkpoint,
+    make_model,
+    save_checkpoint,
+)
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
 from torchrl_nerd.data.generate import CARD, generate, load_data_sets
@@ -72,7 +77,7 @@ class Train(DeviceCommand):
     def plan(self) -> list[str]:
         """What would be trained on what, and what is there."""
         scene, (out, folders) = scene_of(self.scene, self.fine), self.folders
-        model = NeRD(scene, network_config(self.config.network))
+        model = make_model(scene, network_config(self.config.network))
         start = self.begin(scene)
         if start is not None:
             model = begin_from(start, scene, self.config.network)

@@ -56,7 +56,7 @@ class NeRDDynamics:
         self.differentiable = differentiable
         network = cast(Network, model.network)
         if inference == "window":
-            network = WindowNetwork(model.network, window, model.tokens.size)
+            network = WindowNetwork(model.network, window, model.token_size)
         self.network: Network = network
         self._memory: Memory | None = None
         self._rows = 0
@@ -125,7 +125,7 @@ class NeRDDynamics:
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Next ``qpos`` and ``qvel``, the input's distance; advances ``memory``."""
         features = self.model.features(qpos, qvel, torque, terrain)
-        token = self.model.assemble(features, qpos, qvel)
+        token = self.model.assemble(features, qpos, qvel, torque)
         output = self.network.step(token, memory)
         distance = self.model.coverage.distance(features) if is_scored else None
         return *self.model.decode(qpos, qvel, output), distance

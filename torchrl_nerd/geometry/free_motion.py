@@ -189,7 +189,7 @@ def _rows_last(x: Tensor, size: int) -> Tensor:
     """``(*batch, n, d)`` (its last ``size`` dimensions) as ``(d, n, N)``."""
     batch = x.ndim - size
     flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])
-    return flat.permute(*range(flat.ndim - 1, -1, -1))
+    return flat.permute(tuple(reversed(range(flat.ndim))))
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
+from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.coverage import Coverage
 from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
 from torchrl_nerd.scenes.scene import Scene
@@ -20,7 +21,7 @@ from torchrl_nerd.transforms import (
     Stats,
 )
 
-NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
+NetworkConfig = TransformerConfig | MLPConfig | GRUConfig | FreeConfig
 
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
@@ -35,20 +36,24 @@ NETWORKS: dict[str, NetworkConfig] = {
 }
 """Networks by name, for the command line."""
 
+FREE: dict[str, NetworkConfig] = {"free": FreeConfig()}
+"""Those of a `FreeNeRD`: for robots that nothing touches."""
+
 TOKEN, TARGET = "token", "target"
 
 
 def network_config(name: str) -> NetworkConfig:
-    """The network of that name in `NETWORKS`.
+    """The network of that name in `NETWORKS` or `FREE`.
 
     Raises:
         SettingError: no such network.
     """
-    if name not in NETWORKS:
+    known = NETWORKS | FREE
+    if name not in known:
         raise SettingError(
-            f"unknown network '{name}', expected one of {', '.join(NETWORKS)}"
+            f"unknown network '{name}', expected one of {', '.join(known)}"
         )
-    return NETWORKS[name]
+    return known[name]
 
 
 class Memory(Protocol):
@@ -114,7 +119,7 @@ class NeRD(nn.Module):
         What lies outside the training data is taken to their border, see `Coverage`.
         """
         features = self.features(qpos, qvel, joint_torque, terrain)
-        return self.assemble(features, qpos, qvel)
+        return self.assemble(features, qpos, qvel, joint_torque)
 
     def features(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
@@ -123,9 +128,27 @@ class NeRD(nn.Module):
         raw = self.tokens(qpos, qvel, joint_torque, terrain)
         return self.normalize.normalize(TOKEN, raw)
 
-    def assemble(self, features: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """The network's token ``(*batch, F)``, from the `features` of a state."""
-        return self.coverage.clamp_token(features).to(self.dtype)
+    def assemble(
+        self, features: Tensor, qpos: Tensor, qvel: Tensor, joint_torque: Tensor
+    ) -> Tensor:
+        """The network's token ``(*batch, token_size)``, from a state's `features`."""
+        token = self.coverage.clamp_token(features).to(self.dtype)
+        change = self.foresee(qpos, qvel, joint_torque)
+        if change is None:
+            return token
+        exact = torch.promote_types(self.dtype, torch.float32)
+        return torch.cat((token.to(exact), change.to(exact)), -1)
+
+    def foresee(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor
+    ) -> Tensor | None:
+        """What a simulator within the model foresees ``(*batch, D + 1)``; here none."""
+        return None
+
+    @property
+    def token_size(self) -> int:
+        """Width of a token: the features, and what is foreseen."""
+        return self.tokens.size
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor
@@ -164,11 +187,14 @@ class NeRD(nn.Module):
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
         """Move everything, but cast the network alone: constants stay float64."""
-        for part in (self.tokens, self.state_delta, self.normalize, self.coverage):
+        for part in (part for part in self.children() if part is not self.network):
             for module in part.modules():
                 for name, buffer in module._buffers.items():
                     if buffer is not None:
                         module._buffers[name] = buffer.to(fn(buffer).device)
+                for weight in module._parameters.values():  # of a simulator
+                    if weight is not None:
+                        weight.data = weight.data.to(fn(weight.data).device)
         self.network._apply(fn, recurse)
         return self
 

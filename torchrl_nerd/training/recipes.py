@@ -110,7 +110,15 @@ RECIPES: dict[str, Recipe] = {
         softening=0.02,
         bf16_share=0.8,
     ),
-    "franka": _mlp("franka/reach_torque", 10_000, "mlp", 10_000, 1_000, softening=0.01),
+    "franka": _mlp(
+        "franka/reach_torque",
+        12_000,
+        "free",
+        6_000,
+        500,
+        softening=0.0001,
+        validate_every=1_000,
+    ),
     "franka_gravity": _mlp(
         "franka_gravity/reach_torque",
         10_000,

@@ -89,6 +89,9 @@ class Sequences:
         data: ``[trajectories, steps]``.
         device: where batches are wanted.
         symmetry: show each sample as a random one of its images.
+
+    Raises:
+        ValueError: images of what a simulator within the model foresees.
     """
 
     def __init__(
@@ -98,6 +101,11 @@ class Sequences:
         device: torch.device,
         symmetry: Symmetry | None = None,
     ) -> None:
+        if symmetry is not None and model.token_size > model.tokens.size:
+            raise ValueError(
+                "expected training without use_symmetry for a model with a simulator "
+                f"within, got {type(model).__name__} with it"
+            )
         self.tokens, self.targets = (x.to(device) for x in normalised(model, data))
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
@@ -169,18 +177,29 @@ def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
     return stats
 
 
+@torch.no_grad()
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
-    """Tokens and targets of transitions, normalised, float32 ``(*batch, D)``."""
+    """Tokens and targets of transitions, normalised, float32 ``(*batch, D)``.
+
+    Not clamped to what the model covers: that is found from them.
+    """
     tokens, targets = (
         torch.empty(*data.batch_size, size, device=data[QPOS].device)
-        for size in (model.tokens.size, model.state_delta.size)
+        for size in (model.token_size, model.state_delta.size)
     )
     for part, *places in zip(
         data.split(PART), tokens.split(PART), targets.split(PART), strict=True
     ):
         raw = raw_tokens(model.tokens, model.state_delta, part)
-        for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
-            place.copy_(model.normalize.normalize(key, value))
+        token, target = (
+            model.normalize.normalize(key, value)
+            for key, value in zip((TOKEN, TARGET), raw, strict=True)
+        )
+        places[0][..., : model.tokens.size] = token
+        foreseen = model.foresee(part[QPOS], part[QVEL], part[JOINT_TORQUE])
+        if foreseen is not None:
+            places[0][..., model.tokens.size :] = foreseen
+        places[1].copy_(target)
     return tokens, targets
 
 
@@ -195,5 +214,6 @@ def cover(
         samples: their normalised tokens and targets, where they are there already.
     """
     tokens, targets = samples or normalised(model, data)
+    features = tokens[..., : model.tokens.size]
     seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
-    model.coverage.fit(tokens.flatten(0, -2), targets.flatten(0, -2), *seen)
+    model.coverage.fit(features.flatten(0, -2), targets.flatten(0, -2), *seen)

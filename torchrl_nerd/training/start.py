@@ -4,7 +4,8 @@ import hashlib
 
 from tensordict import TensorDict
 
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD, network_config
+from torchrl_nerd.checkpoint import make_model
+from torchrl_nerd.modules.nerd import FREE, NETWORKS, NeRD, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import Symmetry, data_stats
 
@@ -23,7 +24,7 @@ def fresh_model(
     stats = data_stats(scene, data)
     if symmetry is not None:
         stats = symmetry.complete(stats)
-    return NeRD(scene, network_config(network), stats)
+    return make_model(scene, network_config(network), stats)
 
 
 def begin_from(
@@ -46,12 +47,14 @@ def begin_from(
             statistics that the images do not share.
     """
     if start.config != network_config(network):
-        names = [name for name, config in NETWORKS.items() if config == start.config]
+        names = [
+            name for name, config in (NETWORKS | FREE).items() if config == start.config
+        ]
         raise ValueError(
             f"expected the network of the model to start from, "
             f"{' or '.join(names) or start.config}, got {network}"
         )
-    model = NeRD(scene, start.config)
+    model = make_model(scene, network_config(network))
     widths, found = ((m.tokens.size, m.state_delta.size) for m in (model, start))
     if widths != found:
         raise ValueError(

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
-from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.checkpoint import make_card, make_model, save_checkpoint
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import (
     ErrorSummary,
@@ -225,7 +225,7 @@ class Trainer:
 
     def averaged_model(self) -> NeRD:
         """A copy of the model that holds the averaged weights, and knows rest."""
-        model = NeRD(self.scene, self.model.config).to(self.device)
+        model = make_model(self.scene, self.model.config).to(self.device)
         model.load_state_dict(self.model.state_dict())
         model.network.load_state_dict(self.average)
         find_rest(model.eval(), self.resting)

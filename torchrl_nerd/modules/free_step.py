@@ -1,0 +1,113 @@
+"""A control step of a robot that nothing touches, from two looks at its free motion.
+
+MuJoCo's semi-implicit Euler moves on by the accelerations at the starts of its n substeps.
+Their mean is, to second order, the acceleration at the mean of those times, (h - h/n) / 2.
+So the first look, at the start, tells the state there, and the second one the mean: a
+midpoint rule that shares the error of the substeps in place of adding its own.
+"""
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.free_motion import FreeMotion
+from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.scenes.scene import Scene
+
+EXACT = (int(mujoco.mjtIntegrator.mjINT_RK4),)  # no first-order error of its substeps
+
+
+class FreeStep(nn.Module):
+    """The change of the state under given torques, in the numbers of `StateDelta`.
+
+    Args:
+        scene: a fixed robot of hinges and slides without ground and friction.
+
+    Raises:
+        ValueError: in one sentence, another robot.
+    """
+
+    rotation: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        _expect_free(scene)
+        model, self.period = scene.model, scene.control_step
+        self.lag = 0.0 if model.opt.integrator in EXACT else model.opt.timestep
+        self.ahead = 0.5 * (self.period - self.lag)
+        axes = JointAxes.of(model, scene.base)
+        self.actuated, self.num_places = scene.actuated, len(axes.bodies)
+        self.first = FreeMotion(model, scene.base, axes, 2.0 * self.ahead)
+        self.second = FreeMotion(model, scene.base, axes, 2.0 * self.lag)
+        bodies = axes.bodies + self.first.bodies
+        positions = np.concatenate((axes.positions, self.first.positions))
+        self.kinematics = PointKinematics(model, scene.base, bodies, positions)
+        ends = np.where(
+            model.jnt_limited != 0, model.jnt_range.T, [[-np.inf], [np.inf]]
+        )
+        keep_constants(self, rotation=scene.mount[1], low=ends[0], high=ends[1])
+
+    def forward(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The change, and two signs of what it leaves out.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+            joint_torque: ``(*batch, num_actuated)``, held over the step.
+
+        Returns:
+            The change ``(*batch, 2 nv)``; by how much the second look changed that of
+            velocities, ``(*batch, nv)``; how far the step begins or ends beyond a limit,
+            which it does not see, ``(*batch, 1)``, m or rad.
+        """
+        torque = torch.zeros_like(qvel)
+        torque[..., self.actuated] = joint_torque
+        start = self._acceleration(self.first, qpos, qvel, torque)
+        speed = qvel + self.ahead * start
+        moved = qvel + 0.5 * (self.ahead + self.lag) * start
+        place = qpos + self.ahead * moved
+        gain = self.period * self._acceleration(self.second, place, speed, torque)
+        residual = 0.5 * self.lag * gain
+        after = qpos + self.period * (qvel + 0.5 * gain) + residual
+        below = self.low - torch.minimum(qpos, after)
+        above = torch.maximum(qpos, after) - self.high
+        beyond = torch.maximum(below, above).amax(-1, keepdim=True).clamp_min(0.0)
+        return torch.cat((gain, residual), -1), gain - self.period * start, beyond
+
+    def _acceleration(
+        self, motion: FreeMotion, qpos: Tensor, qvel: Tensor, torque: Tensor
+    ) -> Tensor:
+        points, _ = self.kinematics(qpos, qvel)
+        places, corners = (
+            points[..., : self.num_places, :],
+            points[..., self.num_places :, :],
+        )
+        rotation = self.rotation.expand(*qpos.shape[:-1], 3, 3)
+        return motion(qpos, qvel, torque, rotation, corners, places)
+
+
+def _expect_free(scene: Scene) -> None:
+    model = scene.model
+    air = model.opt.density or model.opt.viscosity
+    touching = model.geom_contype[:, None] & model.geom_conaffinity[None]
+    there = {
+        "a floating base": scene.base.is_floating,
+        "a ground": scene.terrain is not None,
+        "dry friction": model.dof_frictionloss.any(),
+        "air or water": air,
+        "parts that touch each other": touching.any(),
+        "gravity compensation": model.body_gravcomp.any(),
+    }
+    found = [what for what, is_there in there.items() if is_there]
+    if found:
+        raise ValueError(
+            "expected a robot that motors, gravity, springs, damping and limits alone "
+            f"move, got scene '{scene.name}' with {', '.join(found)}"
+        )
