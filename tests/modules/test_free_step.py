@@ -19,6 +19,7 @@ CHAIN = """<mujoco><option gravity="1 -2 -9" integrator="{integrator}"/>
   <body pos="0.1 0.2 1" euler="20 30 40"><joint name="a" axis="1 2 3" damping="0.7"
     pos="0.1 0.1 0.2" stiffness="3" springref="0.2" armature="0.1"/>
     <inertial pos="0.1 -0.1 0.2" mass="2" fullinertia="0.2 0.3 0.25 0.02 0.03 -0.04"/>
+    <geom size="0.1"/>
     <body pos="0.3 0 0" euler="10 0 50"><joint name="b" type="slide" axis="0 1 1"
       damping="0.2"/><geom type="box" size="0.1 0.2 0.3" pos="0.1 0.1 0"/>
       <body pos="0 0 0.3"><joint name="c" axis="0 1 0" damping="0.1"/>

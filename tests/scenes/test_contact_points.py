@@ -9,8 +9,12 @@ import torch
 from helpers import every_scene, make_scene, random_states, random_transitions
 
 from torchrl_nerd.keys import CONTACT_DISTANCE, CONTACT_NORMAL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.scenes.contact_points import MARGIN_PER_RADIUS, MIN_MARGIN
+from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.scenes.contact_points import (
+    MARGIN_PER_RADIUS,
+    MIN_MARGIN,
+    own_contacts,
+)
 from torchrl_nerd.scenes.double_pendulum import (
     GROUNDS,
     RADIUS,
@@ -177,3 +181,38 @@ def test_only_what_the_robot_can_touch_is_ground():
     filtered = '<geom type="cylinder" size="1 1" contype="2" conaffinity="2"/>'
     assert len(one_shape(ball, PLANE + filtered).terrain.surfaces) == 1
     assert len(one_shape(ball, PLANE + PLANE).terrain.surfaces) == 2
+
+
+EXCLUDING = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+  <body name="a" pos="0 0 1"><joint/><geom size="0.1"/>
+    <body name="b"><geom size="0.1"/><body name="c"><joint/><geom size="0.1"/>
+      <body name="d"><joint/><geom size="0.1"/></body></body>
+      <body name="e"><joint/><geom size="0.1"/></body></body></body>
+  <body name="f"><joint/><geom name="f" size="0.1" contype="0" conaffinity="0"/></body>
+  <body name="g"><joint/><geom name="g" size="0.1" contype="2" conaffinity="1"/></body>
+  </worldbody><contact><exclude body1="c" body2="e"/><pair geom1="f" geom2="g"/></contact>
+  <option><flag {flag}="disable"/></option></mujoco>"""
+OTHERS = ("dm_control/walker-walk", "dm_control/humanoid-run", "gymnasium/Ant-v5")
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        *(load_scene(name).model for name in (*SCENES, *OTHERS)),
+        *(
+            mujoco.MjModel.from_xml_string(EXCLUDING.format(flag=flag))
+            for flag in ("filterparent", "contact", "gravity")
+        ),
+    ],
+    ids=[*SCENES, *OTHERS, "no parent filter", "no contact", "excluding"],
+)
+def test_own_contacts_are_mujocos(model):
+    """Shapes that feel each other from ten metres off: all that may touch, do."""
+    model = copy.copy(model)
+    model.geom_margin[:] = model.body_margin[:] = 10.0
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moves = model.body_dofnum[model.body_weldid[model.geom_bodyid]] > 0
+    found = {tuple(sorted(pair)) for pair in data.contact.geom.tolist()}
+    found = {pair for pair in found if moves[list(pair)].all()}
+    assert {tuple(sorted(pair)) for pair in own_contacts(model)} == found

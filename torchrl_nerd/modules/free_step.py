@@ -15,6 +15,7 @@ from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.scenes.contact_points import own_contacts
 from torchrl_nerd.scenes.scene import Scene
 
 EXACT = (int(mujoco.mjtIntegrator.mjINT_RK4),)  # no first-order error of its substeps
@@ -96,13 +97,12 @@ class FreeStep(nn.Module):
 def _expect_free(scene: Scene) -> None:
     model = scene.model
     air = model.opt.density or model.opt.viscosity
-    touching = model.geom_contype[:, None] & model.geom_conaffinity[None]
     there = {
         "a floating base": scene.base.is_floating,
         "a ground": scene.terrain is not None,
         "dry friction": model.dof_frictionloss.any(),
         "air or water": air,
-        "parts that touch each other": touching.any(),
+        "parts that touch each other": len(own_contacts(model)),
         "gravity compensation": model.body_gravcomp.any(),
     }
     found = [what for what, is_there in there.items() if is_there]

@@ -7,7 +7,7 @@ the rim of a cap that turns on the spot.
 """
 
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 
 import mujoco
 import numpy as np
@@ -109,6 +109,27 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
             if any(_collide(model, geom, other) for other in moving):
                 grounds.append(geom)
     return grounds
+
+
+def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Pairs of the robot's own shapes between which MuJoCo looks for contact.
+
+    Not those of one body, of a body and its parent, or that the model excludes. Source:
+    https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
+    """
+    if model.opt.disableflags & NO_CONTACT:
+        return []
+    keep_parents = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    weld, excluded = model.body_weldid, set(model.exclude_signature.tolist())
+    pairs = list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
+    for pair in combinations(_moving_geoms(model), 2):
+        low, high = sorted(int(model.geom_bodyid[geom]) for geom in pair)
+        top, other = sorted((int(weld[low]), int(weld[high])))
+        is_parent = top == weld[model.body_parentid[other]] and not keep_parents
+        is_out = top == other or is_parent or (low << 16) + high in excluded
+        if not is_out and _collide(model, *pair):
+            pairs.append(pair)
+    return pairs
 
 
 def _moving_geoms(model: mujoco.MjModel) -> list[int]:
