@@ -37,7 +37,7 @@ SUPPORTED.append(make_scene(floating))
 def free_acceleration(scene, rows, period=0.0, torque=None):
     model = scene.model
     axes = JointAxes.of(model, scene.base)
-    motion = FreeMotion(model, scene.base, axes, period)
+    motion = FreeMotion(model, scene.base, axes)
     bodies = axes.bodies + motion.bodies
     positions = np.concatenate((axes.positions, motion.positions))
     points, _ = PointKinematics(model, scene.base, bodies, positions)(
@@ -47,7 +47,8 @@ def free_acceleration(scene, rows, period=0.0, torque=None):
     mount = map(torch.as_tensor, scene.mount)
     rotation = base_pose(scene.base, rows[QPOS], *mount)[1]
     corners, places = points[:, count:], points[:, :count]
-    return motion(rows[QPOS], rows[QVEL], torque, rotation, corners, places)
+    where = rotation, corners, places
+    return motion(rows[QPOS], rows[QVEL], torque, *where, period)
 
 
 def mujoco_acceleration(scene, rows, period=0.0, torque=None):

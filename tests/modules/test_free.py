@@ -68,6 +68,19 @@ def test_it_comes_back_from_disk(scene, inference, generator, tmp_path):
     assert not unequal_keys(*paths)
 
 
+def test_it_keeps_the_substeps_that_it_learned_from(generator, tmp_path):
+    """RK4 has no error of its substeps to share, and the plain scene's Euler has."""
+    scene = load_scene("cartpole")
+    model = lively(scene.fine, generator)
+    assert model.free_step.lag == 0.0 < fresh(scene).free_step.lag
+    save_checkpoint(model, tmp_path, make_card(model))
+    loaded = load_checkpoint(tmp_path, scene)
+    assert loaded.free_step.lag == 0.0
+    drive = random_drive(scene, 4, 5, generator)
+    paths = [roll(NeRDDynamics(m), *drive) for m in (model, loaded)]
+    assert not unequal_keys(*paths)
+
+
 @each_free
 def test_rows_do_not_see_each_other(scene, generator):
     model, rows = lively(scene, generator), random_transitions(scene, ROWS, generator)

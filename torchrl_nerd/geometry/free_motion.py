@@ -56,8 +56,6 @@ class FreeMotion(nn.Module):
         model: compiled.
         base: of the robot.
         axes: its joints.
-        period: s over which the acceleration is meant to hold: damping is taken at its
-            middle, so that no joint is braked beyond rest.
     """
 
     mass: Tensor
@@ -67,12 +65,10 @@ class FreeMotion(nn.Module):
     damping: Tensor
     stiffness: Tensor
     rest: Tensor
-    extra: Tensor
+    armature: Tensor
     is_slide: Tensor
 
-    def __init__(
-        self, model: mujoco.MjModel, base: Base, axes: JointAxes, period: float
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, base: Base, axes: JointAxes) -> None:
         super().__init__()
         has_mass = (model.body_weldid != 0) & (model.body_mass > 0.0)
         found = np.flatnonzero(has_mass).tolist()
@@ -86,7 +82,6 @@ class FreeMotion(nn.Module):
         together = np.ones((model.nv, model.nv))
         together[self.num_whole :] = 0.0
         together[self.num_whole :, self.num_whole :] = axes.carries(below)
-        braked = 0.5 * period * model.dof_damping
         keep_constants(
             self,
             mass=model.body_mass[found, None],
@@ -96,7 +91,7 @@ class FreeMotion(nn.Module):
             damping=model.dof_damping,
             stiffness=model.jnt_stiffness[joints],
             rest=model.qpos_spring[self.qpos_addresses],
-            extra=np.diag(model.dof_armature + braked),
+            armature=model.dof_armature,
             is_slide=axes.is_slide[:, None],
         )
 
@@ -108,6 +103,7 @@ class FreeMotion(nn.Module):
         rotation: Tensor,
         corners: Tensor,
         places: Tensor,
+        period: float | Tensor = 0.0,
     ) -> Tensor:
         """Acceleration ``(*batch, nv)``, in the axes of ``qvel``.
 
@@ -118,6 +114,8 @@ class FreeMotion(nn.Module):
             rotation: of the base, ``(*batch, 3, 3)``.
             corners: where ``positions`` are, ``(*batch, 4 B, 3)``, m, in B_t.
             places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m, in B_t.
+            period: s over which the acceleration is meant to hold: damping is taken at its
+                middle, so that no joint is braked beyond rest.
         """
         rate, position = _rows_last(qvel, 1), _rows_last(qpos, 1)
         spin, slide = self._axes(_rows_last(places, 2))
@@ -130,7 +128,8 @@ class FreeMotion(nn.Module):
         )
         upper = self.together[..., None] * products.sum(0)
         lower = (1.0 - self.together)[..., None] * upper.transpose(0, 1)
-        mass_matrix = upper + lower + self.extra[..., None]
+        extra = torch.diag(self.armature + 0.5 * period * self.damping)
+        mass_matrix = upper + lower + extra[..., None]
         gravity = _rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
         push = -self._bias(bodies, spin, slide, rate, gravity)
         push = push - self.damping[:, None] * rate

@@ -24,6 +24,11 @@ EXACT = (int(mujoco.mjtIntegrator.mjINT_RK4),)  # no first-order error of its su
 class FreeStep(nn.Module):
     """The change of the state under given torques, in the numbers of `StateDelta`.
 
+    | buffer | meaning |
+    |---|---|
+    | ``lag`` | s, of a substep with the first-order error that the step shares; saved with
+      a model: it is that of the truth it learned from |
+
     Args:
         scene: a fixed robot of hinges and slides without ground and friction.
 
@@ -31,6 +36,7 @@ class FreeStep(nn.Module):
         ValueError: in one sentence, another robot.
     """
 
+    lag: Tensor
     rotation: Tensor
     low: Tensor
     high: Tensor
@@ -39,14 +45,14 @@ class FreeStep(nn.Module):
         super().__init__()
         _expect_free(scene)
         model, self.period = scene.model, scene.control_step
-        self.lag = 0.0 if model.opt.integrator in EXACT else model.opt.timestep
-        self.ahead = 0.5 * (self.period - self.lag)
+        is_exact = model.opt.integrator in EXACT
+        lag = torch.tensor(0.0 if is_exact else model.opt.timestep, dtype=torch.float64)
+        self.register_buffer("lag", lag)
         axes = JointAxes.of(model, scene.base)
         self.actuated, self.num_places = scene.actuated, len(axes.bodies)
-        self.first = FreeMotion(model, scene.base, axes, 2.0 * self.ahead)
-        self.second = FreeMotion(model, scene.base, axes, 2.0 * self.lag)
-        bodies = axes.bodies + self.first.bodies
-        positions = np.concatenate((axes.positions, self.first.positions))
+        self.motion = FreeMotion(model, scene.base, axes)
+        bodies = axes.bodies + self.motion.bodies
+        positions = np.concatenate((axes.positions, self.motion.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
         ends = np.where(
             model.jnt_limited != 0, model.jnt_range.T, [[-np.inf], [np.inf]]
@@ -70,11 +76,12 @@ class FreeStep(nn.Module):
         """
         torque = torch.zeros_like(qvel)
         torque[..., self.actuated] = joint_torque
-        start = self._acceleration(self.first, qpos, qvel, torque)
-        speed = qvel + self.ahead * start
-        moved = qvel + 0.5 * (self.ahead + self.lag) * start
-        place = qpos + self.ahead * moved
-        gain = self.period * self._acceleration(self.second, place, speed, torque)
+        ahead = 0.5 * (self.period - self.lag)
+        start = self._acceleration(qpos, qvel, torque, 2.0 * ahead)
+        speed = qvel + ahead * start
+        place = qpos + ahead * (qvel + 0.5 * (ahead + self.lag) * start)
+        gain = self._acceleration(place, speed, torque, 2.0 * self.lag)
+        gain = self.period * gain
         residual = 0.5 * self.lag * gain
         after = qpos + self.period * (qvel + 0.5 * gain) + residual
         below = self.low - torch.minimum(qpos, after)
@@ -83,15 +90,13 @@ class FreeStep(nn.Module):
         return torch.cat((gain, residual), -1), gain - self.period * start, beyond
 
     def _acceleration(
-        self, motion: FreeMotion, qpos: Tensor, qvel: Tensor, torque: Tensor
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor, period: Tensor
     ) -> Tensor:
         points, _ = self.kinematics(qpos, qvel)
-        places, corners = (
-            points[..., : self.num_places, :],
-            points[..., self.num_places :, :],
-        )
+        count = points.shape[-2] - self.num_places
+        places, corners = points.split((self.num_places, count), -2)
         rotation = self.rotation.expand(*qpos.shape[:-1], 3, 3)
-        return motion(qpos, qvel, torque, rotation, corners, places)
+        return self.motion(qpos, qvel, torque, rotation, corners, places, period)
 
 
 def _expect_free(scene: Scene) -> None:

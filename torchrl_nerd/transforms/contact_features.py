@@ -110,8 +110,7 @@ class ContactFeatures(FeatureTransform):
             if scene.foresees_forces:
                 self.force = GroundForce(scene, axes)
             if scene.foresees_free_motion:
-                args = scene.model, scene.base, axes, scene.control_step
-                self.free_motion = FreeMotion(*args)
+                self.free_motion = FreeMotion(scene.model, scene.base, axes)
                 bodies = bodies + self.free_motion.bodies
                 positions = np.concatenate((positions, self.free_motion.positions))
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
@@ -157,7 +156,8 @@ class ContactFeatures(FeatureTransform):
             if joint_torque is not None:
                 torque = torch.zeros_like(qvel)
                 torque[..., self.actuated] = joint_torque
-            gain = self.free_motion(qpos, qvel, torque, pose[1], corners, places)
+            where = pose[1], corners, places
+            gain = self.free_motion(qpos, qvel, torque, *where, self.step_size)
             gain = self.step_size * gain
         depth = self.radii - distance
         depth = gate * self.coming_depth(qpos, qvel, terrain, gain, depth, speed)

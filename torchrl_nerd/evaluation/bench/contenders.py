@@ -12,6 +12,7 @@ from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.modules.baselines import MLPConfig
+from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 
@@ -90,7 +91,7 @@ def learned_contenders(
         yield Contender(f"{name}, guarded", True, _guarded(model))
         if is_compiling:
             yield _learned(f"{name}, compiled", model, compile=True)
-        if not isinstance(model.config, MLPConfig):  # an MLP has no window to recompute
+        if not isinstance(model.config, MLPConfig | FreeConfig):  # nothing to recompute
             yield _learned(f"{name}, window", model, inference="window")
         yield _learned(f"{name}, bf16", copy.deepcopy(model).to(torch.bfloat16))
 
