@@ -165,11 +165,8 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
         sizes = options.policy_frames
         policy = policy or learned_policy(folder / "measured", *where, 0, sizes)
         explorer = explorer or learned_policy(folder / "explorer", *where, 1, sizes)
-    actor, memory = None, 1
-    if explorer:
-        exploring = load_policy(explorer, task)
-        actor, memory = make_actor(exploring), exploring.memory
-    known = strategies(task.scene, task, actor, memory)
+    actor = make_actor(load_policy(explorer, task)) if explorer else None
+    known = strategies(task.scene, task, actor)
     for name in options.only or known:
         if name not in known:
             raise ValueError(f"expected a strategy of {', '.join(known)}, got '{name}'")

@@ -142,9 +142,7 @@ def train(
         if number % cfg.evaluate_every == 0 or number * frames == total:
             where, seed = [cfg.dynamics], cfg.seed + 1
             episodes = min(256, cfg.episodes)
-            returns = policy_transfer.transfer(
-                task, actor, where, episodes, seed=seed, memory=cfg.memory
-            )
+            returns = policy_transfer.transfer(task, actor, where, episodes, seed=seed)
             means = {name: summary.mean for name, summary in returns.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})
@@ -162,12 +160,12 @@ def main(cfg: Run, collect: Collect = collect) -> None:
     scene = make_task(cfg.task).scene
     learned = ("nerd",) if scene.name in shipped_models() else ()
     everywhere = (cfg.dynamics, *learned, "mujoco", "dm_control")
-    memory, where = cfg.memory, (cfg.task, actor, everywhere)
-    returns = policy_transfer.transfer(*where, cfg.episodes, seed=seed, memory=memory)
+    where = cfg.task, actor, everywhere
+    returns = policy_transfer.transfer(*where, cfg.episodes, seed=seed)
     print(policy_transfer.transfer_table(returns))
     write_json(cfg.out / "returns.json", {k: asdict(v) for k, v in returns.items()})
-    where = (cfg.task, actor, everywhere[:3])
-    episodes = policy_transfer.hardest_episode(*where, seed=seed, memory=memory)
+    where = cfg.task, actor, everywhere[:3]
+    episodes = policy_transfer.hardest_episode(*where, seed=seed)
     plots.plot_states(episodes, scene, cfg.out / "episode.png")
 
 

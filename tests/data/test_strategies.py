@@ -43,6 +43,7 @@ class Linear:
     def __init__(self, task: Task, seed: int, memory: int = 1) -> None:
         generator = Generator().manual_seed(seed)
         size = (memory * task.observation_size, task.controller.num_actions)
+        self.memory = memory
         self.weight = 0.3 * torch.randn(size, generator=generator)
 
     def __call__(self, td: TensorDict) -> TensorDict:
@@ -196,7 +197,7 @@ def test_the_ant_has_fallen_and_lies_still(generator):
 def test_policy_data_is_what_the_env_does(task_id, memory, seed):
     task, rows, steps = make_task(task_id), 4, 6
     actor = Linear(task, seed, memory)
-    data = policy_data(task, actor, rows, steps, seeded(seed), 0.0, memory)
+    data = policy_data(task, actor, rows, steps, seeded(seed), 0.0)
     size = (rows, task.num_uniforms)
     u = torch.rand(size, dtype=torch.float64, generator=seeded(seed))
     env = GroundTruthEnv(task, num_envs=rows)

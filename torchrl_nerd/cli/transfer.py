@@ -44,7 +44,6 @@ class Transfer(DeviceCommand):
             self.episodes,
             seed=self.seed,
             device=self.device,
-            memory=policy.memory,
             quiet=self.quiet,
         )
         print(transfer_table(summaries))

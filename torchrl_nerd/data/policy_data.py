@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_nerd.data.generate import as_transitions
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.envs.memory import recall
+from torchrl_nerd.envs.memory import memory_of, recall
 from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 
@@ -21,7 +21,6 @@ def policy_data(
     steps: int,
     generator: Generator,
     noise: float = 0.5,
-    memory: int = 1,
 ) -> TensorDict:
     """Trajectories ``[rows, steps]`` of a policy in true dynamics, broken ones included.
 
@@ -37,7 +36,6 @@ def policy_data(
         steps: control steps of each.
         generator: of starts and noise.
         noise: largest standard deviation of the noise, in units of the action.
-        memory: how many observations the policy sees, see `remember`.
     """
     scene, controller = task.scene, task.controller
     size = (rows, task.num_uniforms)
@@ -55,7 +53,7 @@ def policy_data(
         for step in range(steps):
             if step % task.steps_per_action == 0:
                 seen = task.observation(row.update(state)).float()
-                recent = recall(recent, seen, memory)
+                recent = recall(recent, seen, memory_of(actor))
                 shown = TensorDict({OBSERVATION: recent}, [rows])
                 mean = actor(shown)[ACTION].double()
                 kick = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)

@@ -41,7 +41,7 @@ def mix(*draws: Draw) -> Draw:
 
 
 def strategies(
-    scene: Scene, task: Task, explorer: Actor | None = None, memory: int = 1
+    scene: Scene, task: Task, explorer: Actor | None = None
 ) -> dict[str, Draw]:
     """What can be done with a scene, by name.
 
@@ -66,7 +66,6 @@ def strategies(
         scene: the robot.
         task: of the same scene; says what standing is.
         explorer: the policy that explores.
-        memory: how many observations it sees.
     """
     calm = {"least_scale": LEAST_SCALE, "passive_share": PASSIVE, "quiet_share": 0.0}
     held = {"correlation": (scene.control_step, LONGEST)}
@@ -89,7 +88,7 @@ def strategies(
     }
     mixed = [along(**both), along(**both, **standing), along(**both, **fallen)]
     if explorer is not None:
-        found["policy"] = partial(policy_data, task, explorer, memory=memory)
+        found["policy"] = partial(policy_data, task, explorer)
         mixed.append(found["policy"])
     found["mixed"] = mix(*mixed)
     return {name: draw for name, draw in found.items() if draw is not None}

@@ -5,4 +5,4 @@ from collections.abc import Callable
 from tensordict import TensorDictBase
 
 Actor = Callable[[TensorDictBase], TensorDictBase]
-"""Any TorchRL policy: reads ``observation``, writes ``action``."""
+"""Any TorchRL policy: reads ``observation``, writes ``action``; see `memory_of`, too."""

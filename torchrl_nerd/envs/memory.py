@@ -6,9 +6,15 @@ import torch
 from torch import Tensor
 from torchrl.envs import CatFrames, TransformedEnv
 
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.keys import OBSERVATION
 from torchrl_nerd.settings import expect_at_least
+
+
+def memory_of(actor: Actor) -> int:
+    """How many observations an actor wants to be shown: its ``memory``, or 1."""
+    return getattr(actor, "memory", 1)
 
 
 def remember(env: SceneEnv, memory: int) -> SceneEnv:

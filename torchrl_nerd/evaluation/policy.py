@@ -109,14 +109,19 @@ class Policy(nn.Module):
 
 
 def make_actor(policy: Policy) -> ProbabilisticActor:
-    """The policy as TorchRL knows it: ``observation`` -> ``action`` in [-1, 1]."""
-    return ProbabilisticActor(
+    """The policy as TorchRL knows it: ``observation`` -> ``action`` in [-1, 1].
+
+    Its ``memory`` says how many observations it is to be shown, see `memory_of`.
+    """
+    actor = ProbabilisticActor(
         TensorDictModule(policy, [OBSERVATION], ["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=[ACTION],
         distribution_class=TanhNormal,
         return_log_prob=True,
     )
+    vars(actor)["memory"] = policy.memory
+    return actor
 
 
 def save_policy(

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.memory import remember
+from torchrl_nerd.envs.memory import memory_of, remember
 from torchrl_nerd.tasks import Task
 
 TRUTH = "mujoco"
@@ -104,7 +104,6 @@ def transfer(
     slow_episodes: int = 256,
     seed: int = 0,
     device: torch.device | str = "cpu",
-    memory: int = 1,
     quiet: bool = True,
 ) -> dict[str, ReturnSummary]:
     """The same policy from the same starts in each dynamics.
@@ -117,7 +116,6 @@ def transfer(
         slow_episodes: the first so many of them on dm_control, which steps row by row.
         seed: of the starts.
         device: where all envs live.
-        memory: how many observations the policy sees, see `remember`.
         quiet: no progress bar, as by default.
 
     Returns:
@@ -130,7 +128,7 @@ def transfer(
     for name in tqdm(names, "dynamics", disable=quiet):
         rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
         env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
-        returns[name] = policy_returns(remember(env, memory), actor)
+        returns[name] = policy_returns(remember(env, memory_of(actor)), actor)
     return {name: summarize(value, returns[TRUTH]) for name, value in returns.items()}
 
 
@@ -140,7 +138,6 @@ def hardest_episode(
     actor: Actor,
     dynamics: Sequence[str | Path],
     seed: int = 0,
-    memory: int = 1,
 ) -> dict[str, TensorDictBase]:
     """What the policy does in each dynamics from the start that earns least, of 64.
 
@@ -151,7 +148,7 @@ def hardest_episode(
     episodes, row = {}, 0
     for name in dict.fromkeys(map(str, dynamics)):
         env = make_env(task, dynamics=name, num_envs=64, seed=seed)
-        env = remember(env, memory)
+        env = remember(env, memory_of(actor))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             steps = env.rollout(env.task.horizon, actor, break_when_any_done=False)[
                 "next"

@@ -39,6 +39,5 @@ def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, D
         )
     policy = load_policy(folder, task)
     digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:16]
-    actor, memory = make_actor(policy), policy.memory
-    draw = partial(policy_data, task, actor, noise=noise, memory=memory)
+    draw = partial(policy_data, task, make_actor(policy), noise=noise)
     return f"policy {digest} with noise {noise:g}", draw
