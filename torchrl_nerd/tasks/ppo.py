@@ -51,7 +51,8 @@ PPO_CONFIGS: dict[str, PPOConfig] = {
     "ant/spin": _ANT,
     "ant/spin_track": _ANT,
     "franka/reach": _FRANKA,
-    "franka/reach_torque": replace(_FRANKA, std=0.3),  # of the torque that it can give
+    # std: of the torque that it can give; to brake in time by torque takes a wider policy
+    "franka/reach_torque": replace(_FRANKA, std=0.3, widths=(128, 128)),
     "anymal/forward": _ANYMAL,
     "anymal/sideways": _ANYMAL,
 }
