@@ -22,6 +22,7 @@ from torchrl_nerd.keys import (
     CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
+    JOINT_TORQUE,
     QPOS,
     QVEL,
     TERRAIN,
@@ -38,8 +39,8 @@ touching_scene = pytest.mark.parametrize("scene", TOUCHING.values(), ids=TOUCHIN
 def contact_features(scene, rows):
     """Features of points in float64, by key, ``(rows, points, -1)``."""
     transform, count = ContactFeatures(scene), len(scene.contacts)
-    terrain = rows.get(TERRAIN, None)
-    values = transform.contact_features(rows[QPOS], rows[QVEL], terrain)
+    ground, torque = rows.get(TERRAIN, None), rows.get(JOINT_TORQUE, None)
+    values = transform.contact_features(rows[QPOS], rows[QVEL], ground, torque)
     found = dict(zip(transform.out_keys, values, strict=True))
     found.pop(CONTACT_FORCE, None)  # of joints, see test_ground_force.py
     return {key: value.unflatten(-1, (count, -1)) for key, value in found.items()}
