@@ -17,8 +17,7 @@ class ResidualConfig:
 
     def build(self, num_inputs: int, num_outputs: int) -> "Correction":
         """A network that corrects nothing yet."""
-        size = MLPConfig(self.depth, self.width)
-        return Correction(size, num_inputs, num_outputs)
+        return Correction(self, num_inputs, num_outputs)
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,7 @@ class FreeConfig:
 
     def build(self, num_inputs: int, num_outputs: int) -> "Correction":
         """A network that corrects nothing yet."""
-        size = MLPConfig(self.depth, self.width)
-        return Correction(size, num_inputs, num_outputs)
+        return Correction(self, num_inputs, num_outputs)
 
 
 class Correction(nn.Module):
@@ -40,14 +38,17 @@ class Correction(nn.Module):
     The simulator's change stands before that last entry, how much there is to correct.
 
     Args:
-        size: of the MLP.
+        config: depth and width of the MLP.
         num_inputs: width F of what a network sees without a simulator.
         num_outputs: width D of changes.
     """
 
-    def __init__(self, size: MLPConfig, num_inputs: int, num_outputs: int) -> None:
+    def __init__(
+        self, config: ResidualConfig | FreeConfig, num_inputs: int, num_outputs: int
+    ) -> None:
         super().__init__()
         self.num_outputs = num_outputs
+        size = MLPConfig(config.depth, config.width)
         self.mlp = MLP(size, num_inputs + num_outputs, num_outputs)  # not the gate
         last = [m for m in self.mlp.head.modules() if isinstance(m, nn.Linear)][-1]
         for weight in last.parameters():

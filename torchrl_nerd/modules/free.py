@@ -38,6 +38,8 @@ class FreeNeRD(NeRD):
         ValueError: another robot.
     """
 
+    has_simulator = True
+
     def __init__(
         self,
         scene: Scene,
@@ -46,11 +48,6 @@ class FreeNeRD(NeRD):
     ) -> None:
         super().__init__(scene, config, stats)
         self.free_step = FreeStep(scene)
-
-    @property
-    def token_size(self) -> int:
-        """As `NeRD`, with the change and its doubt."""
-        return self.tokens.size + self.state_delta.size + 1
 
     def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
         """The step's change and its doubt, ``(*batch, D + 1)``."""

@@ -94,6 +94,8 @@ class NeRD(nn.Module):
             unit variance where not given (a model whose weights are yet to be loaded).
     """
 
+    has_simulator = False  # within, whose change the network is shown, see `foresee`
+
     def __init__(
         self,
         scene: Scene,
@@ -133,22 +135,20 @@ class NeRD(nn.Module):
     ) -> Tensor:
         """The network's token ``(*batch, token_size)``, from a state's `features`."""
         token = self.coverage.clamp_token(features).to(self.dtype)
-        change = self.foresee(qpos, qvel, joint_torque)
-        if change is None:
+        if not self.has_simulator:
             return token
+        change = self.foresee(qpos, qvel, joint_torque)
         exact = torch.promote_types(self.dtype, torch.float32)
         return torch.cat((token.to(exact), change.to(exact)), -1)
 
-    def foresee(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor
-    ) -> Tensor | None:
-        """What a simulator within the model foresees ``(*batch, D + 1)``; here none."""
-        return None
+    def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
+        """The change that a simulator within foresees, and its gate ``(*batch, D + 1)``."""
+        raise NotImplementedError(f"{type(self).__name__} has no simulator within")
 
     @property
     def token_size(self) -> int:
         """Width of a token: the features, and what is foreseen."""
-        return self.tokens.size
+        return self.tokens.size + self.has_simulator * (self.state_delta.size + 1)
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor

@@ -32,6 +32,8 @@ class ResidualNeRD(NeRD):
         stats: as for `NeRD`.
     """
 
+    has_simulator = True
+
     def __init__(
         self,
         scene: Scene,
@@ -40,11 +42,6 @@ class ResidualNeRD(NeRD):
     ) -> None:
         super().__init__(scene, config, stats)
         self.simulator = PenaltyStep(scene, config.substeps)
-
-    @property
-    def token_size(self) -> int:
-        """As `NeRD`, with the change and its gate."""
-        return self.tokens.size + self.state_delta.size + 1
 
     def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
         """The simulator's change and how much of it is contact, ``(*batch, D + 1)``."""

@@ -101,12 +101,15 @@ class Sequences:
         device: torch.device,
         symmetry: Symmetry | None = None,
     ) -> None:
-        if symmetry is not None and model.token_size > model.tokens.size:
+        if symmetry is not None and model.has_simulator:
             raise ValueError(
                 "expected training without use_symmetry for a model with a simulator "
                 f"within, got {type(model).__name__} with it"
             )
-        self.tokens, self.targets = (x.to(device) for x in normalised(model, data))
+        tokens, targets = normalised(model, data)
+        if model.has_simulator:
+            tokens = torch.cat((tokens, foreseen(model, data)), -1)
+        self.tokens, self.targets = tokens.to(device), targets.to(device)
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
         self.steps = data.batch_size[1]
@@ -177,30 +180,26 @@ def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
     return stats
 
 
-@torch.no_grad()
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
-    """Tokens and targets of transitions, normalised, float32 ``(*batch, D)``.
-
-    Not clamped to what the model covers: that is found from them.
-    """
+    """Features and targets of transitions, normalised, float32 ``(*batch, D)``."""
     tokens, targets = (
         torch.empty(*data.batch_size, size, device=data[QPOS].device)
-        for size in (model.token_size, model.state_delta.size)
+        for size in (model.tokens.size, model.state_delta.size)
     )
     for part, *places in zip(
         data.split(PART), tokens.split(PART), targets.split(PART), strict=True
     ):
         raw = raw_tokens(model.tokens, model.state_delta, part)
-        token, target = (
-            model.normalize.normalize(key, value)
-            for key, value in zip((TOKEN, TARGET), raw, strict=True)
-        )
-        places[0][..., : model.tokens.size] = token
-        foreseen = model.foresee(part[QPOS], part[QVEL], part[JOINT_TORQUE])
-        if foreseen is not None:
-            places[0][..., model.tokens.size :] = foreseen
-        places[1].copy_(target)
+        for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
+            place.copy_(model.normalize.normalize(key, value))
     return tokens, targets
+
+
+@torch.no_grad()
+def foreseen(model: NeRD, data: TensorDict) -> Tensor:
+    """What the simulator within foresees of transitions, float32 ``(*batch, D + 1)``."""
+    inputs = ((part[QPOS], part[QVEL], part[JOINT_TORQUE]) for part in data.split(PART))
+    return torch.cat([model.foresee(*given).float() for given in inputs])
 
 
 def cover(
