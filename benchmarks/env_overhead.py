@@ -16,10 +16,10 @@ from statistics import median
 import torch
 import tyro
 
-from torchrl_nerd import make_env
-from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd import NeRDEnv
 from torchrl_nerd.files import write_json
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.tasks import make_task
 
 
 @dataclass
@@ -52,9 +52,7 @@ def step_times(
     task: str, model: NeRD | None, rows: int, steps: int
 ) -> dict[str, float]:
     """Median seconds of a step and of its dynamics, and the shares of the rest."""
-    env = make_env(task, num_envs=rows)
-    if model is not None:
-        env.dynamics = NeRDDynamics(model)
+    env = NeRDEnv(task, model, num_envs=rows)
     dynamics, own = timed(env.dynamics, "step"), timed(env, "_step")
     contact = env.dynamics.model.tokens.contact  # pyright: ignore
     looks = [
@@ -82,7 +80,7 @@ def main(options: Options) -> None:
     """Print a row for the shipped model and for each streaming preset."""
     if options.threads:
         torch.set_num_threads(options.threads)
-    scene = make_env(options.task).scene
+    scene = make_task(options.task).scene
     models = {"shipped": None}
     models |= {name: NeRD(scene, NETWORKS[name]) for name in ("tiny", "small", "paper")}
     figures = {}

@@ -44,6 +44,7 @@ class Run(PPOConfig):
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # where: nerd, mujoco, dm_control, a checkpoint folder
+    compile: bool = False  # steps in NeRD: a minute at the start, several times faster
     seed: int = 0  # of weights, exploration and starts
     evaluate_every: int = 20  # updates between two points of the learning curve
     episodes: int = 2048  # of the final evaluation
@@ -125,7 +126,7 @@ def train(
 ) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
     task = task or cfg.task
-    env = make_env(task, dynamics=cfg.dynamics, num_envs=cfg.num_envs, seed=cfg.seed)
+    env = make_env(task, cfg.dynamics, cfg.num_envs, seed=cfg.seed, compile=cfg.compile)
     env = remember(env, cfg.memory)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)

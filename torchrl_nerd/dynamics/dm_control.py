@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
@@ -57,6 +58,7 @@ class DMControlDynamics:
             if rows is None or rows[row]:
                 physics.reset()
 
+    @uncompiled
     def step(
         self,
         state: TensorDictBase,

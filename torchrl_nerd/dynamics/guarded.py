@@ -90,7 +90,7 @@ class GuardedDynamics:
         assert distance is not None  # for the type checker: it was asked for
         trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
         rows = trust < self.least_trust
-        if rows.any() and self.guard == "raise":
+        if self.guard == "raise" and rows.any():
             worst = float(trust.min())
             raise UntrustedError(
                 f"expected inputs like those of training, got {int(rows.sum())} of "

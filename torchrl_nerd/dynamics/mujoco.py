@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.quiet import quiet_mujoco
@@ -94,6 +95,7 @@ class MujocoDynamics:
         else:
             self._warmstart[rows.cpu().numpy()] = 0.0
 
+    @uncompiled
     def step(
         self,
         state: TensorDictBase,

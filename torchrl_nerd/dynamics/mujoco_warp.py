@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.dynamics.mujoco import feels_forces
 from torchrl_nerd.dynamics.warp_setup import (
@@ -101,6 +102,7 @@ class MujocoWarpDynamics:
             self._view("qacc_warmstart")[every] = 0.0
 
     @torch.no_grad()
+    @uncompiled
     def step(
         self,
         state: TensorDictBase,

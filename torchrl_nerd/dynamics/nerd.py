@@ -1,15 +1,12 @@
 """The learned stand-in for the solver; everything round it is shared with the truth."""
 
-import warnings
-from collections.abc import Callable
 from typing import Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch._dynamo.exc import BackendCompilerFailed
-from torch._inductor.exc import InductorError
 
+from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import Memory, NeRD, Network
@@ -60,11 +57,7 @@ class NeRDDynamics:
         self.network: Network = network
         self._memory: Memory | None = None
         self._rows = 0
-        self._compiled: Callable | None = None
-
-    def __getstate__(self) -> dict:
-        """Compiled code does not travel: a copy in another process compiles its own."""
-        return {**self.__dict__, "_compiled": None}
+        self._compiled = Compiled(self._predict)
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""
@@ -102,7 +95,7 @@ class NeRDDynamics:
         if self._memory is None or self._rows != len(qpos):
             self._rows = len(qpos)
             self._memory = self.network.empty_memory(self._rows)
-        predict = self._run_compiled if self.compile else self._predict
+        predict = self._compiled if self.compile else self._predict
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel, distance = predict(
                 qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
@@ -129,17 +122,3 @@ class NeRDDynamics:
         output = self.network.step(token, memory)
         distance = self.model.coverage.distance(features) if is_scored else None
         return *self.model.decode(qpos, qvel, output), distance
-
-    def _run_compiled(
-        self, *inputs: Tensor | Memory | None | bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """`_predict` through the compiler; eager for good where there is none."""
-        if self._compiled is None:
-            self._compiled = torch.compile(self._predict)
-        try:
-            return self._compiled(*inputs)
-        except (BackendCompilerFailed, InductorError) as error:
-            reason = str(error).strip().splitlines()[0]
-            warnings.warn(f"cannot compile, running eagerly: {reason}", stacklevel=3)
-            self.compile, self._compiled = False, None
-            return self._predict(*inputs)  # pyright: ignore

@@ -9,17 +9,17 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
-from torchrl_nerd.envs.faults import REASONS, FaultRecorder, find_faults
+from torchrl_nerd.envs.faults import REASONS, FaultRecorder
 from torchrl_nerd.envs.streams import row_uniforms
+from torchrl_nerd.envs.transition import Transition
 from torchrl_nerd.keys import (
     ACTION,
     FAULT,
     OBSERVATION,
     QPOS,
     QVEL,
-    SENSORDATA,
-    TERRAIN,
     TRUST,
 )
 from torchrl_nerd.tasks import Task
@@ -76,9 +76,8 @@ class SceneEnv(EnvBase):
             )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
-        is_guarded = isinstance(dynamics, GuardedDynamics)
-        self.guard = dynamics.guard if is_guarded else None
-        self._least_trust = dynamics.least_trust if is_guarded else 0.0
+        self.guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
+        self.eager()
         self.recorder: FaultRecorder | None = None
         if fault_folder is not None:
             name = type(dynamics).__name__
@@ -91,6 +90,29 @@ class SceneEnv(EnvBase):
             value = torch.zeros(num_envs, size, dtype=torch.float64, device=self.device)
             self.register_buffer(f"_state_{key}", value)
         self._set_seed(seed)
+
+    def compile(self, *, warmup: int | None = None, **kwargs: Any) -> "SceneEnv":
+        """Make one compiled piece of a step, and one of a reset; returns the env itself.
+
+        TorchRL calls it for ``compile=`` in a constructor; its own goes through the
+        bookkeeping too, in many pieces, and leaves `step` as it is. Without a compiler,
+        eager with one warning. `eager` undoes it.
+
+        Args:
+            warmup: eager steps before the first compiled one; 1 where not given.
+            kwargs: of `torch.compile`.
+        """
+        transition = Transition(self.task, self.dynamics)
+        options = {"warmup": 1 if warmup is None else warmup, **kwargs}
+        self._transit = Compiled(transition.step, **options)
+        self._restart = Compiled(transition.restart, **options)
+        return self
+
+    def eager(self) -> "SceneEnv":
+        """Step without a compiler; returns the env itself."""
+        transition = Transition(self.task, self.dynamics)
+        self._transit, self._restart = transition.step, transition.restart
+        return self
 
     @property
     def _state_sizes(self) -> dict[str, int]:
@@ -142,23 +164,16 @@ class SceneEnv(EnvBase):
     def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
         """Restore states and episode counts; the history of every row starts empty."""
         result = super().load_state_dict(state_dict, *args, **kwargs)
-        self.dynamics.reset(self._state())
+        self.dynamics.reset(self.state)
         return result
 
     @property
     def state(self) -> TensorDict:
         """Current ``qpos``, ``qvel`` and task parameters; a copy."""
-        return self._state().clone()
+        return TensorDict(self._state(), self.batch_size, self.device).clone()
 
-    def _state(self) -> TensorDict:
-        values = {key: getattr(self, f"_state_{key}") for key in self._state_sizes}
-        return TensorDict._new_unsafe(
-            values, batch_size=self.batch_size, device=self.device
-        )
-
-    def _set(self, values: dict[str, Tensor]) -> None:
-        for key, value in values.items():
-            setattr(self, f"_state_{key}", value)
+    def _state(self) -> dict[str, Tensor]:
+        return {key: getattr(self, f"_state_{key}") for key in self._state_sizes}
 
     def _reset(
         self,
@@ -169,21 +184,17 @@ class SceneEnv(EnvBase):
         rows = None if tensordict is None else tensordict.get("_reset", None)
         every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         rows = every if rows is None else rows.reshape(self.batch_size)
-        u = row_uniforms(self.seed, self._episode, self.task.num_uniforms)
-        fresh = self.task.initial_state(u)
-        if set_state:
-            fresh |= self._given_state(tensordict, rows)
+        given = self._given_state(tensordict, rows) if set_state else {}
         old = self._state()
         if rows.all():  # nothing of the past is left: no gradients of it either
-            old = old.detach()
-        self._set({k: torch.where(rows[:, None], fresh[k], old[k]) for k in fresh})
+            old = {key: value.detach() for key, value in old.items()}
+        u = row_uniforms(self.seed, self._episode, self.task.num_uniforms)
+        found = self._restart(old, rows, u, given)
         self._episode = self._episode + rows
         self._age = self._age.masked_fill(rows, 0)
-        state = self._state()
-        self.dynamics.reset(state, rows)
-        torque = state.get(QPOS).new_zeros(*self.batch_size, len(self.scene.actuated))
-        trust = torch.ones(*self.batch_size, 1, device=self.device)
-        return self._output(state, torque, torch.zeros_like(trust).long(), trust)
+        result = self._hand_out(found)
+        self.dynamics.reset(result, rows)
+        return result
 
     def _given_state(
         self, tensordict: TensorDictBase | None, rows: Tensor
@@ -216,54 +227,19 @@ class SceneEnv(EnvBase):
                 f"got {tuple(action.shape)}"
             )
         state = self._state()
-        given = torch.where(torch.all(action.isfinite(), -1, keepdim=True), action, 0.0)
-        moved, torque = self._control_step(state, given, state)
-        trust = moved.get(TRUST, None)
-        for _ in range(self.task.steps_per_action - 1):
-            moved, torque = self._control_step(moved, given, state)
-            trust = None if trust is None else torch.minimum(trust, moved[TRUST])
-        fault = find_faults(action, moved)
+        found = self._transit(state, action, self._age)
         if self.recorder is not None:
-            self.recorder.record(state, action, torque, fault)
-        next_values = {
-            key: torch.where(fault == 0, moved[key], state[key]) for key in (QPOS, QVEL)
-        }
-        self._set(next_values)
+            self.recorder.record(state, action, found["joint_torque"], found[FAULT])
         self._age = self._age + 1
-        next_state = self._state().set(ACTION, given)
-        if SENSORDATA in moved.keys():
-            next_state[SENSORDATA] = torch.where(fault == 0, moved[SENSORDATA], 0.0)
-        reward = self.task.reward(state, given, next_state)
-        terminated = self.task.terminated(next_state)[:, None] | (fault > 0)
-        truncated = (self._age >= self.task.horizon)[:, None]
-        if self.guard == "truncate" and trust is not None:
-            truncated = truncated | (trust < self._least_trust)
-        return self._output(next_state, torque, fault, trust).update(
-            {
-                "reward": reward[:, None].to(torch.float32),
-                "done": terminated | truncated,
-                "terminated": terminated,
-                "truncated": truncated,
-            }
-        )
+        return self._hand_out(found)
 
-    def _control_step(
-        self, moving: TensorDictBase, action: Tensor, row: TensorDict
-    ) -> tuple[TensorDictBase, Tensor]:
-        """The state one control step later, and the torque that took it there."""
-        torque = self.task.controller(action, moving[QPOS], moving[QVEL])
-        return self.dynamics.step(moving, torque, row.get(TERRAIN, None)), torque
-
-    def _output(
-        self, state: TensorDict, torque: Tensor, fault: Tensor, trust: Tensor | None
-    ) -> TensorDict:
-        """A tensordict that shares no memory with the env."""
-        values = {key: state[key].clone() for key in self._state_sizes}
-        values[FAULT] = fault
-        if self.guard and trust is not None:
-            values[TRUST] = trust
-        values[OBSERVATION] = self.task.observation(state).to(torch.float32)
-        values["joint_torque"] = torque
+    def _hand_out(self, found: dict[str, Tensor]) -> TensorDict:
+        """Keep the state and hand out all, in a tensordict that shares no memory."""
+        for key in self._state_sizes:
+            setattr(self, f"_state_{key}", found[key])
+            found[key] = found[key].clone()
+        if not self.guard:
+            found.pop(TRUST, None)
         return TensorDict._new_unsafe(
-            values, batch_size=self.batch_size, device=self.device
+            found, batch_size=self.batch_size, device=self.device
         )

@@ -6,6 +6,7 @@ the last states, torques, actions and the ground of one such row.
 """
 
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -62,7 +63,7 @@ class FaultRecorder:
         self._written: set[int] = set()
 
     def record(
-        self, state: TensorDictBase, action: Tensor, torque: Tensor, fault: Tensor
+        self, state: Mapping[str, Tensor], action: Tensor, torque: Tensor, fault: Tensor
     ) -> list[Path]:
         """Remember a step; write what it broke for the first time.
 

@@ -40,7 +40,8 @@ def make_env(
         guard: what to do with steps that the model was not trained for, see
             `GuardedDynamics`; true dynamics have nothing to guard against.
         fault_folder: where the first fault of each kind leaves a dump for `nerd replay`.
-        compile: run learned dynamics through `torch.compile`; true ones are compiled.
+        compile: make one compiled piece of controller, learned dynamics, reward and
+            observation, see `SceneEnv.compile`; true dynamics stay as they are.
         differentiable: record gradients through every step of learned dynamics.
 
     Raises:
@@ -60,14 +61,14 @@ def make_env(
             f"unknown dynamics '{dynamics}', expected nerd, "
             f"{', '.join(GROUND_TRUTH)} or a checkpoint folder"
         )
-    return NeRDEnv(
+    env = NeRDEnv(
         task,
         model,
         num_envs,
         seed,
         device,
-        compile=compile,
         guard=guard,
         fault_folder=fault_folder,
         differentiable=differentiable,
     )
+    return env.compile() if compile else env

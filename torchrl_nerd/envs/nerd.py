@@ -22,12 +22,13 @@ class NeRDEnv(SceneEnv):
         seed: of the resets.
         device: where the model and all tensors live.
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
-        compile: run through `torch.compile`.
         guard: what to do with steps far from the training data, see `GuardedDynamics`;
             None steps all alike.
         fault_folder: see `SceneEnv`.
         differentiable: record gradients through every step, to actions and states, and to
             the weights where they ask for them.
+
+    TorchRL's ``compile=True`` makes each step one compiled piece, see `SceneEnv.compile`.
 
     Examples:
         >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
@@ -43,7 +44,6 @@ class NeRDEnv(SceneEnv):
         seed: int = 0,
         device: torch.device | str = "cpu",
         inference: Inference = "streaming",
-        compile: bool = False,
         guard: Guard | None = None,
         fault_folder: Path | None = None,
         differentiable: bool = False,
@@ -54,7 +54,6 @@ class NeRDEnv(SceneEnv):
         learned = NeRDDynamics(
             model.to(device),
             inference=inference,
-            compile=compile,
             differentiable=differentiable,
         )
         dynamics = learned if guard is None else GuardedDynamics(learned, guard)

@@ -61,4 +61,4 @@ class StatelessEnv(EnvBase):
     def _is_here(self, given: TensorDictBase) -> bool:
         """Whether the env stands where ``given`` does."""
         state = self.env._state()
-        return all(torch.equal(given[key], state[key]) for key in state.keys())
+        return all(torch.equal(given[key], value) for key, value in state.items())

@@ -3,7 +3,8 @@
 Row i of episode k gets the same numbers whatever the number of rows, whichever rows are
 reset beside it, and on every device: each number is a hash of (seed, row, episode, index).
 The hash is SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number
-generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195).
+generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). It stays out of compiled
+code, where integers that overflow are not kept modulo 2^64 (torch 2.13 on a CPU).
 """
 
 import torch

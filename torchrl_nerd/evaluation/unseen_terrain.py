@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchrl_nerd.evaluation.protocols import Protocol
 from torchrl_nerd.keys import TERRAIN
-from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.double_pendulum import double_pendulum_over
 from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
 
@@ -33,12 +32,7 @@ class DoublePendulumOver(DoublePendulumPassive):
 
     def __init__(self, add_ground: Callable[[mujoco.MjSpec], None]) -> None:
         super().__init__(ground=0)
-        self._scene = double_pendulum_over(add_ground)
-
-    @property
-    def scene(self) -> Scene:
-        """The pendulum and its ground."""
-        return self._scene
+        self.scene = double_pendulum_over(add_ground)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """As over planes, without a row's ground."""

@@ -179,7 +179,7 @@ class Scene:
     @cached_property
     def down(self) -> tuple[float, float, float]:
         """Unit vector of gravity in the world; where there is none, against z."""
-        x, y, z = unit_gravity(self.model)
+        x, y, z = unit_gravity(self.model).tolist()
         return x, y, z
 
     @cached_property

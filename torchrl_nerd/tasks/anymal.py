@@ -1,5 +1,6 @@
 """ANYmal walks forward or sideways at 1 m/s. Paper, appendix B."""
 
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -75,11 +76,16 @@ class Anymal(Task):
 
     def terminated(self, next_state: State) -> Tensor:
         """Too low, or base or knees at the ground."""
-        qpos, model = next_state[QPOS], self.scene.model
-        names = (model.body(body).name for body in self.scene.contacts.bodies)
-        points = [i for i, name in enumerate(names) if not name.endswith("SHANK")]
-        clearance = self.scene.clearances(qpos)[..., points].amin(-1)
+        qpos = next_state[QPOS]
+        clearance = self.scene.clearances(qpos)[..., self._upper_points].amin(-1)
         return (qpos[..., 2] < MIN_HEIGHT) | (clearance < MIN_CLEARANCE)
+
+    @cached_property
+    def _upper_points(self) -> list[int]:
+        """Contact points of base and knees."""
+        model, bodies = self.scene.model, self.scene.contacts.bodies
+        names = [model.body(body).name for body in bodies]
+        return [i for i, name in enumerate(names) if not name.endswith("SHANK")]
 
 
 class AnymalForward(Anymal):

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.scenes.actuators import ActuatorController
 from torchrl_nerd.tasks.suite_judge import SuiteJudge
@@ -105,6 +106,7 @@ class _RowMemo:
         return self._answers
 
 
+@uncompiled
 def _on_rows(function: _RowMemo, rows: Tensor) -> Tensor:
     """A function of NumPy rows ``(n, k)``, of float64 tensors ``(*batch, k)``."""
     flat = rows.double().flatten(0, -2).cpu().contiguous().numpy().copy()

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from functools import cached_property
 
 from torch import Tensor
 
@@ -34,7 +35,7 @@ class Task(ABC):
     steps_per_action: int = 1
     parameters: Mapping[str, int] = {}
 
-    @property
+    @cached_property
     def scene(self) -> Scene:
         """The robot and its ground."""
         return load_scene(self.scene_name)

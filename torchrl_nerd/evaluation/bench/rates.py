@@ -1,5 +1,6 @@
 """Control steps per second, all contenders in turn, so that noise hits all alike."""
 
+import copy
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
 
-from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.envs import make_env
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.bench.contenders import Contender
 from torchrl_nerd.evaluation.bench.cost import Cost
 from torchrl_nerd.evaluation.rollout_error import Source, initial_states, scene_of
@@ -168,8 +169,11 @@ def _stepper(
 def _env_stepper(
     contender: Contender, task: Task, batch: int, seed: int, device: torch.device | str
 ) -> Callable[[int], None]:
-    env = make_env(task, dynamics="mujoco", num_envs=batch, seed=seed, device=device)
-    env.dynamics = contender.make(task.scene)
+    dynamics, there = contender.make(task.scene), copy.copy(task)
+    there.scene = dynamics.scene  # of as many substeps
+    env = SceneEnv(there, dynamics, batch, seed, device)
+    if isinstance(dynamics, NeRDDynamics) and dynamics.compile:
+        env.compile()
     collected: dict[int, Collector] = {}
 
     def run(steps: int) -> None:

@@ -1,0 +1,117 @@
+"""What an action makes of a state: controller, physics, faults, reward, end, observation.
+
+Functions of tensors with one memory, the history that the dynamics keeps, so that the whole
+of a control step can be compiled into one piece.
+"""
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
+from torchrl_nerd.envs.faults import find_faults
+from torchrl_nerd.keys import (
+    ACTION,
+    FAULT,
+    OBSERVATION,
+    QPOS,
+    QVEL,
+    SENSORDATA,
+    TERRAIN,
+    TRUST,
+)
+from torchrl_nerd.tasks import Task
+
+Tensors = dict[str, Tensor]
+
+
+class Transition:
+    """A task in a dynamics, from one state to the next.
+
+    Args:
+        task: controller, observation, reward, end, starts.
+        dynamics: what steps the state; guarded by ``"truncate"`` it also ends episodes.
+    """
+
+    def __init__(self, task: Task, dynamics: Dynamics) -> None:
+        self.task, self.dynamics = task, dynamics
+        self.least_trust = 0.0  # no trust is below it
+        if isinstance(dynamics, GuardedDynamics) and dynamics.guard == "truncate":
+            self.least_trust = dynamics.least_trust
+
+    def step(self, state: Tensors, action: Tensor, age: Tensor) -> Tensors:
+        """All that one action leads to; a row at fault keeps its state and ends.
+
+        Args:
+            state: ``qpos``, ``qvel`` and the task's parameters, ``(num_envs, size)``.
+            action: ``(num_envs, num_actions)``.
+            age: ``(num_envs,)`` actions before this one.
+
+        Returns:
+            The next state and what an env hands out beside it: ``joint_torque``,
+            ``observation``, ``reward``, ``fault``, the flags, and ``trust`` where the
+            dynamics has one.
+        """
+        given = torch.where(torch.all(action.isfinite(), -1, keepdim=True), action, 0.0)
+        start = TensorDict(state, batch_size=action.shape[:1], device=action.device)
+        moved, torque = self._control_step(start, given, state.get(TERRAIN))
+        trust = moved.get(TRUST, None)
+        for _ in range(self.task.steps_per_action - 1):
+            torch._dynamo.graph_break()  # two steps in one piece take minutes to compile
+            moved, torque = self._control_step(moved, given, state.get(TERRAIN))
+            trust = None if trust is None else torch.minimum(trust, moved[TRUST])
+        fault = find_faults(action, moved)
+        is_good = fault == 0
+        after = dict(state)
+        for key in (QPOS, QVEL):
+            after[key] = torch.where(is_good, moved[key], state[key])
+        felt = {}
+        if SENSORDATA in moved.keys():
+            felt[SENSORDATA] = torch.where(is_good, moved[SENSORDATA], 0.0)
+        shown = after | felt | {ACTION: given}
+        terminated = self.task.terminated(shown)[:, None] | ~is_good
+        truncated = (age + 1 >= self.task.horizon)[:, None]
+        if trust is not None:
+            truncated = truncated | (trust < self.least_trust)
+            after[TRUST] = trust
+        reward = self.task.reward(state, given, shown)[:, None]
+        return after | {
+            "joint_torque": torque,
+            FAULT: fault,
+            OBSERVATION: self.task.observation(shown).to(torch.float32),
+            "reward": reward.to(torch.float32),
+            "done": terminated | truncated,
+            "terminated": terminated,
+            "truncated": truncated,
+        }
+
+    def _control_step(
+        self, moving: TensorDictBase, action: Tensor, terrain: Tensor | None
+    ) -> tuple[TensorDictBase, Tensor]:
+        """The state one control step later, and the torque that took it there."""
+        torque = self.task.controller(action, moving[QPOS], moving[QVEL])
+        return self.dynamics.step(moving, torque, terrain), torque
+
+    def restart(
+        self, state: Tensors, rows: Tensor, u: Tensor, given: Tensors
+    ) -> Tensors:
+        """New episodes for some rows; the others stay bitwise as they are.
+
+        Args:
+            state: as in `step`.
+            rows: ``(num_envs,)`` bool: which.
+            u: ``(num_envs, task.num_uniforms)`` in [0, 1).
+            given: what of a start is not left to chance.
+
+        Returns:
+            As `step`, without reward and flags: zero torque, no fault, full trust.
+        """
+        fresh = self.task.initial_state(u) | given
+        start = {k: torch.where(rows[:, None], fresh[k], state[k]) for k in state}
+        column, num_torques = rows[:, None], len(self.task.scene.actuated)
+        return start | {
+            "joint_torque": start[QPOS].new_zeros(len(rows), num_torques),
+            FAULT: torch.zeros_like(column, dtype=torch.long),
+            TRUST: torch.ones_like(column, dtype=torch.float32),
+            OBSERVATION: self.task.observation(start).to(torch.float32),
+        }
