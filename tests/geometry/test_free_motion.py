@@ -37,7 +37,7 @@ SUPPORTED.append(make_scene(floating))
 def free_acceleration(scene, rows, period=0.0, torque=None):
     model = scene.model
     axes = JointAxes.of(model, scene.base)
-    motion = FreeMotion(model, scene.base, axes)
+    motion = FreeMotion(model, scene.base, axes, list(range(model.nv)))
     bodies = axes.bodies + motion.bodies
     positions = np.concatenate((axes.positions, motion.positions))
     points, _ = PointKinematics(model, scene.base, bodies, positions)(

@@ -56,6 +56,7 @@ class FreeMotion(nn.Module):
         model: compiled.
         base: of the robot.
         axes: its joints.
+        actuated: dofs that motors drive.
     """
 
     mass: Tensor
@@ -68,8 +69,11 @@ class FreeMotion(nn.Module):
     armature: Tensor
     is_slide: Tensor
 
-    def __init__(self, model: mujoco.MjModel, base: Base, axes: JointAxes) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, base: Base, axes: JointAxes, actuated: list[int]
+    ) -> None:
         super().__init__()
+        self.actuated = actuated
         has_mass = (model.body_weldid != 0) & (model.body_mass > 0.0)
         found = np.flatnonzero(has_mass).tolist()
         self.bodies = [body for body in found for _ in CORNERS]
@@ -99,7 +103,7 @@ class FreeMotion(nn.Module):
         self,
         qpos: Tensor,
         qvel: Tensor,
-        torque: Tensor | None,
+        joint_torque: Tensor | None,
         rotation: Tensor,
         corners: Tensor,
         places: Tensor,
@@ -110,7 +114,7 @@ class FreeMotion(nn.Module):
         Args:
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
-            torque: of the motors on every dof, ``(*batch, nv)``; None for a robot let go.
+            joint_torque: ``(*batch, num_actuated)``; None for a robot let go.
             rotation: of the base, ``(*batch, 3, 3)``.
             corners: where ``positions`` are, ``(*batch, 4 B, 3)``, m, in B_t.
             places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m, in B_t.
@@ -133,8 +137,10 @@ class FreeMotion(nn.Module):
         gravity = _rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
         push = -self._bias(bodies, spin, slide, rate, gravity)
         push = push - self.damping[:, None] * rate
-        if torque is not None:
-            push = push + _rows_last(torque, 1)
+        if joint_torque is not None:
+            driven = torch.zeros_like(rate)
+            driven[self.actuated] = _rows_last(joint_torque, 1)
+            push = push + driven
         stretch = self.rest[:, None] - position[self.qpos_addresses]
         stretch = self.stiffness[:, None] * stretch
         push = torch.cat((push[: self.num_whole], push[self.num_whole :] + stretch))

@@ -49,8 +49,8 @@ class FreeStep(nn.Module):
         lag = torch.tensor(0.0 if is_exact else model.opt.timestep, dtype=torch.float64)
         self.register_buffer("lag", lag)
         axes = JointAxes.of(model, scene.base)
-        self.actuated, self.num_places = scene.actuated, len(axes.bodies)
-        self.motion = FreeMotion(model, scene.base, axes)
+        self.num_places = len(axes.bodies)
+        self.motion = FreeMotion(model, scene.base, axes, scene.actuated)
         bodies = axes.bodies + self.motion.bodies
         positions = np.concatenate((axes.positions, self.motion.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
@@ -74,13 +74,11 @@ class FreeStep(nn.Module):
             velocities, ``(*batch, nv)``; how far the step begins or ends beyond a limit,
             which it does not see, ``(*batch, 1)``, m or rad.
         """
-        torque = torch.zeros_like(qvel)
-        torque[..., self.actuated] = joint_torque
         ahead = 0.5 * (self.period - self.lag)
-        start = self._acceleration(qpos, qvel, torque, 2.0 * ahead)
+        start = self._acceleration(qpos, qvel, joint_torque, 2.0 * ahead)
         speed = qvel + ahead * start
         place = qpos + ahead * (qvel + 0.5 * (ahead + self.lag) * start)
-        gain = self._acceleration(place, speed, torque, 2.0 * self.lag)
+        gain = self._acceleration(place, speed, joint_torque, 2.0 * self.lag)
         gain = self.period * gain
         residual = 0.5 * self.lag * gain
         after = qpos + self.period * (qvel + 0.5 * gain) + residual
@@ -90,13 +88,13 @@ class FreeStep(nn.Module):
         return torch.cat((gain, residual), -1), gain - self.period * start, beyond
 
     def _acceleration(
-        self, qpos: Tensor, qvel: Tensor, torque: Tensor, period: Tensor
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, period: Tensor
     ) -> Tensor:
         points, _ = self.kinematics(qpos, qvel)
         count = points.shape[-2] - self.num_places
         places, corners = points.split((self.num_places, count), -2)
         rotation = self.rotation.expand(*qpos.shape[:-1], 3, 3)
-        return self.motion(qpos, qvel, torque, rotation, corners, places, period)
+        return self.motion(qpos, qvel, joint_torque, rotation, corners, places, period)
 
 
 def _expect_free(scene: Scene) -> None:

@@ -96,7 +96,7 @@ class ContactFeatures(FeatureTransform):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
-        self.actuated, self.step_size = scene.actuated, scene.control_step
+        self.step_size = scene.control_step
         if terrain is None:
             return
         points = scene.contacts
@@ -110,7 +110,8 @@ class ContactFeatures(FeatureTransform):
             if scene.foresees_forces:
                 self.force = GroundForce(scene, axes)
             if scene.foresees_free_motion:
-                self.free_motion = FreeMotion(scene.model, scene.base, axes)
+                robot = scene.model, scene.base, axes, scene.actuated
+                self.free_motion = FreeMotion(*robot)
                 bodies = bodies + self.free_motion.bodies
                 positions = np.concatenate((positions, self.free_motion.positions))
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
@@ -152,12 +153,8 @@ class ContactFeatures(FeatureTransform):
         sliding = velocity - speed[..., None] * normal
         gain = None
         if self.free_motion is not None:
-            torque = None
-            if joint_torque is not None:
-                torque = torch.zeros_like(qvel)
-                torque[..., self.actuated] = joint_torque
             where = pose[1], corners, places
-            gain = self.free_motion(qpos, qvel, torque, *where, self.step_size)
+            gain = self.free_motion(qpos, qvel, joint_torque, *where, self.step_size)
             gain = self.step_size * gain
         depth = self.radii - distance
         depth = gate * self.coming_depth(qpos, qvel, terrain, gain, depth, speed)
