@@ -24,7 +24,8 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.modules.free_step import FreeStep
+from torchrl_nerd.modules.correction import FreeConfig
+from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import make_task
@@ -46,9 +47,9 @@ warp_too = pytest.mark.parametrize(
 
 
 def is_free(scene: Scene) -> bool:
-    """Whether a `FreeStep` can move the robot."""
+    """Whether nothing but a `FreeStep` moves the robot."""
     try:
-        FreeStep(scene)
+        FreeNeRD(scene, FreeConfig())
     except ValueError:
         return False
     return True

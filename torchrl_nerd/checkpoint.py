@@ -85,6 +85,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
         "control_step": scene.control_step,
         "foresees_forces": scene.foresees_forces,
         "foresees_free_motion": scene.foresees_free_motion,
+        "flies": model.flight is not None,
         "network": {"kind": kind, **asdict(cast(Any, config))},
         "training_ranges": scene.sampling.ranges(),
         "versions": {
@@ -149,6 +150,8 @@ def read_checkpoint(
         try:
             _expect_room(config, tensors)
             model = make_model(scene, config)
+            if card.get("flies") is True:
+                model.fly()
         except ValueError as error:
             raise ValueError(
                 f"the network in {folder} cannot be built: {error}"

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.modules.nerd import Memory, NeRD, Network
+from torchrl_nerd.modules.nerd import TOKEN, Memory, NeRD, Network
 from torchrl_nerd.modules.window import WindowNetwork
 
 Inference = Literal["streaming", "window"]
@@ -117,8 +117,13 @@ class NeRDDynamics:
         is_scored: bool,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Next ``qpos`` and ``qvel``, the input's distance; advances ``memory``."""
-        features = self.model.features(qpos, qvel, torque, terrain)
-        token = self.model.assemble(features, qpos, qvel, torque)
-        output = self.network.step(token, memory)
-        distance = self.model.coverage.distance(features) if is_scored else None
-        return *self.model.decode(qpos, qvel, output), distance
+        model = self.model
+        raw = model.tokens(qpos, qvel, torque, terrain)
+        features = model.normalize.normalize(TOKEN, raw)
+        token = model.assemble(features, qpos, qvel, torque)
+        after = model.decode(qpos, qvel, self.network.step(token, memory))
+        if model.flight is not None:
+            gap = model.tokens.gap(raw)
+            after = model.flight((qpos, qvel), torque, terrain, gap, after)
+        distance = model.coverage.distance(features) if is_scored else None
+        return after[0], after[1], distance

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.modules.correction import FreeConfig
-from torchrl_nerd.modules.free_step import FreeStep
+from torchrl_nerd.modules.free_step import FreeStep, expect_none, untold_pushes
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Stats
@@ -30,7 +30,7 @@ class FreeNeRD(NeRD):
     error, that share goes into the change.
 
     Args:
-        scene: of a robot that `FreeStep` can move.
+        scene: of a fixed robot without a ground that `FreeStep` can move.
         config: of the network.
         stats: as for `NeRD`.
 
@@ -46,12 +46,16 @@ class FreeNeRD(NeRD):
         config: FreeConfig,
         stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
+        touched = {"a floating base": scene.base.is_floating}
+        touched["a ground"] = scene.terrain is not None
+        expect_none(scene, touched | untold_pushes(scene))
         super().__init__(scene, config, stats)
         self.free_step = FreeStep(scene)
 
     def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
         """The step's change and its doubt, ``(*batch, D + 1)``."""
-        change, second, beyond = self.free_step(qpos, qvel, joint_torque)
+        *after, second, beyond = self.free_step(qpos, qvel, joint_torque)
+        change = self.state_delta.delta(qpos, qvel, *after)
         second = second / self.normalize.std(TARGET)[: second.shape[-1]]
         doubt = second.square().mean(-1, keepdim=True).sqrt()
         doubt = (doubt + beyond / (beyond + HALF_GATE)).clamp_max(1.0)

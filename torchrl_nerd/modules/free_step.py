@@ -1,4 +1,4 @@
-"""A control step of a robot that nothing touches, from two looks at its free motion.
+"""A control step during which nothing touches a robot: two looks at its free motion.
 
 MuJoCo's semi-implicit Euler moves on by the accelerations at the starts of its n substeps.
 Their mean is, to second order, the acceleration at the mean of those times, (h - h/n) / 2.
@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.base import BasePose
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.contact_points import own_contacts
 from torchrl_nerd.scenes.scene import Scene
 
@@ -22,7 +24,7 @@ EXACT = (int(mujoco.mjtIntegrator.mjINT_RK4),)  # no first-order error of its su
 
 
 class FreeStep(nn.Module):
-    """The change of the state under given torques, in the numbers of `StateDelta`.
+    """The next state under given torques, if ground and limits do not push.
 
     | buffer | meaning |
     |---|---|
@@ -30,20 +32,20 @@ class FreeStep(nn.Module):
       a model: it is that of the truth it learned from |
 
     Args:
-        scene: a fixed robot of hinges and slides without ground and friction.
+        scene: a robot of hinges and slides, on a free base or a fixed one, without dry
+            friction.
 
     Raises:
         ValueError: in one sentence, another robot.
     """
 
     lag: Tensor
-    rotation: Tensor
     low: Tensor
     high: Tensor
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
-        _expect_free(scene)
+        expect_none(scene, untold_pushes(scene))
         model, self.period = scene.model, scene.control_step
         is_exact = model.opt.integrator in EXACT
         lag = torch.tensor(0.0 if is_exact else model.opt.timestep, dtype=torch.float64)
@@ -54,15 +56,17 @@ class FreeStep(nn.Module):
         bodies = axes.bodies + self.motion.bodies
         positions = np.concatenate((axes.positions, self.motion.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
-        ends = np.where(
-            model.jnt_limited != 0, model.jnt_range.T, [[-np.inf], [np.inf]]
-        )
-        keep_constants(self, rotation=scene.mount[1], low=ends[0], high=ends[1])
+        self.pose, self.layout = BasePose(scene.base, scene.mount), scene.layout
+        is_limited = model.jnt_limited[axes.joints] != 0
+        low, high = model.jnt_range[axes.joints].T
+        margin = model.jnt_margin[axes.joints]
+        low = np.where(is_limited, low + margin, -np.inf)
+        keep_constants(self, low=low, high=np.where(is_limited, high - margin, np.inf))
 
     def forward(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The change, and two signs of what it leaves out.
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The next state, and two signs of what it leaves out.
 
         Args:
             qpos: ``(*batch, nq)``.
@@ -70,22 +74,27 @@ class FreeStep(nn.Module):
             joint_torque: ``(*batch, num_actuated)``, held over the step.
 
         Returns:
-            The change ``(*batch, 2 nv)``; by how much the second look changed that of
-            velocities, ``(*batch, nv)``; how far the step begins or ends beyond a limit,
-            which it does not see, ``(*batch, 1)``, m or rad.
+            The next ``qpos`` and ``qvel``; by how much the second look changed velocities,
+            ``(*batch, nv)``; how far the step begins or ends beyond a limit, which it does
+            not see, ``(*batch, 1)``, m or rad.
         """
         ahead = 0.5 * (self.period - self.lag)
         start = self._acceleration(qpos, qvel, joint_torque, 2.0 * ahead)
         speed = qvel + ahead * start
-        place = qpos + ahead * (qvel + 0.5 * (ahead + self.lag) * start)
+        moved = ahead * (qvel + 0.5 * (ahead + self.lag) * start)
+        place = integrate_pos(self.layout, qpos, moved)
         gain = self._acceleration(place, speed, joint_torque, 2.0 * self.lag)
         gain = self.period * gain
-        residual = 0.5 * self.lag * gain
-        after = qpos + self.period * (qvel + 0.5 * gain) + residual
-        below = self.low - torch.minimum(qpos, after)
-        above = torch.maximum(qpos, after) - self.high
-        beyond = torch.maximum(below, above).amax(-1, keepdim=True).clamp_min(0.0)
-        return torch.cat((gain, residual), -1), gain - self.period * start, beyond
+        moved = self.period * (qvel + 0.5 * gain) + 0.5 * self.lag * gain
+        after = integrate_pos(self.layout, qpos, moved)
+        return after, qvel + gain, gain - self.period * start, self._beyond(qpos, after)
+
+    def _beyond(self, before: Tensor, after: Tensor) -> Tensor:
+        first, last = (x[..., self.motion.qpos_addresses] for x in (before, after))
+        below = self.low - torch.minimum(first, last)
+        above = torch.maximum(first, last) - self.high
+        none = torch.zeros_like(before[..., :1])  # a robot may have no joints
+        return torch.cat((none, below, above), -1).amax(-1, keepdim=True)
 
     def _acceleration(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, period: Tensor
@@ -93,22 +102,24 @@ class FreeStep(nn.Module):
         points, _ = self.kinematics(qpos, qvel)
         count = points.shape[-2] - self.num_places
         places, corners = points.split((self.num_places, count), -2)
-        rotation = self.rotation.expand(*qpos.shape[:-1], 3, 3)
+        _, rotation = self.pose(qpos)
         return self.motion(qpos, qvel, joint_torque, rotation, corners, places, period)
 
 
-def _expect_free(scene: Scene) -> None:
+def untold_pushes(scene: Scene) -> dict[str, bool]:
+    """What `FreeStep` cannot tell of what may push a robot that touches no ground."""
     model = scene.model
-    air = model.opt.density or model.opt.viscosity
-    there = {
-        "a floating base": scene.base.is_floating,
-        "a ground": scene.terrain is not None,
-        "dry friction": model.dof_frictionloss.any(),
-        "air or water": air,
-        "parts that touch each other": len(own_contacts(model)),
-        "gravity compensation": model.body_gravcomp.any(),
+    return {
+        "dry friction": bool(model.dof_frictionloss.any()),
+        "air or water": bool(model.opt.density or model.opt.viscosity),
+        "parts that touch each other": len(own_contacts(model)) > 0,
+        "gravity compensation": bool(model.body_gravcomp.any()),
     }
-    found = [what for what, is_there in there.items() if is_there]
+
+
+def expect_none(scene: Scene, pushes: dict[str, bool]) -> None:
+    """Raise ValueError, in one sentence, where something is there that pushes a robot."""
+    found = [what for what, is_there in pushes.items() if is_there]
     if found:
         raise ValueError(
             "expected a robot that motors, gravity, springs, damping and limits alone "

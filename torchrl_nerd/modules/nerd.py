@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.coverage import Coverage
+from torchrl_nerd.modules.flight import Flight
 from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.settings import SettingError
@@ -111,7 +112,17 @@ class NeRD(nn.Module):
             stats or {TOKEN: unit_stats(num_inputs), TARGET: unit_stats(num_outputs)}
         )
         self.coverage = Coverage(scene, num_inputs, num_outputs)
+        self.flight: Flight | None = None
         self.network = config.build(num_inputs, num_outputs)
+
+    def fly(self) -> "NeRD":
+        """Have rows that nothing pushes move along their free motion; returns itself.
+
+        Raises:
+            ValueError: a robot that `Flight` is not for.
+        """
+        self.flight = Flight(self.scene).to(self.device)
+        return self
 
     def encode(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
@@ -175,6 +186,8 @@ class NeRD(nn.Module):
         scene = scene.foreseeing(mine.foresees_forces, mine.foresees_free_motion)
         with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
             model = type(self)(scene, self.config)
+        if self.flight is not None:
+            model.fly()
         sizes, other = self.tokens.contact.sizes, model.tokens.contact.sizes
         if sizes != other:
             raise ValueError(
@@ -224,6 +237,16 @@ class SceneTokens(nn.Module):
         self.contact = ContactFeatures(scene)
         widths = (*self.robot.sizes.values(), *self.contact.sizes.values())
         self.size = sum(widths)
+
+    def gap(self, raw: Tensor) -> Tensor:
+        """Between contact points and the ground, m, ``(*batch, P)``, of raw tokens.
+
+        Far ones are farther away than they show.
+        """
+        contact = self.contact
+        first = self.size - sum(contact.sizes.values())
+        beyond = raw[..., first : first + contact.count]
+        return beyond + (contact.margins - contact.radii)
 
     def forward(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None

@@ -65,6 +65,7 @@ class FineTuner:
         self.config, self.tosses, self.quiet = config, tosses, quiet
         self.train = train
         self.model, self.keep = copy.deepcopy(model), keep
+        self.model.flight = None  # measured bodies fall as they do, not as the scene's
         self.view = TossView(model.scene, tosses, config, model.device)
         states = STATES if config.update == "physics" else config.length + 1
         self.starts = self.view.starts(states, train)

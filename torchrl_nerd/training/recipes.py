@@ -96,6 +96,7 @@ RECIPES: dict[str, Recipe] = {
         46_000,
         6_000,
         softening=0.02,
+        flies=True,
         use_symmetry=True,
         rollout_rounds=2,
         bf16_share=0.85,
@@ -108,6 +109,7 @@ RECIPES: dict[str, Recipe] = {
         15_000,
         1_000,
         softening=0.02,
+        flies=True,
         bf16_share=0.8,
     ),
     "franka": _mlp(

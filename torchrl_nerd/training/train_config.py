@@ -22,6 +22,7 @@ class TrainConfig:
     | ``rollout_steps`` | further updates on the model's own rollouts |
     | ``rows``, ``length`` | sequences per update and tokens of each |
     | ``single_share`` | share of updates on as many single states instead |
+    | ``flies`` | have rows that nothing pushes move along the free motion, see `Flight` |
     | ``use_symmetry`` | show each sample as a random one of its mirror images |
     | ``rollout_rows``, ``rollout_length`` | the same for rollouts |
     | ``lr``, ``lr_other`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
@@ -47,6 +48,7 @@ class TrainConfig:
     rows: int = 64
     length: int = 16
     single_share: float = 0.75
+    flies: bool = False
     use_symmetry: bool = False
     rollout_rows: int = 128
     rollout_length: int = 8

@@ -1,5 +1,6 @@
 """Training of a NeRD: sequences gathered on the device, resumable to the bit."""
 
+import copy
 import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
@@ -11,7 +12,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
-from torchrl_nerd.checkpoint import make_card, make_model, save_checkpoint
+from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import (
     ErrorSummary,
@@ -100,6 +101,8 @@ class Trainer:
             model = fresh_model(scene, data, config.network, symmetry)
         else:
             model = begin_from(start, scene, config.network, symmetry)
+        if config.flies:
+            model.fly()
         self.start = None if start is None else fingerprint(start)
         self.sequences = Sequences(model, data, self.device, symmetry)
         self.model, self.resting = model.to(self.device), resting(self.sequences.data)
@@ -225,8 +228,7 @@ class Trainer:
 
     def averaged_model(self) -> NeRD:
         """A copy of the model that holds the averaged weights, and knows rest."""
-        model = make_model(self.scene, self.model.config).to(self.device)
-        model.load_state_dict(self.model.state_dict())
+        model = copy.deepcopy(self.model)
         model.network.load_state_dict(self.average)
         find_rest(model.eval(), self.resting)
         return model

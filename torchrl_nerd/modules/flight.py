@@ -1,0 +1,103 @@
+"""Rows that neither ground nor limits push for a whole step move along their free motion.
+
+There the equation of motion is all there is, two looks at it err by a millionth where a
+network errs by a tenth, and whatever a robot has gone astray by when it lands its contacts
+make more of. So the network is left with contact.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.base import BasePose
+from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.modules.free_step import FreeStep
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.terrain_distance import TerrainDistance
+
+LEAST_GAP = 1e-3  # m: a point may come nearer within the step than at both its ends
+BLOCK = (
+    16  # rows: matrix products of so many give each the same bits, whichever they are
+)
+
+State = tuple[Tensor, Tensor]
+
+
+class Flight(nn.Module):
+    """Puts the free motion's next state in the place of the network's, row by row.
+
+    A row flies where no contact point is near the ground and no joint near a limit, when
+    the step begins and when it ends.
+
+    Args:
+        scene: of a robot that `FreeStep` can move, with a ground.
+
+    Raises:
+        ValueError: another robot, or one without a ground.
+    """
+
+    radii: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        if scene.terrain is None:
+            raise ValueError(f"expected a ground to fly over, got scene '{scene.name}'")
+        points = scene.contacts
+        self.free_step = FreeStep(scene)
+        self.kinematics = PointKinematics(
+            scene.model, scene.base, points.bodies, points.positions
+        )
+        self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
+        self.pose = BasePose(scene.base, scene.mount)
+        keep_constants(self, radii=points.radii)
+
+    def forward(
+        self,
+        before: State,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        gap: Tensor,
+        after: State,
+    ) -> State:
+        """The next state, of rows that fly by the free motion, of others as it was.
+
+        Eagerly on a processor only rows that may fly are looked at; in compiled code and
+        on a GPU, which want shapes that stay, all are.
+
+        Args:
+            before: ``qpos (rows, nq)`` and ``qvel (rows, nv)``.
+            joint_torque: ``(rows, num_actuated)``.
+            terrain: ``(rows, terrain.size)``; None for the scene's own ground.
+            gap: between every contact point and the ground, ``(rows, P)``, m.
+            after: the next ``qpos`` and ``qvel`` as the network tells them.
+        """
+        may_fly = (gap > LEAST_GAP).all(-1)
+        if torch.compiler.is_compiling() or gap.device.type != "cpu":
+            found, flies = self._fly(before, joint_torque, terrain)
+            flies = (flies & may_fly)[:, None]
+            return tuple(  # pyright: ignore
+                torch.where(flies, new, old)
+                for new, old in zip(found, after, strict=True)
+            )
+        (rows,) = may_fly.nonzero(as_tuple=True)
+        if not len(rows):
+            return after
+        rows = torch.cat((rows, rows[-1:].expand(-len(rows) % BLOCK)))
+        ground = None if terrain is None else terrain[rows]
+        start = before[0][rows], before[1][rows]
+        found, flies = self._fly(start, joint_torque[rows], ground)
+        rows = rows[flies]
+        return tuple(  # pyright: ignore
+            old.index_put((rows,), new[flies])
+            for new, old in zip(found, after, strict=True)
+        )
+
+    def _fly(
+        self, before: State, joint_torque: Tensor, terrain: Tensor | None
+    ) -> tuple[State, Tensor]:
+        """Next states along the free motion, and whether nothing is met ``(rows,)``."""
+        qpos, qvel, _, beyond = self.free_step(*before, joint_torque)
+        points, _ = self.kinematics(qpos, qvel[:0])
+        distance, _ = self.ground(points, terrain, *self.pose(qpos))
+        is_clear = (distance - self.radii > LEAST_GAP).all(-1)
+        return (qpos, qvel), is_clear & (beyond == 0.0)[..., 0]
