@@ -8,6 +8,7 @@ make more of. So the network is left with contact.
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.geometry.base import BasePose
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.kinematics import PointKinematics
@@ -51,6 +52,7 @@ class Flight(nn.Module):
         self.pose = BasePose(scene.base, scene.mount)
         keep_constants(self, radii=points.radii)
 
+    @uncompiled  # the equations of fourteen dofs take minutes to compile
     def forward(
         self,
         before: State,
@@ -61,8 +63,8 @@ class Flight(nn.Module):
     ) -> State:
         """The next state, of rows that fly by the free motion, of others as it was.
 
-        Eagerly on a processor only rows that may fly are looked at; in compiled code and
-        on a GPU, which want shapes that stay, all are.
+        On a processor only rows that may fly are looked at; on a GPU, which would have to
+        wait for their number, all are.
 
         Args:
             before: ``qpos (rows, nq)`` and ``qvel (rows, nv)``.
@@ -72,13 +74,8 @@ class Flight(nn.Module):
             after: the next ``qpos`` and ``qvel`` as the network tells them.
         """
         may_fly = (gap > LEAST_GAP).all(-1)
-        if torch.compiler.is_compiling() or gap.device.type != "cpu":
-            found, flies = self._fly(before, joint_torque, terrain)
-            flies = (flies & may_fly)[:, None]
-            return tuple(  # pyright: ignore
-                torch.where(flies, new, old)
-                for new, old in zip(found, after, strict=True)
-            )
+        if gap.device.type != "cpu":
+            return self.fly_at_once(before, joint_torque, terrain, may_fly, after)
         (rows,) = may_fly.nonzero(as_tuple=True)
         if not len(rows):
             return after
@@ -90,6 +87,21 @@ class Flight(nn.Module):
         return tuple(  # pyright: ignore
             old.index_put((rows,), new[flies])
             for new, old in zip(found, after, strict=True)
+        )
+
+    def fly_at_once(
+        self,
+        before: State,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        may_fly: Tensor,
+        after: State,
+    ) -> State:
+        """As `forward`, of rows that ``may_fly (rows,)``, with shapes that stay."""
+        found, flies = self._fly(before, joint_torque, terrain)
+        flies = (flies & may_fly)[:, None]
+        return tuple(  # pyright: ignore
+            torch.where(flies, new, old) for new, old in zip(found, after, strict=True)
         )
 
     def _fly(
