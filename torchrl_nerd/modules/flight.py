@@ -73,7 +73,7 @@ class Flight(nn.Module):
             gap: between every contact point and the ground, ``(rows, P)``, m.
             after: the next ``qpos`` and ``qvel`` as the network tells them.
         """
-        may_fly = (gap > LEAST_GAP).all(-1)
+        may_fly = (gap > LEAST_GAP).all(-1) & self.free_step.is_within(before[0])
         if gap.device.type != "cpu":
             return self.fly_at_once(before, joint_torque, terrain, may_fly, after)
         (rows,) = may_fly.nonzero(as_tuple=True)

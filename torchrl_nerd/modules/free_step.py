@@ -89,6 +89,11 @@ class FreeStep(nn.Module):
         after = integrate_pos(self.layout, qpos, moved)
         return after, qvel + gain, gain - self.period * start, self._beyond(qpos, after)
 
+    def is_within(self, qpos: Tensor) -> Tensor:
+        """Whether no joint is beyond a limit, ``(*batch,)``."""
+        joints = qpos[..., self.motion.qpos_addresses]
+        return ((joints >= self.low) & (joints <= self.high)).all(-1)
+
     def _beyond(self, before: Tensor, after: Tensor) -> Tensor:
         first, last = (x[..., self.motion.qpos_addresses] for x in (before, after))
         below = self.low - torch.minimum(first, last)
