@@ -44,7 +44,7 @@ class Run(PPOConfig):
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # where: nerd, mujoco, dm_control, a checkpoint folder
-    compile: bool = False  # steps in NeRD: a minute at the start, several times faster
+    compile: bool = False  # steps in NeRD, see SceneEnv.compile
     seed: int = 0  # of weights, exploration and starts
     evaluate_every: int = 20  # updates between two points of the learning curve
     episodes: int = 2048  # of the final evaluation

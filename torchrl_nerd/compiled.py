@@ -44,7 +44,9 @@ class Compiled(Generic[Given, Result]):
 
     def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Result:
         """What ``function`` gives."""
-        if self.is_eager or torch.compiler.is_compiling() or self._calls_to_go > 0:
+        if self.is_eager or torch.compiler.is_compiling():
+            return self.function(*args, **kwargs)
+        if self._calls_to_go > 0:
             self._calls_to_go -= 1
             return self.function(*args, **kwargs)
         if self._run is None:

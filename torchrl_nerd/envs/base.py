@@ -77,6 +77,7 @@ class SceneEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
         self.guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
+        self._transition = Transition(task, dynamics)
         self.eager()
         self.recorder: FaultRecorder | None = None
         if fault_folder is not None:
@@ -102,16 +103,15 @@ class SceneEnv(EnvBase):
             warmup: eager steps before the first compiled one; 1 where not given.
             kwargs: of `torch.compile`.
         """
-        transition = Transition(self.task, self.dynamics)
         options = {"warmup": 1 if warmup is None else warmup, **kwargs}
-        self._transit = Compiled(transition.step, **options)
-        self._restart = Compiled(transition.restart, **options)
+        self._transit = Compiled(self._transition.step, **options)
+        self._restart = Compiled(self._transition.restart, **options)
         return self
 
     def eager(self) -> "SceneEnv":
         """Step without a compiler; returns the env itself."""
-        transition = Transition(self.task, self.dynamics)
-        self._transit, self._restart = transition.step, transition.restart
+        self._transit = self._transition.step
+        self._restart = self._transition.restart
         return self
 
     @property
