@@ -9,12 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.geometry.base import BasePose
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.modules.free_step import FreeStep
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
 LEAST_GAP = 1e-3  # m: a point may come nearer within the step than at both its ends
 BLOCK = (
@@ -37,20 +33,11 @@ class Flight(nn.Module):
         ValueError: another robot, or one without a ground.
     """
 
-    radii: Tensor
-
     def __init__(self, scene: Scene) -> None:
         super().__init__()
         if scene.terrain is None:
             raise ValueError(f"expected a ground to fly over, got scene '{scene.name}'")
-        points = scene.contacts
-        self.free_step = FreeStep(scene)
-        self.kinematics = PointKinematics(
-            scene.model, scene.base, points.bodies, points.positions
-        )
-        self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
-        self.pose = BasePose(scene.base, scene.mount)
-        keep_constants(self, radii=points.radii)
+        self.scene, self.free_step = scene, FreeStep(scene)
 
     @uncompiled  # the equations of fourteen dofs take minutes to compile
     def forward(
@@ -109,7 +96,5 @@ class Flight(nn.Module):
     ) -> tuple[State, Tensor]:
         """Next states along the free motion, and whether nothing is met ``(rows,)``."""
         qpos, qvel, _, beyond = self.free_step(*before, joint_torque)
-        points, _ = self.kinematics(qpos, qvel[:0])
-        distance, _ = self.ground(points, terrain, *self.pose(qpos))
-        is_clear = (distance - self.radii > LEAST_GAP).all(-1)
+        is_clear = (self.scene.clearances(qpos, terrain) > LEAST_GAP).all(-1)
         return (qpos, qvel), is_clear & (beyond == 0.0)[..., 0]
