@@ -15,6 +15,7 @@ from torchrl.collectors import Collector
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.streams import row_uniforms, uniforms
 from torchrl_nerd.tasks import make_task
 
 TASK = "cartpole/swingup"
@@ -59,6 +60,22 @@ def check_is_compiled(env: SceneEnv) -> None:
     for piece in (env._transit, env._restart):
         assert isinstance(piece, Compiled)
         assert (piece._run is not None) == HAS_COMPILER
+
+
+def test_compiled_starts_are_the_eager_ones(generator):
+    """To the bit, whatever the seed: products of 64-bit numbers overflow as they should."""
+    for rows in (1, 3, 64):
+        drawn = int(torch.randint(2**63 - 1, (), generator=generator))
+        for seed in (0, 1, drawn):
+            env = make_env(TASK, num_envs=rows, seed=seed)
+            count = env.task.num_uniforms
+            draw = Compiled(uniforms, warmup=0)
+            for _ in range(3):
+                episode = torch.randint(10**6, (rows,), generator=generator)
+                given = env._keys, episode, env._offsets
+                expected = row_uniforms(seed, episode, count)
+                assert torch.equal(uniforms(*given), expected)
+                assert torch.equal(draw(*given), expected)
 
 
 def act_next(actions: Iterator[torch.Tensor], td: TensorDictBase) -> TensorDictBase:

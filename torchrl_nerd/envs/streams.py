@@ -3,8 +3,9 @@
 Row i of episode k gets the same numbers whatever the number of rows, whichever rows are
 reset beside it, and on every device: each number is a hash of (seed, row, episode, index).
 The hash is SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number
-generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). It stays out of compiled
-code, where integers that overflow are not kept modulo 2^64 (torch 2.13 on a CPU).
+generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). Whatever counts rows and
+numbers is made outside of compiled code and handed in: there products with a range that is
+made on the spot are not kept modulo 2^64 (torch 2.13 on a CPU).
 """
 
 import torch
@@ -26,19 +27,33 @@ def _mix(x: Tensor) -> Tensor:
     return x ^ _shift_right(x, 31)
 
 
-def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
+def row_keys(seed: int, rows: int, device: torch.device | str = "cpu") -> Tensor:
+    """What sets the streams of rows apart, int64 ``(rows,)``."""
+    row = torch.arange(rows, device=device)
+    key = _mix(torch.full_like(row, seed) * GOLDEN)
+    return _mix(key + (row + 1) * GOLDEN)
+
+
+def stream_offsets(count: int, device: torch.device | str = "cpu") -> Tensor:
+    """What sets the numbers of an episode apart, int64 ``(count,)``."""
+    return torch.arange(1, count + 1, device=device) * GOLDEN
+
+
+def uniforms(keys: Tensor, episode: Tensor, offsets: Tensor) -> Tensor:
     """Uniform numbers in [0, 1), ``(rows, count)``, float64.
 
     Args:
-        seed: of the env.
+        keys: ``(rows,)``, see `row_keys`.
         episode: ``(rows,)`` int64: how many episodes each row has begun.
-        count: numbers per row.
+        offsets: ``(count,)``, see `stream_offsets`.
     """
-    device = episode.device
-    row = torch.arange(len(episode), device=device)
-    key = _mix(torch.full_like(row, seed) * GOLDEN)
-    for part in (row, episode):
-        key = _mix(key + (part + 1) * GOLDEN)
-    index = torch.arange(1, count + 1, device=device)
-    bits = _mix(key[:, None] + index * GOLDEN)
+    keys = _mix(keys + (episode + 1) * GOLDEN)
+    bits = _mix(keys[:, None] + offsets)
     return _shift_right(bits, 11).to(torch.float64) * 2.0**-53
+
+
+def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
+    """`uniforms` of all rows of an env with that seed."""
+    device = episode.device
+    keys = row_keys(seed, len(episode), device)
+    return uniforms(keys, episode, stream_offsets(count, device))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.envs.faults import find_faults
+from torchrl_nerd.envs.streams import uniforms
 from torchrl_nerd.keys import (
     ACTION,
     FAULT,
@@ -93,25 +94,32 @@ class Transition:
         return self.dynamics.step(moving, torque, terrain), torque
 
     def restart(
-        self, state: Tensors, rows: Tensor, u: Tensor, given: Tensors
+        self,
+        state: Tensors,
+        rows: Tensor,
+        streams: tuple[Tensor, Tensor, Tensor],
+        given: Tensors,
     ) -> Tensors:
         """New episodes for some rows; the others stay bitwise as they are.
 
         Args:
             state: as in `step`.
             rows: ``(num_envs,)`` bool: which.
-            u: ``(num_envs, task.num_uniforms)`` in [0, 1).
+            streams: of the rows' random numbers, see `streams.uniforms`.
             given: what of a start is not left to chance.
 
         Returns:
-            As `step`, without reward and flags: zero torque, no fault, full trust.
+            As `step`, without reward: zero torque, no fault, full trust, not done.
         """
-        fresh = self.task.initial_state(u) | given
-        start = {k: torch.where(rows[:, None], fresh[k], state[k]) for k in state}
+        fresh = self.task.initial_state(uniforms(*streams)) | given
         column, num_torques = rows[:, None], len(self.task.scene.actuated)
+        start = {k: torch.where(column, fresh[k], state[k]) for k in state}
         return start | {
             "joint_torque": start[QPOS].new_zeros(len(rows), num_torques),
             FAULT: torch.zeros_like(column, dtype=torch.long),
             TRUST: torch.ones_like(column, dtype=torch.float32),
             OBSERVATION: self.task.observation(start).to(torch.float32),
+            "done": torch.zeros_like(column),
+            "terminated": torch.zeros_like(column),
+            "truncated": torch.zeros_like(column),
         }
