@@ -1,8 +1,10 @@
 """TorchRL pipelines of `examples/` with tiny budgets: each has to show what it claims."""
 
+import copy
 import importlib
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -10,10 +12,11 @@ import pytest
 import torch
 from dynamics_helpers import unequal_keys
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_nerd import load_scene, make_env
-from torchrl_nerd.evaluation.policy import make_actor
+from torchrl_nerd import NeRDEnv, from_pretrained, load_scene, make_env
+from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.transforms import Stats
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -208,21 +211,51 @@ def test_ppo_outlives_a_worker_of_ray(example, moment, monkeypatch, capsys):
     assert not torch.equal(*starts)
 
 
-def test_gradients_through_learned_dynamics_help_in_true_ones(example):
+def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path):
     first_order = example("first_order")
-    cfg = first_order.Config(num_envs=16, window=8, episode=8, updates=12, lr=1e-2)
+    cfg = first_order.Config(
+        num_envs=16,
+        window=8,
+        episode=8,
+        updates=12,
+        lr=1e-2,
+        evaluate_every=12,
+        episodes=8,
+        out=tmp_path,
+    )
     policy, rewards = first_order.train(cfg)
     assert len(rewards) == cfg.updates
+    idle = copy.deepcopy(policy)
+    nn.init.zeros_(idle.mlp[-1].weight)
+    nn.init.zeros_(idle.mlp[-1].bias)
     env = make_env(cfg.task, "mujoco", 64)
-    start = env.reset()
-    earned = []
-    for actor in (first_order.make_actor(policy), idle_policy(7)):
-        td = env.reset(start.select(*env.state.keys()), set_state=True)
+    start, earned = env.reset(), []
+    for each in (policy, idle):
+        now = env.reset(start.select(*env.state.keys()), set_state=True)
         with torch.no_grad():
-            earned.append(float(first_order.window_reward(env, actor, td, 24)))
+            reward, _ = first_order.window_reward(env, each, now, None, 24)
+        earned.append(float(reward))
     assert earned[0] > earned[1] + 0.01
+    first_order.main(replace(cfg, start=tmp_path, updates=1, lr=0.0))
+    kept = load_policy(tmp_path).state_dict()
+    assert all(torch.equal(kept[k], x) for k, x in policy.state_dict().items())
+    assert (tmp_path / "returns.json").is_file()
 
 
-def idle_policy(num_actions: int):
-    """No action at all."""
-    return lambda td: td.set("action", torch.zeros(*td.shape, num_actions))
+def test_windows_go_on_where_the_last_one_ended(example, generator):
+    """The sum of a rollout in windows is that of the whole."""
+    first_order = example("first_order")
+    cfg = first_order.Config(num_envs=4)
+    model = from_pretrained("franka").requires_grad_(False)
+    env = NeRDEnv(cfg.task, model, 4, differentiable=True)
+    policy = first_order.make_policy(cfg, env)
+    start = env.reset()
+    whole, _ = first_order.window_reward(env, policy, start, None, 6)
+    now, recent, parts = env.reset(start, set_state=True), None, []
+    for _ in range(2):
+        part, recent = first_order.window_reward(env, policy, now, recent, 3)
+        parts.append(part)
+        now = env.reset(env.state.detach(), set_state=True)
+    torch.testing.assert_close(sum(parts) / 2, whole)
+    gradients = torch.autograd.grad(whole, list(policy.mlp.parameters()))
+    assert all(gradient.any() for gradient in gradients)
