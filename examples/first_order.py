@@ -40,9 +40,9 @@ class Config:
     start: Path | None = None  # folder of a policy to go on from, as PPO leaves it
     compile: bool = False  # steps and their gradients: minutes at first, then faster
     num_envs: int = 64  # rows that it learns from together
-    window: int = 32  # actions that the gradient goes through
+    window: int = 16  # actions that the gradient goes through
     episode: int = 128  # actions before all rows begin anew
-    updates: int = 200  # gradient steps, one a window
+    updates: int = 300  # gradient steps, one a window
     lr: float = 3e-3  # Adam's step size at the start; falls linearly to almost zero
     evaluate_every: int = 25  # updates between two points of the learning curve
     episodes: int = 256  # of the evaluation
