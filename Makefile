@@ -61,25 +61,14 @@ test-gpu: $(STAMP) ## the tests that need a CUDA device
 bench-check: $(STAMP) ## whether anything got slower, against a baseline of ratios
 	$(PY) benchmarks/bench_check.py $(ARGS)
 
-model-ant: $(STAMP) ## the shipped Ant anew: learned, tried by two policies, learned on
+model-ant: $(STAMP) ## the shipped Ant anew: learned, tried by a policy, learned on
 	$(NERD) train ant
 	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant/best --out runs/ppo_ant \
 		--horizon 16 --minibatch 8192 --lr 1e-3 --total-frames 8000000 --episodes 512
 	$(NERD) data ant --policy runs/ppo_ant --trajectories 12000 --out datasets/ant_policy
 	$(NERD) train ant --start runs/ant/best --data datasets/ant datasets/ant_policy \
 		--steps 12000 --rollout-steps 4000 --rollout-rounds 1 --lr 0.004 --lr-other 0.0012 \
-		--rollout-lr 0.25 --validate-every 2000 --out runs/ant_policy
-	$(NERD) train ant --start runs/ant_policy/best --data datasets/ant datasets/ant_policy \
-		--steps 20000 --rollout-steps 8000 --rollout-rounds 2 --lr 0.005 --lr-other 0.0015 \
-		--rollout-lr 0.25 --validate-every 4000 --out runs/ant_on
-	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant_policy/best \
-		--out runs/ppo_ant_policy --horizon 16 --minibatch 8192 --lr 1e-3 \
-		--total-frames 8000000 --episodes 512
-	$(NERD) data ant --policy runs/ppo_ant_policy --trajectories 6000 --out datasets/ant_run
-	$(NERD) train ant --start runs/ant_on/best \
-		--data datasets/ant datasets/ant_policy datasets/ant_run \
-		--steps 7000 --rollout-steps 4000 --rollout-rounds 1 --lr 0.004 --lr-other 0.0012 \
-		--rollout-lr 0.25 --validate-every 3500 --out runs/ant_again \
+		--rollout-lr 0.25 --validate-every 2000 --out runs/ant_policy \
 		--export torchrl_nerd/pretrained/ant
 
 model-anymal: $(STAMP) ## the shipped ANYmal anew: learned, tried by two policies, learned on
