@@ -22,7 +22,7 @@ from torch.optim.lr_scheduler import LinearLR
 from tqdm import trange
 
 from torchrl_nerd import NeRDEnv, from_pretrained
-from torchrl_nerd.envs.memory import recall
+from torchrl_nerd.envs.memory import recall, remember
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.files import write_json
@@ -55,18 +55,13 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
     if cfg.start is not None:
         return load_policy(cfg.start, env.task)
     ppo = PPO_CONFIGS.get(cfg.task, PPOConfig())
-    size, num_actions = (
-        ppo.memory * env.task.observation_size,
-        env.action_spec.shape[-1],
-    )
-    policy = Policy((size, *ppo.widths, num_actions), memory=ppo.memory)
     with torch.no_grad():
-        now, recent, seen = env.reset(), None, []
-        for _ in range(env.task.horizon):
-            recent = recall(recent, now["observation"], ppo.memory)
-            seen.append(recent)
-            now = env.step(env.rand_action(now))["next"]
-        policy.standardize.fit(torch.stack(seen))
+        steps = remember(env, ppo.memory).rollout(
+            cfg.episode, break_when_any_done=False
+        )
+    size, num_actions = steps["observation"].shape[-1], env.action_spec.shape[-1]
+    policy = Policy((size, *ppo.widths, num_actions), memory=ppo.memory)
+    policy.standardize.fit(steps["observation"])
     return policy
 
 

@@ -24,6 +24,7 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
@@ -179,6 +180,11 @@ class EnvMaker:
 def random_actions(env: SceneEnv, steps: int, generator: Generator) -> Tensor:
     """Actions in [-1, 1], ``(steps, *action shape)``."""
     return 2.0 * torch.rand(steps, *env.action_spec.shape, generator=generator) - 1.0
+
+
+def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
+    """What the rows of an env with that seed draw at the start of these episodes."""
+    return uniforms(row_keys(seed, len(episode)), episode, stream_offsets(count))
 
 
 def act(env: SceneEnv, action: Tensor) -> TensorDict:

@@ -8,14 +8,20 @@ from itertools import cycle
 
 import pytest
 import torch
-from dynamics_helpers import HAS_COMPILER, EnvMaker, random_actions, random_model
+from dynamics_helpers import (
+    HAS_COMPILER,
+    EnvMaker,
+    random_actions,
+    random_model,
+    row_uniforms,
+)
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.streams import row_uniforms, uniforms
+from torchrl_nerd.envs.streams import uniforms
 from torchrl_nerd.tasks import make_task
 
 TASK = "cartpole/swingup"

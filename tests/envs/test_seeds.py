@@ -16,13 +16,13 @@ from dynamics_helpers import (
     each_dynamics,
     random_actions,
     random_model,
+    row_uniforms,
     unequal_keys,
 )
 from torch import Generator, Tensor
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
-from torchrl_nerd.envs.streams import row_uniforms
 from torchrl_nerd.scenes import SCENES
 from torchrl_nerd.tasks import TASKS, make_task
 

@@ -14,13 +14,13 @@ from dynamics_helpers import (
     random_actions,
     random_drive,
     random_model,
+    row_uniforms,
     start_at,
 )
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
-from torchrl_nerd.envs.streams import row_uniforms
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.tasks.suite import SuiteTask
 

@@ -265,9 +265,7 @@ class SceneEnv(EnvBase):
         self, found: dict[str, Tensor], counts: dict[str, Tensor]
     ) -> TensorDict:
         """Keep the state and hand out all, in a tensordict that shares no memory."""
-        kept = (
-            self._buffers
-        )  # past the attributes of modules, which cost more than sums
+        kept = self._buffers  # setting a module's attributes costs more than sums
         kept.update(counts)
         for key in self._state_sizes:
             kept[f"_state_{key}"] = found[key]

@@ -50,10 +50,3 @@ def uniforms(keys: Tensor, episode: Tensor, offsets: Tensor) -> Tensor:
     keys = _mix(keys + (episode + 1) * GOLDEN)
     bits = _mix(keys[:, None] + offsets)
     return _shift_right(bits, 11).to(torch.float64) * 2.0**-53
-
-
-def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
-    """`uniforms` of all rows of an env with that seed."""
-    device = episode.device
-    keys = row_keys(seed, len(episode), device)
-    return uniforms(keys, episode, stream_offsets(count, device))

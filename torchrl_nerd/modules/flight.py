@@ -13,9 +13,7 @@ from torchrl_nerd.modules.free_step import FreeStep
 from torchrl_nerd.scenes.scene import Scene
 
 LEAST_GAP = 1e-3  # m: a point may come nearer within the step than at both its ends
-BLOCK = (
-    16  # rows: matrix products of so many give each the same bits, whichever they are
-)
+BLOCK = 16  # rows: products of so many give each the same bits, whichever they are
 
 State = tuple[Tensor, Tensor]
 
