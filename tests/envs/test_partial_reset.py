@@ -116,8 +116,14 @@ def test_what_a_reset_hands_back_is_torchrls_own(task_id, generator):
     now["action"] = env.action_spec.rand()
     now["count"] = torch.arange(1, ROWS + 1)[:, None]
     now["flag"] = torch.ones(ROWS, 2, dtype=torch.bool)
-    nested = now.clone().set(("hidden", "state"), torch.ones(ROWS, 3))
-    for given in (now, nested, now.exclude("joint_torque")):
+    nested = now.clone().set(("hidden", "state"), torch.ones(ROWS, 3, 2))
+    nested["hidden", "deep", "id"] = torch.arange(1, ROWS + 1)
+    for given in (
+        now,
+        nested,
+        nested.exclude(("hidden", "deep")),
+        now.exclude("joint_torque"),
+    ):
         for rows in (torch.arange(ROWS) == 1, torch.ones(ROWS, dtype=torch.bool)):
             given = given.clone().set("_reset", rows[:, None])
             fresh = env._reset(given)

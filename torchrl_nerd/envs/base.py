@@ -235,15 +235,16 @@ class SceneEnv(EnvBase):
 
         What is not the env's, such as the last action, is zero where some rows begin anew.
         """
-        shown = {} if tensordict is None else dict(tensordict.items())
-        rows = shown.pop("_reset", None)
-        is_flat = all(isinstance(x, Tensor) and x.ndim == 2 for x in shown.values())
-        if tensordict is None or rows is None or not is_flat or rows.all():
+        rows = None if tensordict is None else tensordict.get("_reset", None)
+        if tensordict is None or rows is None or rows.all():
             return super()._reset_proc_data(tensordict, tensordict_reset)
-        fresh = dict(tensordict_reset.items())
+        rows, fresh = rows.reshape(self.batch_size), dict(tensordict_reset.items())
         merged = {
-            k: torch.where(rows, fresh[k], x) if k in fresh else x.masked_fill(rows, 0)
-            for k, x in shown.items()
+            k: torch.where(_beside(rows, x), fresh[k], x)
+            if k in fresh
+            else _emptied(rows, x)
+            for k, x in tensordict.items()
+            if k != "_reset"
         }
         tensordict.pop("_reset")
         return tensordict.update(fresh | merged)
@@ -275,3 +276,18 @@ class SceneEnv(EnvBase):
         return TensorDict._new_unsafe(
             found, batch_size=self.batch_size, device=self.device
         )
+
+
+def _beside(rows: Tensor, value: Tensor) -> Tensor:
+    """The mask ``(num_envs,)`` in as many dimensions as a value ``(num_envs, ...)``."""
+    return rows.reshape(-1, *[1] * (value.ndim - 1))
+
+
+def _emptied(rows: Tensor, value: Any) -> Any:
+    """Zeros in those rows, of a tensor or of all that a tensordict holds."""
+    if isinstance(value, Tensor):
+        return value.masked_fill(_beside(rows, value), 0)
+    if isinstance(value, TensorDictBase):
+        kept = {key: _emptied(rows, x) for key, x in value.items()}
+        return value.copy().update(kept)
+    return value
