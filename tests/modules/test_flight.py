@@ -4,8 +4,10 @@ import pytest
 import torch
 from dynamics_helpers import random_model, roll
 from helpers import random_transitions, true_step
+from torch._dynamo.testing import CompileCounterWithBackend
 
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
+from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.flight import LEAST_GAP, Flight
@@ -118,6 +120,49 @@ def test_all_rows_at_once_are_close_to_some(scene, generator):
     every = flight.fly_at_once(before, rows[JOINT_TORQUE], terrain, may_fly, before)
     torch.testing.assert_close(some, every, atol=1e-9, rtol=1e-9)
     assert (some[1] != before[1]).any()
+
+
+@pytest.mark.parametrize(
+    ("scene", "backend"),
+    [
+        (load_scene("ant"), "eager"),
+        *(pytest.param(s, "inductor", marks=pytest.mark.slow) for s in FLYING),
+    ],
+    ids=lambda x: getattr(x, "name", x),
+)
+def test_one_code_is_compiled_for_any_number_that_flies(
+    backend, scene, generator, monkeypatch
+):
+    """None, a block of rows, all of them: close to eager, and nothing compiled anew."""
+    fly, traced = Flight._fly, []
+
+    def noting(*args):
+        traced.append(torch.compiler.is_compiling())
+        return fly(*args)
+
+    monkeypatch.setattr(Flight, "_fly", noting)
+    model = random_model(scene, generator, "mlp").fly()
+    rows = transitions(scene, 8 * ROWS, generator)
+    flies = flying(model, rows)[0]
+    most = min(ROWS, int(flies.sum()))
+    assert most > 0
+    counter = CompileCounterWithBackend(backend)
+    compiled = NeRDDynamics(model, compile=True)
+    compiled._compiled = Compiled(compiled._predict, warmup=0, backend=counter)
+    counts = [0, most, 1, most // 2, most - 1]
+    pieces = []
+    for count in counts:
+        parts = rows[flies][:count], rows[~flies][: ROWS - count]
+        here = torch.cat(parts)
+        given = here.select(QPOS, QVEL), here[JOINT_TORQUE], here.get(TERRAIN, None)
+        expected = NeRDDynamics(model).step(*given)
+        traced.clear()
+        found = compiled.step(*given)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+        pieces.append(counter.frame_count)
+        assert all(traced)
+        assert traced or not count
+    assert pieces[1:] == [pieces[1]] * (len(counts) - 1)
 
 
 def test_a_checkpoint_knows_that_it_flies(tmp_path, generator):

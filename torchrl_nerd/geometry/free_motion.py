@@ -20,6 +20,7 @@ from torchrl_nerd.geometry.frames import quat_matrix
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import cross
 
+FEW = 8  # unknowns; fourteen would take minutes to compile
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float)
 
 
@@ -198,10 +199,13 @@ def _rows_last(x: Tensor, size: int) -> Tensor:
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solutions ``(n, N)`` of positive definite ``(n, n, N)`` by Gauss's elimination.
+    """Solutions ``(n, N)`` of positive definite ``(n, n, N)``.
 
-    No pivots are needed, and all rows go through each step at once.
+    By LAPACK, row by row; where few unknowns are compiled, by Gauss's elimination without
+    pivots, all rows at once, which becomes one piece with what is round it.
     """
+    if len(right) > FEW or not torch.compiler.is_compiling():
+        return torch.linalg.solve_ex(matrix.movedim(-1, 0), right.mT)[0].mT
     columns, rows = [], []
     while len(right):
         row = matrix[0] / matrix[0, 0]

@@ -37,7 +37,6 @@ class Flight(nn.Module):
             raise ValueError(f"expected a ground to fly over, got scene '{scene.name}'")
         self.scene, self.free_step = scene, FreeStep(scene)
 
-    @uncompiled  # the equations of fourteen dofs take minutes to compile
     def forward(
         self,
         before: State,
@@ -61,16 +60,14 @@ class Flight(nn.Module):
         may_fly = (gap > LEAST_GAP).all(-1) & self.free_step.is_within(before[0])
         if gap.device.type != "cpu":
             return self.fly_at_once(before, joint_torque, terrain, may_fly, after)
-        (rows,) = may_fly.nonzero(as_tuple=True)
+        rows = _numbers(may_fly)
         if not len(rows):
             return after
-        rows = torch.cat((rows, rows[-1:].expand(-len(rows) % BLOCK)))
         ground = None if terrain is None else terrain[rows]
         start = before[0][rows], before[1][rows]
         found, flies = self._fly(start, joint_torque[rows], ground)
-        rows = rows[flies]
         return tuple(  # pyright: ignore
-            old.index_put((rows,), new[flies])
+            old.index_put((rows,), torch.where(flies[:, None], new, old[rows]))
             for new, old in zip(found, after, strict=True)
         )
 
@@ -96,3 +93,12 @@ class Flight(nn.Module):
         qpos, qvel, _, beyond = self.free_step(*before, joint_torque)
         is_clear = (self.scene.clearances(qpos, terrain) > LEAST_GAP).all(-1)
         return (qpos, qvel), is_clear & (beyond == 0.0)[..., 0]
+
+
+@uncompiled
+def _numbers(rows: Tensor) -> Tensor:
+    """Which rows of a mask; the last one once more and again, to make whole blocks."""
+    (found,) = rows.nonzero(as_tuple=True)
+    found = torch.cat((found, found[-1:].expand(-len(found) % BLOCK)))
+    torch._dynamo.maybe_mark_dynamic(found, 0)  # compiled once for any number of blocks
+    return found

@@ -93,7 +93,10 @@ def learned_contenders(
             yield _learned(f"{name}, compiled", model, compile=True)
         if not isinstance(model.config, MLPConfig | FreeConfig):  # nothing to recompute
             yield _learned(f"{name}, window", model, inference="window")
-        yield _learned(f"{name}, bf16", copy.deepcopy(model).to(torch.bfloat16))
+        half = copy.deepcopy(model).to(torch.bfloat16)
+        yield _learned(f"{name}, bf16", half)
+        if is_compiling:
+            yield _learned(f"{name}, bf16 compiled", half, compile=True)
 
 
 def _learned(name: str, model: NeRD, **how: object) -> Contender:
