@@ -235,6 +235,11 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
         assert row["paper"] == protocol.published.get(key)
         assert row["case"] in line and row["quantity"] in line
 
+    half = tmp_path / "half.json"
+    assert main([*argv, "--bf16", "--json", str(half)]) == 0
+    assert read(half)["bf16"] and not content["bf16"]
+    assert read(half)["errors"] != content["errors"]  # of other rounding
+
 
 def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
     """Default folders, whose names hold no slash; the recipe and protocol of any robot."""

@@ -4,6 +4,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional, real_scene
@@ -15,7 +17,8 @@ from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
 from torchrl_nerd.evaluation.toss_error import STATES
 from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
 from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.scenes import Scene, load_scene
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,8 @@ class Eval(DeviceCommand):
     """Of the starts; test seeds are never used in training or validation."""
     inference: Inference = "streaming"
     """streaming, or window: the paper's recomputation."""
+    bf16: bool = False
+    """Network in bfloat16, state in float64: for processors that multiply in it."""
     fine: bool = False
     """Against MuJoCo's RK4 at four times the scene's substeps."""
     unseen_terrain: bool = False
@@ -67,7 +72,7 @@ class Eval(DeviceCommand):
                     f"no unseen terrain for '{self.scene}', expected one of {known}"
                 )
             protocol = UNSEEN_TERRAIN[self.scene]()
-        model = from_pretrained(self.model or self.scene, scene).to(self.device)
+        model = self._load(self.model or self.scene, scene)
         rows = []
         header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"
         print(f"{header}{'final':>9}{'p95':>9}  paper")
@@ -94,13 +99,18 @@ class Eval(DeviceCommand):
                     line += "".join(f"{figure:>9.5f}" for figure in figures)
                     print(f"{line}  {paper if paper is not None else '-'}")
         settings = {"rows": self.rows, "seed": self.seed}
-        settings |= {"inference": self.inference, "fine": self.fine}
+        settings |= {"inference": self.inference, "fine": self.fine, "bf16": self.bf16}
         return {"scene": self.scene, **settings, "errors": rows}
+
+    def _load(self, name: Path | str, scene: Scene) -> NeRD:
+        """The model as it was asked for."""
+        model = from_pretrained(name, scene).to(self.device)
+        return model.to(torch.bfloat16) if self.bf16 else model
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
         """The same for recorded tosses."""
         scene = real_scene(self.scene)
-        model = from_pretrained(self.model or SHIPPED, scene).to(self.device)
+        model = self._load(self.model or SHIPPED, scene)
         tosses, split = load_tosses(path, scene)
         if self.split != "all" and self.split not in split:
             expected = ", ".join(("all", *split))

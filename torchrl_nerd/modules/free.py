@@ -2,7 +2,7 @@
 
 Most of what a solver does then needs no learning: it is the equation of motion. A network
 errs by a tenth of a step where two looks at that equation err by a thousandth, see
-docs/results.md. So it is left with the rest, joints' limits above all, and has no more say
+docs/studies.md. So it is left with the rest, joints' limits above all, and has no more say
 than there is to say.
 """
 

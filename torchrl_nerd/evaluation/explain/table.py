@@ -35,7 +35,7 @@ def _kept(report: SceneReport) -> list[str]:
     if report.derived:
         names = ", ".join(report.derived)
         lines.append(f"derived: {names}: functions of the kinds above them, kept since")
-        lines.append("they are slow to learn (coming depth: docs/results.md)")
+        lines.append("they are slow to learn (coming depth: docs/studies.md)")
     added = [kind.name for kind in report.kinds if kind.name in ADDED]
     lines.append(f"not in the paper's input: {', '.join(added) or 'none'}")
     return lines

@@ -1,0 +1,93 @@
+"""One token a step against the paper's window of ten, recomputed, by preset.
+
+    python benchmarks/streaming.py
+    python benchmarks/streaming.py cartpole --presets tiny --rows 64 --no-compile
+
+Untrained networks of the scene's sizes, since their speed does not depend on weights; that
+both err alike is seen in the races of trained ones (`nerd bench cartpole`). All take turns
+in one run.
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+
+import torch
+import tyro
+from scaling import stepper
+from tyro.conf import Positional
+
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way
+from torchrl_nerd.files import write_json
+from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.scenes import Scene, load_scene
+
+
+@dataclass
+class Options:
+    """What to time, and how often."""
+
+    scene: Positional[str] = "ant"
+    presets: tuple[str, ...] = ("tiny", "small", "paper")
+    rows: int = 512
+    rounds: int = 5
+    compile: bool = True
+    """Have compiled rows."""
+    threads: int = 2
+    seed: int = 0
+    json: Path | None = None
+    """Write the figures to this file."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Control steps per second, medians over turns; and the ratio's in the same turn."""
+
+    preset: str
+    is_compiled: bool
+    streaming_per_s: float
+    window_per_s: float
+    ratio: float
+
+
+def measure(scene: Scene, preset: str, is_compiled: bool, options: Options) -> Speed:
+    """Both ways of one network."""
+    state = states_on_the_way(scene, options.rows, options.seed)
+    model = NeRD(scene, network_config(preset))
+    runners = [
+        Runner(stepper(NeRDDynamics(model, way, compile=is_compiled), state))
+        for way in ("streaming", "window")
+    ]
+    turns = [[runner.steps_per_s() for runner in runners] for _ in range(options.rounds)]
+    streaming, window = (
+        options.rows * median(rates) for rates in zip(*turns, strict=True)
+    )
+    ratio = median(a / b for a, b in turns)
+    return Speed(preset, is_compiled, streaming, window, ratio)
+
+
+def main(options: Options) -> list[Speed]:
+    """Print a row for every preset, eager and compiled."""
+    torch.set_num_threads(options.threads)
+    scene, found = load_scene(options.scene), []
+    print(f"{scene.name}, {options.rows} rows, {options.threads} threads, steps/s")
+    print(f"{'preset':<22}{'streaming':>11}{'window':>9}{'ratio':>7}")
+    for preset in options.presets:
+        for is_compiled in (False, True)[: 1 + options.compile]:
+            x = measure(scene, preset, is_compiled, options)
+            name = f"{preset}, compiled" if is_compiled else preset
+            rates = f"{x.streaming_per_s:>11,.0f}{x.window_per_s:>9,.0f}{x.ratio:>7.1f}"
+            print(f"{name:<22}{rates}", flush=True)
+            found.append(x)
+    if options.json is not None:
+        about = {"scene": scene.name, "rows": options.rows, "threads": options.threads}
+        speeds = [asdict(x) for x in found]
+        write_json(
+            options.json, {**about, "torch": torch.__version__, "speeds": speeds}
+        )
+    return found
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
