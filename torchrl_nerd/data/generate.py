@@ -174,7 +174,8 @@ def generate(
     drawn = mapper(partial(draw_chunk, draw, config), chunks)
     for (number, rows), data in zip(chunks, drawn, strict=True):
         sound = is_sound(data)
-        kept, first = data[sound], card["trajectories"]
+        kept = data if sound.all() else data[sound]
+        first = card["trajectories"]
         store[first : first + len(kept)] = kept
         card["trajectories"] += len(kept)
         card["dropped"] += int((~sound).sum())

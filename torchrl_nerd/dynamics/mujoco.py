@@ -149,17 +149,16 @@ class MujocoDynamics:
 
     def _control(self, joint_torque: Tensor, terrain: Tensor | None) -> np.ndarray:
         """MuJoCo's control vector, ``(rows, T, size)``: applied force, ground's pose."""
-        shape = joint_torque.shape[:-1]
-        force = torch.zeros(*shape, self._model.nv, dtype=torch.float64)
-        force[..., self.scene.actuated] = joint_torque.double().cpu()
-        ground = self.scene.terrain
-        if terrain is None or ground is None or not ground.is_per_row:
-            pos = torch.from_numpy(self._data[0].mocap_pos.reshape(-1))
-            quat = torch.from_numpy(self._data[0].mocap_quat.reshape(-1))
-            pose = torch.cat((pos, quat)).expand(shape[0], -1)
+        size = mujoco.mj_stateSize(self._model, CONTROL)
+        control = np.zeros((*joint_torque.shape[:-1], size))
+        control[..., self.scene.actuated] = joint_torque.double().cpu().numpy()
+        ground, pose = self.scene.terrain, control[..., self._model.nv :]
+        if terrain is not None and ground is not None and ground.is_per_row:
+            pose[:] = ground.mocap_pose(terrain.double().cpu()).numpy()[:, None]
         else:
-            pose = ground.mocap_pose(terrain.double().cpu())
-        return torch.cat((force, pose[:, None].expand(*shape, -1)), -1).numpy()
+            data = self._data[0]
+            pose[:] = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
+        return control
 
     def _substeps(
         self, qpos: np.ndarray, qvel: np.ndarray, control: np.ndarray
