@@ -98,7 +98,7 @@ def test_every_option_that_is_named_exists(page, capsys):
         with pytest.raises(SystemExit):
             main([name, "--help"])
         known = capsys.readouterr().out
-        for option in re.findall(r"--[a-z-]+", options):
+        for option in re.findall(r"--[a-z0-9-]+", options):
             assert re.search(rf"{option}(?![\w-])", known), f"nerd {name}{options}"
 
 
