@@ -59,7 +59,9 @@ def measure(scene: Scene, preset: str, is_compiled: bool, options: Options) -> S
         Runner(stepper(NeRDDynamics(model, way, compile=is_compiled), state))
         for way in ("streaming", "window")
     ]
-    turns = [[runner.steps_per_s() for runner in runners] for _ in range(options.rounds)]
+    turns = [
+        [runner.steps_per_s() for runner in runners] for _ in range(options.rounds)
+    ]
     streaming, window = (
         options.rows * median(rates) for rates in zip(*turns, strict=True)
     )
