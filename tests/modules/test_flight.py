@@ -200,3 +200,13 @@ def test_other_robots_are_refused(what):
     scene = load_scene("franka") if what == "ground" else load_scene(what)
     with pytest.raises(ValueError, match=r"expected a (ground|robot).*got scene"):
         Flight(scene)
+
+
+@each_flying
+def test_no_rows_at_all_have_clearances_and_a_free_step(scene, generator):
+    """As an empty share of a batch has them."""
+    rows = transitions(scene, ROWS, generator)[:0]
+    gaps = scene.clearances(rows[QPOS], rows.get(TERRAIN, None))
+    assert gaps.shape == (0, len(scene.contacts))
+    after = Flight(scene).free_step(rows[QPOS], rows[QVEL], rows[JOINT_TORQUE])
+    assert [len(x) for x in after] == [0] * 4

@@ -280,7 +280,8 @@ def _join(motions: list[Motion]) -> Motion:
 
 def _side_by_side(parts: tuple[Tensor, ...]) -> Tensor:
     """Bodies together; where all rows of a part are alike, there as many as elsewhere."""
-    rows = max(part.shape[-1] for part in parts)
+    counts = [part.shape[-1] for part in parts]
+    rows = min(counts) and max(counts)  # a batch may be empty
     return torch.cat([part.expand(*part.shape[:-1], rows) for part in parts], -2)
 
 
