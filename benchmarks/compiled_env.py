@@ -10,7 +10,6 @@ and held, from the starts of episodes on, so robots that fall spend some steps i
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 
 import torch
 import tyro
@@ -18,7 +17,7 @@ import tyro
 from torchrl_nerd import NeRDEnv
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.evaluation.bench.rates import Runner
+from torchrl_nerd.evaluation.bench.rates import Runner, two_in_turn
 from torchrl_nerd.files import write_json
 from torchrl_nerd.tasks import TASKS, make_task
 
@@ -64,13 +63,12 @@ def compare(task: str, rows: int, rounds: int, seed: int) -> dict[str, float]:
     began = time.perf_counter()
     compiled(2)
     seconds = time.perf_counter() - began
-    runners = [Runner(stepper, time.process_time) for stepper in (eager, compiled)]
-    turns = [[1e6 / (rows * r.steps_per_s()) for r in runners] for _ in range(rounds)]
-    slow, fast = zip(*turns, strict=True)
+    one, other = (Runner(x, time.process_time) for x in (compiled, eager))
+    fast, slow, ratio = two_in_turn(one, other, rounds)
     return {
-        "eager_us": median(slow),
-        "compiled_us": median(fast),
-        "ratio": median(a / b for a, b in turns),
+        "eager_us": 1e6 / (rows * slow),
+        "compiled_us": 1e6 / (rows * fast),
+        "ratio": ratio,
         "compile_s": seconds,
     }
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean
 from typing import Any, cast
 
 import mujoco
@@ -25,7 +25,7 @@ from tensordict import TensorDict
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.evaluation.bench.cost import memory_bytes
-from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way
+from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_in_turn
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD, network_config
@@ -111,11 +111,8 @@ def measure(scene: Scene, batch: int, options: Options) -> Point:
     model = NeRD(scene, network_config(options.network))
     learned = NeRDDynamics(model, compile=options.compile)
     true = MujocoDynamics(scene, num_threads=1)
-    runners = [Runner(stepper(x, state), time.process_time) for x in (true, learned)]
-    rounds = [[x.steps_per_s() for x in runners] for _ in range(options.rounds)]
-    true_us, learned_us = (
-        1e6 / (batch * median(rates)) for rates in zip(*rounds, strict=True)
-    )
+    one, other = (Runner(stepper(x, state), time.process_time) for x in (learned, true))
+    learned_rate, true_rate, ratio = two_in_turn(one, other, options.rounds)
     return Point(
         scene=scene.name,
         rows=batch,
@@ -123,9 +120,9 @@ def measure(scene: Scene, batch: int, options: Options) -> Point:
         substeps=scene.substeps,
         points=len(scene.contacts),
         contacts=mean_contacts(scene, state),
-        mujoco_us=true_us,
-        learned_us=learned_us,
-        ratio=median(learned / true for true, learned in rounds),
+        mujoco_us=1e6 / (batch * true_rate),
+        learned_us=1e6 / (batch * learned_rate),
+        ratio=ratio,
         state_bytes=8 * (scene.model.nq + scene.model.nv),
     )
 

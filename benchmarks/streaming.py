@@ -10,7 +10,6 @@ in one run.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import median
 
 import torch
 import tyro
@@ -18,7 +17,7 @@ from scaling import stepper
 from tyro.conf import Positional
 
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way
+from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_in_turn
 from torchrl_nerd.files import write_json
 from torchrl_nerd.modules.nerd import NeRD, network_config
 from torchrl_nerd.scenes import Scene, load_scene
@@ -55,18 +54,13 @@ def measure(scene: Scene, preset: str, is_compiled: bool, options: Options) -> S
     """Both ways of one network."""
     state = states_on_the_way(scene, options.rows, options.seed)
     model = NeRD(scene, network_config(preset))
-    runners = [
+    streaming, window = (
         Runner(stepper(NeRDDynamics(model, way, compile=is_compiled), state))
         for way in ("streaming", "window")
-    ]
-    turns = [
-        [runner.steps_per_s() for runner in runners] for _ in range(options.rounds)
-    ]
-    streaming, window = (
-        options.rows * median(rates) for rates in zip(*turns, strict=True)
     )
-    ratio = median(a / b for a, b in turns)
-    return Speed(preset, is_compiled, streaming, window, ratio)
+    fast, slow, ratio = two_in_turn(streaming, window, options.rounds)
+    rows = options.rows
+    return Speed(preset, is_compiled, rows * fast, rows * slow, ratio)
 
 
 def main(options: Options) -> list[Speed]:

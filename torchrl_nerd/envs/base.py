@@ -288,6 +288,5 @@ def _emptied(rows: Tensor, value: Any) -> Any:
     if isinstance(value, Tensor):
         return value.masked_fill(_beside(rows, value), 0)
     if isinstance(value, TensorDictBase):
-        kept = {key: _emptied(rows, x) for key, x in value.items()}
-        return value.copy().update(kept)
+        return value.apply(lambda x: _emptied(rows, x))
     return value

@@ -228,3 +228,10 @@ class Runner:
     def steps_per_s(self) -> float:
         """Of one visit."""
         return self._length / _seconds(self._run, self._length, self._clock)
+
+
+def two_in_turn(one: Runner, other: Runner, rounds: int) -> tuple[float, float, float]:
+    """Steps per second of both, and of the first to the second: medians over rounds."""
+    turns = [(one.steps_per_s(), other.steps_per_s()) for _ in range(rounds)]
+    first, second = (median(rates) for rates in zip(*turns, strict=True))
+    return first, second, median(a / b for a, b in turns)
