@@ -27,6 +27,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.free import FreeNeRD
+from torchrl_nerd.modules.ground_step import GroundStep
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import make_task
@@ -56,8 +57,24 @@ def is_free(scene: Scene) -> bool:
     return True
 
 
+def is_grounded(scene: Scene) -> bool:
+    """Whether a `GroundStep` can move the robot."""
+    try:
+        GroundStep(scene)
+    except ValueError:
+        return False
+    return True
+
+
 FREE = [load_scene(name) for name in SCENES if is_free(load_scene(name))]
+GROUNDED = [load_scene(name) for name in SCENES if is_grounded(load_scene(name))]
+STEPPED = [(s, "free") for s in FREE] + [(s, "grounded") for s in GROUNDED]
 each_free = pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.name)
+each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)
+each_stepped = pytest.mark.parametrize(
+    ("scene", "network"), STEPPED, ids=lambda x: getattr(x, "name", x)
+)
+"""Every robot that a step moves, with the name of the network that corrects it."""
 
 
 def enliven(network: nn.Module, generator: Generator) -> nn.Module:

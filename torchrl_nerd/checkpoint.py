@@ -19,8 +19,13 @@ from tensordict.utils import NestedKey
 from torchrl_nerd import __version__
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
-from torchrl_nerd.modules.correction import FreeConfig, ResidualConfig
+from torchrl_nerd.modules.correction import (
+    FreeConfig,
+    GroundedConfig,
+    ResidualConfig,
+)
 from torchrl_nerd.modules.free import FreeNeRD
+from torchrl_nerd.modules.grounded import GroundedNeRD
 from torchrl_nerd.modules.nerd import Config, NeRD, NetworkConfig
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
@@ -48,6 +53,7 @@ KINDS: dict[str, type] = {
     "gru": GRUConfig,
     "residual-mlp": ResidualConfig,
     "free-mlp": FreeConfig,
+    "grounded-mlp": GroundedConfig,
 }
 
 
@@ -65,6 +71,8 @@ def make_model(
         return ResidualNeRD(scene, config, stats)
     if isinstance(config, FreeConfig):
         return FreeNeRD(scene, config, stats)
+    if isinstance(config, GroundedConfig):
+        return GroundedNeRD(scene, config, stats)
     return NeRD(scene, config, stats)
 
 

@@ -120,7 +120,7 @@ class NeRDDynamics:
         model = self.model
         raw = model.tokens(qpos, qvel, torque, terrain)
         features = model.normalize.normalize(TOKEN, raw)
-        token = model.assemble(features, qpos, qvel, torque)
+        token = model.assemble(features, qpos, qvel, torque, terrain)
         after = model.decode(qpos, qvel, self.network.step(token, memory))
         if model.flight is not None:
             gap = model.tokens.gap(raw)

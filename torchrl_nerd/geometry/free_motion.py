@@ -122,9 +122,32 @@ class FreeMotion(nn.Module):
             period: s over which the acceleration is meant to hold: damping is taken at its
                 middle, so that no joint is braked beyond rest.
         """
-        rate, position = _rows_last(qvel, 1), _rows_last(qpos, 1)
-        spin, slide = self._axes(_rows_last(places, 2))
-        four = _rows_last(corners, 2).unflatten(1, (-1, len(CORNERS)))
+        where = rotation, corners, places
+        parts = self.equation(qpos, qvel, joint_torque, *where, period)
+        acceleration = _solve(*parts).movedim(0, -1).reshape(qvel.shape)
+        if not self.num_whole:
+            return acceleration
+        linear = (rotation @ acceleration[..., :3, None])[..., 0]
+        return torch.cat((linear, acceleration[..., 3:]), -1)
+
+    def equation(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor | None,
+        rotation: Tensor,
+        corners: Tensor,
+        places: Tensor,
+        period: float | Tensor = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        """Mass matrix ``(nv, nv, N)`` and forces ``(nv, N)`` of all N rows.
+
+        Of the arguments of `forward`. A free base's velocity is in B_t here, as seen by
+        one who moves on with it.
+        """  # noqa: D417
+        rate, position = rows_last(qvel, 1), rows_last(qpos, 1)
+        spin, slide = self._axes(rows_last(places, 2))
+        four = rows_last(corners, 2).unflatten(1, (-1, len(CORNERS)))
         second = (four[:, None] * four).sum(3) * (self.mass / len(CORNERS))
         bodies = _Inertia(self.mass, four.mean(2) * self.mass, second)
         moment, force = bodies.of_groups(self.carries).momentum(spin, slide)
@@ -135,21 +158,17 @@ class FreeMotion(nn.Module):
         lower = (1.0 - self.together)[..., None] * upper.transpose(0, 1)
         extra = torch.diag(self.armature + 0.5 * period * self.damping)
         mass_matrix = upper + lower + extra[..., None]
-        gravity = _rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
+        gravity = rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
         push = -self._bias(bodies, spin, slide, rate, gravity)
         push = push - self.damping[:, None] * rate
         if joint_torque is not None:
             driven = torch.zeros_like(rate)
-            driven[self.actuated] = _rows_last(joint_torque, 1)
+            driven[self.actuated] = rows_last(joint_torque, 1)
             push = push + driven
         stretch = self.rest[:, None] - position[self.qpos_addresses]
         stretch = self.stiffness[:, None] * stretch
         push = torch.cat((push[: self.num_whole], push[self.num_whole :] + stretch))
-        acceleration = _solve(mass_matrix, push).movedim(0, -1).reshape(qvel.shape)
-        if not self.num_whole:
-            return acceleration
-        linear = (rotation @ acceleration[..., :3, None])[..., 0]
-        return torch.cat((linear, acceleration[..., 3:]), -1)
+        return mass_matrix, push
 
     def _axes(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """How each dof turns, and moves the base frame's origin, ``(3, nv, N)``."""
@@ -191,7 +210,7 @@ class FreeMotion(nn.Module):
         return (spin * (self.carries @ moment) + slide * (self.carries @ force)).sum(0)
 
 
-def _rows_last(x: Tensor, size: int) -> Tensor:
+def rows_last(x: Tensor, size: int) -> Tensor:
     """``(*batch, n, d)`` (its last ``size`` dimensions) as ``(d, n, N)``."""
     batch = x.ndim - size
     flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])

@@ -32,6 +32,18 @@ class FreeConfig:
         return Correction(self, num_inputs, num_outputs)
 
 
+@dataclass(frozen=True)
+class GroundedConfig:
+    """An MLP of ``depth`` blocks of ``width`` on a step along a robot's springs."""
+
+    depth: int = 2
+    width: int = 64
+
+    def build(self, num_inputs: int, num_outputs: int) -> "Correction":
+        """A network that corrects nothing yet."""
+        return Correction(self, num_inputs, num_outputs)
+
+
 class Correction(nn.Module):
     """Adds to the simulator's change what an MLP makes of all, times the token's last.
 
@@ -39,12 +51,15 @@ class Correction(nn.Module):
 
     Args:
         config: depth and width of the MLP.
-        num_inputs: width F of what a network sees without a simulator.
+        num_inputs: width F of what a network sees beside the simulator's change.
         num_outputs: width D of changes.
     """
 
     def __init__(
-        self, config: ResidualConfig | FreeConfig, num_inputs: int, num_outputs: int
+        self,
+        config: ResidualConfig | FreeConfig | GroundedConfig,
+        num_inputs: int,
+        num_outputs: int,
     ) -> None:
         super().__init__()
         self.num_outputs = num_outputs

@@ -52,7 +52,13 @@ class FreeNeRD(NeRD):
         super().__init__(scene, config, stats)
         self.free_step = FreeStep(scene)
 
-    def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
+    def foresee(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> Tensor:
         """The step's change and its doubt, ``(*batch, D + 1)``."""
         *after, second, beyond = self.free_step(qpos, qvel, joint_torque)
         change = self.state_delta.delta(qpos, qvel, *after)

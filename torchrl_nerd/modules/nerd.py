@@ -8,7 +8,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
-from torchrl_nerd.modules.correction import FreeConfig
+from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.coverage import Coverage
 from torchrl_nerd.modules.flight import Flight
 from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
@@ -22,7 +22,7 @@ from torchrl_nerd.transforms import (
     Stats,
 )
 
-NetworkConfig = TransformerConfig | MLPConfig | GRUConfig | FreeConfig
+NetworkConfig = TransformerConfig | MLPConfig | GRUConfig | FreeConfig | GroundedConfig
 
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
@@ -37,19 +37,23 @@ NETWORKS: dict[str, NetworkConfig] = {
 }
 """Networks by name, for the command line."""
 
-FREE: dict[str, NetworkConfig] = {"free": FreeConfig()}
-"""Those of a `FreeNeRD`: for robots that nothing touches."""
+STEPS: dict[str, NetworkConfig] = {
+    "free": FreeConfig(),
+    "grounded": GroundedConfig(),
+}
+"""Those that correct a step: of a `FreeNeRD`, for robots that nothing touches, and of a
+`GroundedNeRD`, for robots on springs."""
 
 TOKEN, TARGET = "token", "target"
 
 
 def network_config(name: str) -> NetworkConfig:
-    """The network of that name in `NETWORKS` or `FREE`.
+    """The network of that name in `NETWORKS` or `STEPS`.
 
     Raises:
         SettingError: no such network.
     """
-    known = NETWORKS | FREE
+    known = NETWORKS | STEPS
     if name not in known:
         raise SettingError(
             f"unknown network '{name}', expected one of {', '.join(known)}"
@@ -113,7 +117,7 @@ class NeRD(nn.Module):
         )
         self.coverage = Coverage(scene, num_inputs, num_outputs)
         self.flight: Flight | None = None
-        self.network = config.build(num_inputs, num_outputs)
+        self.network = config.build(num_inputs + self.num_hints, num_outputs)
 
     def fly(self) -> "NeRD":
         """Have rows that nothing pushes move along their free motion; returns itself.
@@ -132,7 +136,7 @@ class NeRD(nn.Module):
         What lies outside the training data is taken to their border, see `Coverage`.
         """
         features = self.features(qpos, qvel, joint_torque, terrain)
-        return self.assemble(features, qpos, qvel, joint_torque)
+        return self.assemble(features, qpos, qvel, joint_torque, terrain)
 
     def features(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
@@ -142,24 +146,41 @@ class NeRD(nn.Module):
         return self.normalize.normalize(TOKEN, raw)
 
     def assemble(
-        self, features: Tensor, qpos: Tensor, qvel: Tensor, joint_torque: Tensor
+        self,
+        features: Tensor,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
     ) -> Tensor:
         """The network's token ``(*batch, token_size)``, from a state's `features`."""
         token = self.coverage.clamp_token(features).to(self.dtype)
         if not self.has_simulator:
             return token
-        change = self.foresee(qpos, qvel, joint_torque)
+        change = self.foresee(qpos, qvel, joint_torque, terrain)
         exact = torch.promote_types(self.dtype, torch.float32)
         return torch.cat((token.to(exact), change.to(exact)), -1)
 
-    def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
-        """The change that a simulator within foresees, and its gate ``(*batch, D + 1)``."""
+    @property
+    def num_hints(self) -> int:
+        """H: what a simulator within tells beside its change."""
+        return 0
+
+    def foresee(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> Tensor:
+        """What a simulator within foresees: hints, change, gate ``(*batch, H + D + 1)``."""
         raise NotImplementedError(f"{type(self).__name__} has no simulator within")
 
     @property
     def token_size(self) -> int:
         """Width of a token: the features, and what is foreseen."""
-        return self.tokens.size + self.has_simulator * (self.state_delta.size + 1)
+        foreseen = self.num_hints + self.state_delta.size + 1
+        return self.tokens.size + self.has_simulator * foreseen
 
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor

@@ -43,7 +43,13 @@ class ResidualNeRD(NeRD):
         super().__init__(scene, config, stats)
         self.simulator = PenaltyStep(scene, config.substeps)
 
-    def foresee(self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor) -> Tensor:
+    def foresee(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> Tensor:
         """The simulator's change and how much of it is contact, ``(*batch, D + 1)``."""
         flat = qpos.reshape(-1, qpos.shape[-1]), qvel.reshape(-1, qvel.shape[-1])
         *after, push = self.simulator(*flat)

@@ -17,6 +17,7 @@ from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 PART = 1024  # trajectories turned into tokens at a time
+FEW = 32  # of them at a time are stepped: what a step takes stays in a cache
 LOOK = 8  # parts in which images of tokens are looked for
 # ... and beside them states in which every contact point has features, which those of a
 # small data set may never have
@@ -197,9 +198,12 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def foreseen(model: NeRD, data: TensorDict) -> Tensor:
-    """What the simulator within foresees of transitions, float32 ``(*batch, D + 1)``."""
-    inputs = ((part[QPOS], part[QVEL], part[JOINT_TORQUE]) for part in data.split(PART))
-    return torch.cat([model.foresee(*given).float() for given in inputs])
+    """What the simulator within foresees, float32 ``(*batch, model.token_size - F)``."""
+    found = []
+    for part in data.split(FEW):
+        state, terrain = (part[QPOS], part[QVEL]), part.get(TERRAIN, None)
+        found.append(model.foresee(*state, part[JOINT_TORQUE], terrain).float())
+    return torch.cat(found)
 
 
 def cover(

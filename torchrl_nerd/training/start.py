@@ -5,7 +5,14 @@ import hashlib
 from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import make_model
-from torchrl_nerd.modules.nerd import FREE, NETWORKS, NeRD, network_config
+from torchrl_nerd.modules.correction import GroundedConfig
+from torchrl_nerd.modules.nerd import (
+    NETWORKS,
+    STEPS,
+    Config,
+    NeRD,
+    network_config,
+)
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import Symmetry, data_stats
 
@@ -21,10 +28,20 @@ def fresh_model(
         network: name in `NETWORKS`.
         symmetry: whose images count as data too.
     """
+    config = network_config(network)
+    scene = seen_by(config, scene)
     stats = data_stats(scene, data)
     if symmetry is not None:
         stats = symmetry.complete(stats)
-    return make_model(scene, network_config(network), stats)
+    return make_model(scene, config, stats)
+
+
+def seen_by(config: Config, scene: Scene) -> Scene:
+    """The scene with the features that such a network is shown.
+
+    What its springs push with, and where, a `GroundStep` finds out by itself.
+    """
+    return scene.foreseeing(False) if isinstance(config, GroundedConfig) else scene
 
 
 def begin_from(
@@ -48,13 +65,16 @@ def begin_from(
     """
     if start.config != network_config(network):
         names = [
-            name for name, config in (NETWORKS | FREE).items() if config == start.config
+            name
+            for name, config in (NETWORKS | STEPS).items()
+            if config == start.config
         ]
         raise ValueError(
             f"expected the network of the model to start from, "
             f"{' or '.join(names) or start.config}, got {network}"
         )
-    model = make_model(scene, network_config(network))
+    config = network_config(network)
+    model = make_model(seen_by(config, scene), config)
     widths, found = ((m.tokens.size, m.state_delta.size) for m in (model, start))
     if widths != found:
         raise ValueError(

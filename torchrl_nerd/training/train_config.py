@@ -17,7 +17,8 @@ class TrainConfig:
 
     | field | meaning |
     |---|---|
-    | ``network`` | name in `NETWORKS`, or ``free``, see `FreeNeRD` |
+    | ``network`` | name in `NETWORKS`, or ``free``, see `FreeNeRD`, or ``grounded``, see
+      `GroundedNeRD` |
     | ``steps`` | updates on one-step targets |
     | ``rollout_steps`` | further updates on the model's own rollouts |
     | ``rows``, ``length`` | sequences per update and tokens of each |

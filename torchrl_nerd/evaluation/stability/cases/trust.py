@@ -80,7 +80,7 @@ def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
     fine = torch.all(after[QVEL].isfinite(), -1)
     target = model.state_delta.delta(*now, after[QPOS], after[QVEL])
     features = model.features(*now, torque, terrain)
-    token = model.assemble(features, *now, torque)
+    token = model.assemble(features, *now, torque, terrain)
     with torch.no_grad():
         output = model.network.step(token, model.network.empty_memory(len(token)))
     error = output.double() - model.normalize.normalize(TARGET, target)

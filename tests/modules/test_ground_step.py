@@ -1,0 +1,178 @@
+"""A step along springs: MuJoCo's substeps, but for what changes between two looks."""
+
+from dataclasses import replace
+
+import mujoco
+import pytest
+import torch
+from dynamics_helpers import GROUNDED, each_grounded
+from helpers import in_ground, make_scene, random_transitions, true_step
+
+from torchrl_nerd.geometry.manifold import differentiate_pos
+from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.ground_step import GroundStep
+from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes.penalty import set_penalty_contact
+
+ROWS = 256
+BALL = """<mujoco><option cone="{cone}" timestep="0.001"/><worldbody>
+  <geom type="plane" size="1 1 1"/><body pos="0 0 0.2"><freejoint/>
+  <geom size="0.1" density="200"/></body></worldbody></mujoco>"""
+
+
+def moved(scene, rows, **how):
+    """The step's next state of ``rows``."""
+    inputs = rows[QPOS], rows[QVEL], rows[JOINT_TORQUE], rows.get(TERRAIN, None)
+    return GroundStep(scene)(*inputs, **how)
+
+
+def errors(scene, rows):
+    """Error of velocities and places, over the true change of velocity, of each row."""
+    qpos, qvel, _ = moved(scene, rows)
+    truth = rows["next"]
+    size = (truth[QVEL] - rows[QVEL]).norm(dim=-1).clamp_min(1e-6)
+    fast = (qvel - truth[QVEL]).norm(dim=-1) / size
+    slip = differentiate_pos(scene.layout, qpos, truth[QPOS]).norm(dim=-1)
+    return fast, slip / (size * scene.control_step)
+
+
+def touching(scene, generator):
+    rows = in_ground(scene, ROWS, generator)
+    return true_step(scene, rows.exclude("next"), rows[JOINT_TORQUE])
+
+
+def air(scene, generator):
+    """Rows that neither ground nor limits push."""
+    rows = random_transitions(scene, ROWS, generator)
+    if scene.base.is_floating:
+        rows[QPOS][:, 2] += 3.0
+    else:
+        rows[TERRAIN][:, 3] -= 10.0
+    for joint in range(scene.model.njnt):
+        if scene.model.jnt_limited[joint]:
+            at = scene.model.jnt_qposadr[joint]
+            rows[QPOS][:, at] = float(scene.model.jnt_range[joint].mean())
+    rows[QVEL].mul_(0.3)
+    rows[JOINT_TORQUE] = 0.01 * rows[JOINT_TORQUE]
+    return true_step(scene, rows.exclude("next"), rows[JOINT_TORQUE])
+
+
+@each_grounded
+def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, generator):
+    """What the law leaves out is in proportion to their impedance."""
+    model = scene.with_substeps(scene.substeps).model
+    one, found = replace(scene, model=model, substeps=1), []
+    rows = in_ground(one, ROWS, generator).exclude("next")
+    torque = random_transitions(one, ROWS, generator)[JOINT_TORQUE]
+    for impedance in (1e-3, 1e-4):  # MuJoCo's least
+        for solimp in (model.geom_solimp, model.jnt_solimp):
+            solimp[:, :2] = impedance
+        fast, slip = errors(one, true_step(one, rows, torque))
+        assert fast.median() < 20.0 * impedance and slip.median() < 20.0 * impedance
+        found.append(fast.median())
+    assert found[1] < 0.2 * found[0]
+
+
+@each_grounded
+def test_it_goes_where_mujoco_goes(scene, generator):
+    fast, slip = errors(scene, touching(scene, generator))
+    assert fast.median() < 0.05 and slip.median() < 0.05
+
+
+@each_grounded
+def test_half_a_step_in_the_air_has_an_eighth_of_the_error(scene, generator):
+    rows, found = air(scene, generator), []
+    for parts in (1, 2):
+        model = scene.with_substeps(scene.substeps).model
+        model.opt.timestep /= parts
+        here = replace(scene, model=model)
+        start = rows.exclude("next")
+        fast, slip = errors(here, true_step(here, start, rows[JOINT_TORQUE]))
+        found.append((fast.norm(), slip.norm()))
+    for coarse, fine in zip(*found, strict=True):
+        assert fine < max(coarse / 2.5, 1e-7)  # relative: an eighth over a half
+
+
+@each_grounded
+def test_springs_are_as_good_in_float32(scene, generator):
+    rows = touching(scene, generator)
+    expected, got = moved(scene, rows), moved(scene, rows, dtype=torch.float32)
+    size = (expected[1] - rows[QVEL]).norm(dim=-1)
+    error = (got[1] - expected[1]).norm(dim=-1)
+    assert (error < 1e-3 * (1.0 + size)).float().mean() > 0.97  # some lose touch by it
+    assert got[0].dtype == got[1].dtype == torch.float64
+
+
+@each_grounded
+def test_any_batch_is_a_batch_of_rows(scene, generator):
+    rows = touching(scene, generator)[:6]
+    flat, square = moved(scene, rows), moved(scene, rows.reshape(2, 3))
+    for one, other in zip(flat, square, strict=True):
+        torch.testing.assert_close(other.flatten(0, 1), one)
+    alone = moved(scene, rows[4:5])
+    for one, other in zip(flat, alone, strict=True):
+        torch.testing.assert_close(other[0], one[4], atol=1e-9, rtol=1e-9)
+
+
+def test_it_has_gradients(generator):
+    scene = load_scene("cube")
+    rows = touching(scene, generator)[:8]
+    step = GroundStep(scene)
+    speed = rows[QVEL].clone().requires_grad_()
+    (found,) = torch.autograd.grad(
+        step(rows[QPOS], speed, speed[:, :0])[1].sum(), speed
+    )
+    assert found.isfinite().all()
+    tiny, numeric = 1e-7, torch.zeros_like(found)
+    with torch.no_grad():
+        for k in range(speed.shape[1]):
+            ends = []
+            for sign in (1.0, -1.0):
+                moving = speed.clone()
+                moving[:, k] += sign * tiny
+                ends.append(step(rows[QPOS], moving, speed[:, :0])[1].sum(-1))
+            numeric[:, k] = (ends[0] - ends[1]) / (2.0 * tiny)
+    close = (found - numeric).abs().amax(-1) < 1e-3 * (1.0 + numeric.abs().amax(-1))
+    assert close.float().mean() > 0.7  # a row may lose touch just there
+
+
+def ball(cone="elliptic"):
+    model = mujoco.MjModel.from_xml_string(BALL.format(cone=cone))
+    set_penalty_contact(model, ke=2e3, kd=20.0, kf=30.0, mu=0.5)
+    return replace(make_scene(model), substeps=4)
+
+
+def test_a_rolling_ball_is_turned_by_its_rim():
+    """Friction acts where the ball touches, not at its centre: it spins up as it slides."""
+    scene = ball()
+    qpos = torch.tensor([[0.0, 0.0, 0.0995, 1.0, 0.0, 0.0, 0.0]]).double()
+    qvel = torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]).double()
+    _, after, _ = GroundStep(scene)(qpos, qvel, qpos[:, :0])
+    assert after[0, 0] < 1.0 and after[0, 4] > 0.0
+    inertia = 0.4 * 0.1  # over m r: of a solid sphere
+    torch.testing.assert_close(
+        inertia * after[0, 4], 1.0 - after[0, 0], rtol=0.02, atol=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("scene", "sentence"),
+    [
+        (load_scene("franka"), "expected a ground to step on, got scene 'franka'"),
+        (GROUNDED[0].fine, "expected substeps of mjINT_EULER, got mjINT_RK4"),
+        (ball("pyramidal"), "expected elliptic friction cones, got pyramidal ones"),
+    ],
+)
+def test_what_it_does_not_know_is_refused(scene, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        GroundStep(scene)
+
+
+def test_so_are_contacts_and_limits_of_another_law():
+    with pytest.raises(ValueError, match="expected contacts that are springs"):
+        GroundStep(make_scene(BALL.format(cone="elliptic")))
+    scene = load_scene("ant")
+    model = scene.with_substeps(scene.substeps).model
+    model.jnt_solref[:] = (0.02, 1.0)
+    with pytest.raises(ValueError, match="expected limits that are springs"):
+        GroundStep(replace(scene, model=model))

@@ -1,0 +1,69 @@
+"""A NeRD of a robot on the ground: a step along its springs, and what that leaves.
+
+The ground and the limits of the paper's robots are explicit springs, and between two looks
+at a robot little changes but what they push with. A network that has to find all that out
+errs by a tenth of a step, `GroundStep` by a hundredth. So the network is left with the
+rest, and has the more say the more the second look changed.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_nerd.modules.correction import GroundedConfig
+from torchrl_nerd.modules.ground_step import GroundStep
+from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms import Stats
+
+
+class GroundedNeRD(NeRD):
+    """A `GroundStep` and its learned correction; otherwise a `NeRD` like any other.
+
+    After the features the token holds what the second look changed of each velocity, then
+    the change of the state that the step foresees, normalised as targets are, and its
+    doubt, 0 to 1: the root mean square of what the second look changed.
+
+    Args:
+        scene: of a robot that `GroundStep` can move.
+        config: of the network.
+        stats: as for `NeRD`.
+
+    Raises:
+        ValueError: another robot.
+    """
+
+    has_simulator = True
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: GroundedConfig,
+        stats: Mapping[NestedKey, Stats] | None = None,
+    ) -> None:
+        step = GroundStep(scene)  # refuses before anything is built
+        super().__init__(scene, config, stats)
+        self.ground_step = step
+
+    @property
+    def num_hints(self) -> int:
+        """The second look's changes."""
+        return self.scene.layout.nv
+
+    def foresee(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> Tensor:
+        """What the second look changed, the step's change, its doubt."""
+        exact = torch.promote_types(self.dtype, torch.float32)
+        *after, second = self.ground_step(qpos, qvel, joint_torque, terrain, exact)
+        change = self.state_delta.delta(qpos, qvel, *after)
+        change = self.normalize.normalize(TARGET, change)
+        second = second / self.normalize.std(TARGET)[: self.num_hints]
+        doubt = second.square().mean(-1, keepdim=True).sqrt().clamp_max(1.0)
+        return torch.cat((second, change, doubt), -1)
