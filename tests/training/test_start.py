@@ -148,7 +148,7 @@ def test_images_need_statistics_that_they_share(generator):
 
 def test_the_shipped_ant_can_be_shown_images(generator):
     scene = load_scene("ant")
-    model, data = from_pretrained("ant", scene), simulate(scene, 16, 4, generator)
+    model, data = from_pretrained("ant-mlp", scene), simulate(scene, 16, 4, generator)
     begin_from(model, model.scene, "mlp-larger", Symmetry.of(model.scene, data))
 
 
