@@ -57,7 +57,7 @@ class NeRDDynamics:
         self.network: Network = network
         self._memory: Memory | None = None
         self._rows = 0
-        self._compiled = Compiled(self._predict)
+        self._compiled = Compiled(self._predict, **model.compile_options)
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""

@@ -36,6 +36,8 @@ class GroundedNeRD(NeRD):
     """
 
     has_simulator = True
+    # hundreds of short loops: a second thread waits for longer than it works
+    compile_options = {"options": {"cpp.threads": 1}}
 
     def __init__(
         self,

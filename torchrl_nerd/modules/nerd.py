@@ -100,6 +100,7 @@ class NeRD(nn.Module):
     """
 
     has_simulator = False  # within, whose change the network is shown, see `foresee`
+    compile_options: Mapping[str, Any] = {}  # of `torch.compile`, for a step of it
 
     def __init__(
         self,
