@@ -61,12 +61,13 @@ def _mlp(
     return Recipe(DataConfig(trajectories=trajectories, steps=100), train, task)
 
 
-def _grounded(task: str, trajectories: int, steps: int) -> Recipe:
+def _grounded(task: str, trajectories: int, steps: int, **others: Any) -> Recipe:
     """A step along springs and its correction; its last checkpoint is the model.
 
     Passive starts, which validate, tell little of what it is worth under torque.
     """
-    made = _mlp(task, trajectories, "grounded", steps, 0, softening=0.02)
+    others = {"validate_every": 5_000, **others}
+    made = _mlp(task, trajectories, "grounded", steps, 0, softening=0.02, **others)
     return replace(made, exports="last")
 
 
@@ -79,8 +80,10 @@ RECIPES: dict[str, Recipe] = {
     "double_pendulum": replace(
         _grounded("double_pendulum/passive", 30_000, 20_000), strategy="level"
     ),
-    "ant": _grounded("ant/run", 20_000, 20_000),
-    "anymal": _grounded("anymal/forward", 6_000, 12_000),
+    "ant": _grounded("ant/run", 20_000, 20_000, validate_every=4_000, bf16_share=0.85),
+    "anymal": _grounded(
+        "anymal/forward", 6_000, 12_000, validate_every=4_000, bf16_share=0.8
+    ),
     "franka": _mlp(
         "franka/reach_torque",
         12_000,
