@@ -1,5 +1,6 @@
 """A scene, a task and a dynamics joined into a batched TorchRL env."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,7 +11,7 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_nerd.compiled import Compiled
-from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
+from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition
@@ -106,9 +107,10 @@ class SceneEnv(EnvBase):
 
         Args:
             warmup: eager steps before the first compiled one; 1 where not given.
-            kwargs: of `torch.compile`.
+            kwargs: of `torch.compile`; where no mode is among them, what suits the model.
         """
-        options = {"warmup": 1 if warmup is None else warmup, **kwargs}
+        suits = {} if "mode" in kwargs else compile_options(self.dynamics)
+        options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
         self._transit = Compiled(self._transition.step, **options)
         self._restart = Compiled(self._transition.restart, **options)
         return self
@@ -290,3 +292,10 @@ def _emptied(rows: Tensor, value: Any) -> Any:
     if isinstance(value, TensorDictBase):
         return value.apply(lambda x: _emptied(rows, x))
     return value
+
+
+def compile_options(dynamics: Dynamics) -> Mapping[str, Any]:
+    """What `torch.compile` is told of these dynamics, see `NeRD.compile_options`."""
+    learned = dynamics.learned if isinstance(dynamics, GuardedDynamics) else dynamics
+    is_learned = isinstance(learned, NeRDDynamics)
+    return learned.model.compile_options if is_learned else {}

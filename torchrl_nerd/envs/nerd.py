@@ -1,7 +1,6 @@
 """A task in learned dynamics."""
 
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -57,12 +56,5 @@ class NeRDEnv(SceneEnv):
             inference=inference,
             differentiable=differentiable,
         )
-        self._compile_options = learned.model.compile_options
         dynamics = learned if guard is None else GuardedDynamics(learned, guard)
         super().__init__(task, dynamics, num_envs, seed, device, fault_folder)
-
-    def compile(self, *, warmup: int | None = None, **kwargs: Any) -> "NeRDEnv":
-        """See `SceneEnv.compile`; with what suits the model where no mode is asked for."""
-        options = {} if "mode" in kwargs else self._compile_options
-        super().compile(warmup=warmup, **{**options, **kwargs})
-        return self
