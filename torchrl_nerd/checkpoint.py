@@ -55,6 +55,11 @@ KINDS: dict[str, type] = {
     "free-mlp": FreeConfig,
     "grounded-mlp": GroundedConfig,
 }
+CORRECTED: dict[type, type[NeRD]] = {
+    ResidualConfig: ResidualNeRD,
+    FreeConfig: FreeNeRD,
+    GroundedConfig: GroundedNeRD,
+}
 
 
 def make_model(
@@ -67,13 +72,7 @@ def make_model(
     Raises:
         ValueError: a robot that no model of that configuration is for.
     """
-    if isinstance(config, ResidualConfig):
-        return ResidualNeRD(scene, config, stats)
-    if isinstance(config, FreeConfig):
-        return FreeNeRD(scene, config, stats)
-    if isinstance(config, GroundedConfig):
-        return GroundedNeRD(scene, config, stats)
-    return NeRD(scene, config, stats)
+    return CORRECTED.get(type(config), NeRD)(scene, config, stats)
 
 
 def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -8,40 +8,34 @@ from torchrl_nerd.modules.baselines import MLP, MLPConfig, NoMemory
 
 
 @dataclass(frozen=True)
-class ResidualConfig:
-    """An MLP of ``depth`` blocks of ``width`` on a simulator step of ``substeps``."""
+class CorrectionConfig:
+    """An MLP of ``depth`` blocks of ``width`` on a simulator's step."""
 
     depth: int = 2
     width: int = 64
+
+    def build(self, num_inputs: int, num_outputs: int) -> "Correction":
+        """A network that corrects nothing yet."""
+        return Correction(self, num_inputs, num_outputs)
+
+
+@dataclass(frozen=True)
+class ResidualConfig(CorrectionConfig):
+    """On ``substeps`` of a penalty simulator."""
+
     substeps: int = 8
 
-    def build(self, num_inputs: int, num_outputs: int) -> "Correction":
-        """A network that corrects nothing yet."""
-        return Correction(self, num_inputs, num_outputs)
-
 
 @dataclass(frozen=True)
-class FreeConfig:
-    """An MLP of ``depth`` blocks of ``width`` on a step along the free motion."""
+class FreeConfig(CorrectionConfig):
+    """On a step along the free motion."""
 
-    depth: int = 2
     width: int = 32
 
-    def build(self, num_inputs: int, num_outputs: int) -> "Correction":
-        """A network that corrects nothing yet."""
-        return Correction(self, num_inputs, num_outputs)
-
 
 @dataclass(frozen=True)
-class GroundedConfig:
-    """An MLP of ``depth`` blocks of ``width`` on a step along a robot's springs."""
-
-    depth: int = 2
-    width: int = 64
-
-    def build(self, num_inputs: int, num_outputs: int) -> "Correction":
-        """A network that corrects nothing yet."""
-        return Correction(self, num_inputs, num_outputs)
+class GroundedConfig(CorrectionConfig):
+    """On a step along a robot's springs."""
 
 
 class Correction(nn.Module):
@@ -56,10 +50,7 @@ class Correction(nn.Module):
     """
 
     def __init__(
-        self,
-        config: ResidualConfig | FreeConfig | GroundedConfig,
-        num_inputs: int,
-        num_outputs: int,
+        self, config: CorrectionConfig, num_inputs: int, num_outputs: int
     ) -> None:
         super().__init__()
         self.num_outputs = num_outputs

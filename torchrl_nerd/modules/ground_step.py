@@ -95,9 +95,8 @@ class GroundStep(nn.Module):
         self.whole = 3 * scene.base.is_floating  # rates that turn all there is
         limited = [2 * self.whole + joint for joint in self.limit.joints]
         # rims of several bodies in one place push together, each turned by its own joints
-        merged = np.arange(len(points))[:, None] == points.stands_for
-        carried = merged @ axes.carries(shape_points(model)[0]).T
-        carried /= merged.sum(1, keepdims=True)  # (P, J)
+        carried = points.merged @ axes.carries(shape_points(model)[0]).T
+        carried /= points.merged.sum(1, keepdims=True)  # (P, J)
         longest = int((carried > 0.0).sum(1).max(initial=0))
         # a point's own joints first, then others, which have no lever, to fill the row
         joints = np.argsort(-carried, 1, kind="stable")[:, :longest]
@@ -146,28 +145,13 @@ class GroundStep(nn.Module):
             The next ``qpos`` and ``qvel``, and by how much the second look changed the
             velocity at its time, ``(*batch, nv)``.
         """
-        batch = qpos.shape[:-1]
-        state = qpos.flatten(0, -2), qvel.flatten(0, -2)
+        batch, state = qpos.shape[:-1], (qpos, qvel, joint_torque)
+        qpos, qvel, joint_torque = (x.flatten(0, -2) for x in state)
         ground = None if terrain is None else terrain.flatten(0, -2)
-        found = self._step(*state, joint_torque.flatten(0, -2), ground, dtype)
-        return tuple(x.unflatten(0, batch) for x in found)  # pyright: ignore
-
-    def _step(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None,
-        dtype: torch.dtype,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        given = joint_torque, terrain, dtype
+        given = joint_torque, ground, dtype
         start = self._look(qpos, qvel, *given)
         joints = qpos.mT[self.limited_places].to(dtype)
         speed = self._turned(qvel.mT, start.rotation.mT).to(dtype)
-        if self.substeps == 1:  # one look is all there is
-            after = self._march(start, None, speed, joints, 1)[-1]
-            place, speed = self._moved(qpos, after, start.rotation)
-            return place, speed, torch.zeros_like(qvel)
         marches = self._march(start, None, speed, joints, self.substeps // 2)
         place, guess = self._moved(qpos, self._middle(marches), start.rotation)
         later = self._look(place, guess, *given)
@@ -175,8 +159,8 @@ class GroundStep(nn.Module):
         marches = self._march(start, later, speed, joints, self.substeps)
         second = self._middle(marches).speed.to(qvel)
         second = self._turned(second, later.rotation).mT - guess
-        place, speed = self._moved(qpos, marches[-1], later.rotation)
-        return place, speed, second
+        found = *self._moved(qpos, marches[-1], later.rotation), second
+        return tuple(x.unflatten(0, batch) for x in found)  # pyright: ignore
 
     def _middle(self, marches: list[_March]) -> _March:
         """Where a march is at the mean of the times at which substeps begin."""
@@ -255,18 +239,23 @@ class GroundStep(nn.Module):
         step, levers, normal, free = self.step_size, *start[:2], start.free
         inverse, bend, drift = start.inverse, None, None
         if later is not None:
-            time = 0.5 * (self.substeps - 1) * step
             turn = later.rotation.mT @ start.rotation
             levers, normal = _rotated(levers, turn), _rotated(normal, turn)
             free = self._turned(free, turn)
-            bend = (step / time) * (later.levers - levers)
-            drift = (step / time) * (later.free - free)
+            share = 2.0 / max(self.substeps - 1, 1)  # of the way to it, each substep
+            bend, drift = share * (later.levers - levers), share * (later.free - free)
             inverse = later.inverse
         first, depth, moved = levers, start.depth, torch.zeros_like(speed)
-        velocity, reaches = self._velocity(levers, speed), self.reaches.to(speed)
-        marches = [_March(speed, moved)]
+        marches, reaches = [_March(speed, moved)], self.reaches.to(speed)
         for number in range(count):
-            force = self.contact(depth, velocity, normal)
+            if bend is not None:
+                levers = torch.add(first, bend, alpha=number)
+            velocity = self._velocity(levers, speed)
+            rising = (velocity * normal).sum(0)
+            if number:
+                depth = depth - step * rising
+            sliding = velocity - rising * normal
+            force = self.contact(depth, rising, sliding, normal)
             at = joints + moved[self.limited], speed[self.limited]
             pushes = (levers * force[:, :, None]).sum(0).flatten(0, 1), self.limit(*at)
             push = reaches @ torch.cat(pushes)
@@ -275,10 +264,6 @@ class GroundStep(nn.Module):
             gain = free if drift is None else torch.add(free, drift, alpha=number)
             speed = speed + step * (gain + (inverse * push).sum(1))
             moved = self._composed(moved, step * speed)
-            if bend is not None:
-                levers = torch.add(first, bend, alpha=number + 1)
-            velocity = self._velocity(levers, speed)
-            depth = depth - step * (velocity * normal).sum(0)
             marches.append(_March(speed, moved))
         return marches
 

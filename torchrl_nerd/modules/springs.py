@@ -41,31 +41,31 @@ class ContactSprings(nn.Module):
                 f"'{scene.name}'"
             )
         law = PenaltyLaw.of_bodies(model, points.bodies)
-        merged = np.array([points.stands_for.count(i) for i in range(len(points))])
-        drags = np.where(law.friction > 0.0, law.slip, 0.0)
         # of the force that slip asks for: how much of it turns into normal force
-        share = law.friction * law.damping / law.slip
+        share = law.friction / model.opt.impratio
         less = 1.0 / (1.0 + law.friction * share)
-        numbers = law.stiffness, law.damping, drags, law.friction, share, less, merged
+        dampers, merged = (law.damping, law.slip), points.merged.sum(1)
+        numbers = law.stiffness, *dampers, law.friction, share, less, merged
         keep_constants(self, law=np.stack(numbers)[..., None])
 
-    def forward(self, depth: Tensor, velocity: Tensor, normal: Tensor) -> Tensor:
+    def forward(
+        self, depth: Tensor, speed: Tensor, sliding: Tensor, normal: Tensor
+    ) -> Tensor:
         """Forces ``(3, P, N)``, N, on points that are in the ground, else zero.
 
         Args:
             depth: in the ground, ``(P, N)``, m.
-            velocity: over the ground, ``(3, P, N)``, m/s.
+            speed: along the normal, ``(P, N)``, m/s.
+            sliding: across it, ``(3, P, N)``, m/s.
             normal: of the ground, ``(3, P, N)``.
         """
-        stiffness, damping, drags, friction, share, less, merged = self.law.to(depth)
-        speed = (velocity * normal).sum(0)
-        sliding = velocity - speed * normal
+        stiffness, damping, slip, friction, share, less, merged = self.law.to(depth)
         slipping = (sliding.square().sum(0) + SLOWEST**2).sqrt()
-        push, pull = stiffness * depth - damping * speed, drags * slipping
+        push, pull = stiffness * depth - damping * speed, slip * slipping
         nearest = (less * (push + share * pull)).clamp_min(0.0)
         push = torch.where(pull > friction * push, nearest, push)
         push = torch.where(depth > 0.0, merged * push, 0.0)
-        drag = torch.minimum(merged * drags, friction * push / slipping)
+        drag = torch.minimum(merged * slip, friction * push / slipping)
         return push * normal - drag * sliding
 
 

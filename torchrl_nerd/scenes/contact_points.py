@@ -52,6 +52,11 @@ class ContactPoints:
         return len(self.bodies)
 
     @property
+    def merged(self) -> np.ndarray:
+        """Which of the shapes' points each stands for, ``(P, count_found)``, bool."""
+        return np.arange(len(self))[:, None] == self.stands_for
+
+    @property
     def count_found(self) -> int:
         """How many the shapes have before merging and dropping."""
         return len(self.stands_for)

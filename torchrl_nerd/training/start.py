@@ -63,17 +63,15 @@ def begin_from(
         ValueError: in one sentence, another network, features of another width, or
             statistics that the images do not share.
     """
-    if start.config != network_config(network):
+    config = network_config(network)
+    if start.config != config:
         names = [
-            name
-            for name, config in (NETWORKS | STEPS).items()
-            if config == start.config
+            name for name, known in (NETWORKS | STEPS).items() if known == start.config
         ]
         raise ValueError(
             f"expected the network of the model to start from, "
             f"{' or '.join(names) or start.config}, got {network}"
         )
-    config = network_config(network)
     model = make_model(seen_by(config, scene), config)
     widths, found = ((m.tokens.size, m.state_delta.size) for m in (model, start))
     if widths != found:

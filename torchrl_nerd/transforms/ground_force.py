@@ -38,9 +38,7 @@ class GroundForce(nn.Module):
         super().__init__()
         model, self.is_floating = scene.model, scene.base.is_floating
         law = PenaltyLaw.of_bodies(model, scene.contacts.bodies)
-        merged = [
-            scene.contacts.stands_for.count(i) for i in range(len(scene.contacts))
-        ]
+        merged = scene.contacts.merged.sum(1)
         numbers = law.stiffness, law.damping, law.slip, law.friction, merged
         keep_constants(
             self,

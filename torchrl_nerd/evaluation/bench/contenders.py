@@ -12,7 +12,7 @@ from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.modules.baselines import MLPConfig
-from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
+from torchrl_nerd.modules.correction import CorrectionConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 
@@ -21,7 +21,6 @@ INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
 }
-FORGETFUL = MLPConfig, FreeConfig, GroundedConfig  # without a window to recompute
 FINEST = 64  # substeps of a truth in contact, or four times the scene's own
 
 
@@ -92,7 +91,7 @@ def learned_contenders(
         yield Contender(f"{name}, guarded", True, _guarded(model))
         if is_compiling:
             yield _learned(f"{name}, compiled", model, compile=True)
-        if not isinstance(model.config, FORGETFUL):
+        if not isinstance(model.config, MLPConfig | CorrectionConfig):  # no history
             yield _learned(f"{name}, window", model, inference="window")
         half = copy.deepcopy(model).to(torch.bfloat16)
         yield _learned(f"{name}, bf16", half)
