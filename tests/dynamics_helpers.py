@@ -28,7 +28,7 @@ from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.ground_step import GroundStep
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NETWORKS, STEPS, NeRD
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.sequences import cover, data_stats
@@ -68,7 +68,11 @@ def is_grounded(scene: Scene) -> bool:
 
 FREE = [load_scene(name) for name in SCENES if is_free(load_scene(name))]
 GROUNDED = [load_scene(name) for name in SCENES if is_grounded(load_scene(name))]
-STEPPED = [(s, "free") for s in FREE] + [(s, "grounded") for s in GROUNDED]
+STEPPED = [
+    (scene, name)
+    for name, config in STEPS.items()
+    for scene in (FREE if isinstance(config, FreeConfig) else GROUNDED)
+]
 each_free = pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.name)
 each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)
 each_stepped = pytest.mark.parametrize(

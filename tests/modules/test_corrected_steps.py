@@ -22,6 +22,7 @@ from torchrl_nerd.checkpoint import (
 )
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.grounded import GroundedNeRD
 from torchrl_nerd.modules.nerd import STEPS
@@ -29,7 +30,7 @@ from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training.start import begin_from
 
 ROWS = 32
-KINDS = {"free": FreeNeRD, "grounded": GroundedNeRD}
+KINDS = {FreeConfig: FreeNeRD, GroundedConfig: GroundedNeRD}
 
 
 def fresh(scene, network):
@@ -56,7 +57,7 @@ def test_the_papers_robots_are_moved_so():
 @each_stepped
 def test_a_fresh_one_moves_as_its_step_does(scene, network, generator):
     model, rows = fresh(scene, network), random_transitions(scene, ROWS, generator)
-    assert type(model) is KINDS[network]
+    assert type(model) is KINDS[type(STEPS[network])]
     inputs = rows[QPOS], rows[QVEL], rows[JOINT_TORQUE]
     if isinstance(model, GroundedNeRD):
         qpos, qvel, _ = model.ground_step(*inputs, rows.get(TERRAIN, None))
@@ -73,7 +74,7 @@ def test_it_comes_back_from_disk(scene, network, inference, generator, tmp_path)
     model = lively(scene, network, generator)
     save_checkpoint(model, tmp_path, make_card(model))
     loaded = load_checkpoint(tmp_path)
-    assert loaded.config == model.config and type(loaded) is KINDS[network]
+    assert loaded.config == model.config and type(loaded) is KINDS[type(STEPS[network])]
     drive = random_drive(scene, 4, 5, generator)
     paths = [roll(NeRDDynamics(m, inference), *drive) for m in (model, loaded)]
     assert not unequal_keys(*paths)
@@ -135,7 +136,7 @@ def test_only_the_mlp_is_cast(scene, network, generator):
     rows = random_transitions(scene, ROWS, generator)
     half = fresh(scene, network).bfloat16()
     assert half.dtype == torch.bfloat16
-    own = half.ground_step if network == "grounded" else half.free_step
+    own = half.free_step if network == "free" else half.ground_step
     kept = [x for x in own.buffers() if x.is_floating_point()]
     assert all(x.dtype == torch.float64 for x in kept)
     expected, after = step(fresh(scene, network), rows), step(half, rows)
@@ -167,7 +168,7 @@ def test_it_can_be_learned_on(scene, network, generator):
     start = lively(scene.foreseeing(False), network, generator)
     model = begin_from(start, scene, network)
     weights = start.network.state_dict()
-    assert type(model) is KINDS[network]
+    assert type(model) is KINDS[type(STEPS[network])]
     assert all(
         torch.equal(model.network.state_dict()[k], x) for k, x in weights.items()
     )

@@ -35,7 +35,10 @@ class FreeConfig(CorrectionConfig):
 
 @dataclass(frozen=True)
 class GroundedConfig(CorrectionConfig):
-    """On a step along a robot's springs."""
+    """On a step along a robot's springs, see `GroundStep`."""
+
+    looks: int = 2
+    stride: int = 1
 
 
 class Correction(nn.Module):

@@ -7,6 +7,9 @@ and speed. So the robot is looked at twice, at the start and at the mean time of
 substeps, where a first march through half of them ends. Then all substeps are made, as
 MuJoCo makes them, with points whose levers and free accelerations change along the line
 through both looks, and the mass matrix of the second one.
+
+Where that is too dear, one look has to do, at the mean time of the substeps, to where the
+velocity of the start leads, and some substeps at once.
 """
 
 from typing import NamedTuple
@@ -55,9 +58,11 @@ class GroundStep(nn.Module):
     Args:
         scene: a robot of hinges and slides, on a free base or a fixed one, over a ground,
             whose contacts and limits are springs and dampers, see `scenes.penalty`.
+        looks: one or two.
+        stride: how many of MuJoCo's substeps are made as one.
 
     Raises:
-        ValueError: in one sentence, another robot.
+        ValueError: in one sentence, another robot, or another number of looks.
     """
 
     joints: Tensor
@@ -69,9 +74,11 @@ class GroundStep(nn.Module):
     radii: Tensor
     is_slide: Tensor
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, looks: int = 2, stride: int = 1) -> None:
         super().__init__()
         model = scene.model
+        if looks not in (1, 2):
+            raise ValueError(f"expected one look or two, got {looks}")
         expect_none(scene, untold_pushes(scene))
         if scene.terrain is None:
             raise ValueError(f"expected a ground to step on, got scene '{scene.name}'")
@@ -80,8 +87,9 @@ class GroundStep(nn.Module):
             raise ValueError(
                 f"expected substeps of mjINT_EULER, got {found} in scene '{scene.name}'"
             )
-        self.step_size = float(model.opt.timestep)
-        self.substeps = round(scene.control_step / self.step_size)
+        own = round(scene.control_step / float(model.opt.timestep))
+        self.looks, self.substeps = looks, max(1, own // stride)
+        self.step_size = scene.control_step / self.substeps
         axes, points = JointAxes.of(model, scene.base), scene.contacts
         self.num_points, self.num_axes = len(points), len(axes.joints)
         self.contact, self.limit = ContactSprings(scene), LimitSprings(model, axes)
@@ -132,7 +140,7 @@ class GroundStep(nn.Module):
         terrain: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The next state, and what the second look changed.
+        """The next state, and by how much the velocity at the last look was wrong.
 
         Args:
             qpos: ``(*batch, nq)``.
@@ -142,24 +150,28 @@ class GroundStep(nn.Module):
             dtype: of the springs; all else is float64.
 
         Returns:
-            The next ``qpos`` and ``qvel``, and by how much the second look changed the
-            velocity at its time, ``(*batch, nv)``.
+            The next ``qpos`` and ``qvel``, and the velocity that the substeps have at the
+            time of the last look less the one that it was taken with, ``(*batch, nv)``.
         """
         batch, state = qpos.shape[:-1], (qpos, qvel, joint_torque)
         qpos, qvel, joint_torque = (x.flatten(0, -2) for x in state)
         ground = None if terrain is None else terrain.flatten(0, -2)
         given = joint_torque, ground, dtype
-        start = self._look(qpos, qvel, *given)
         joints = qpos.mT[self.limited_places].to(dtype)
-        speed = self._turned(qvel.mT, start.rotation.mT).to(dtype)
-        marches = self._march(start, None, speed, joints, self.substeps // 2)
-        place, guess = self._moved(qpos, self._middle(marches), start.rotation)
-        later = self._look(place, guess, *given)
-        speed = self._turned(qvel.mT, later.rotation.mT).to(dtype)
-        marches = self._march(start, later, speed, joints, self.substeps)
-        second = self._middle(marches).speed.to(qvel)
-        second = self._turned(second, later.rotation).mT - guess
-        found = *self._moved(qpos, marches[-1], later.rotation), second
+        if self.looks == 1:
+            start, guess = None, qvel
+            look = self._look_ahead(qpos, qvel, *given)
+        else:
+            start = self._look(qpos, qvel, *given)
+            speed = self._turned(qvel.mT, start.rotation.mT).to(dtype)
+            marches = self._march(start, None, speed, joints, self.substeps // 2)
+            place, guess = self._moved(qpos, self._middle(marches), start.rotation)
+            look = self._look(place, guess, *given)
+        speed = self._turned(qvel.mT, look.rotation.mT).to(dtype)
+        marches = self._march(look, start, speed, joints, self.substeps)
+        middle = self._middle(marches).speed.to(qvel)
+        wrong = self._turned(middle, look.rotation).mT - guess
+        found = *self._moved(qpos, marches[-1], look.rotation), wrong
         return tuple(x.unflatten(0, batch) for x in found)  # pyright: ignore
 
     def _middle(self, marches: list[_March]) -> _March:
@@ -205,6 +217,22 @@ class GroundStep(nn.Module):
         levers, normal, depth, free, inverse = (x.to(dtype).contiguous() for x in parts)
         return _Look(levers, normal, depth, free, inverse, rotation)
 
+    def _look_ahead(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        dtype: torch.dtype,
+    ) -> _Look:
+        """A look at the mean time of the substeps, with the depths of the start."""
+        ahead = 0.5 * (self.substeps - 1) * self.step_size
+        place = integrate_pos(self.layout, qpos, ahead * qvel)
+        look = self._look(place, qvel, joint_torque, terrain, dtype)
+        speed = self._turned(qvel.mT, look.rotation.mT).to(dtype)
+        rising = (self._velocity(look.levers, speed) * look.normal).sum(0)
+        return look._replace(depth=look.depth + ahead * rising)
+
     def _levers(self, points: Tensor, places: Tensor) -> Tensor:
         """What each of its C rates moves a point by, ``(3, P, C, N)``."""
         anchor, tip = places.chunk(2, 1)
@@ -221,8 +249,8 @@ class GroundStep(nn.Module):
 
     def _march(
         self,
-        start: _Look,
-        later: _Look | None,
+        look: _Look,
+        start: _Look | None,
         speed: Tensor,
         joints: Tensor,
         count: int,
@@ -230,22 +258,22 @@ class GroundStep(nn.Module):
         """Where ``count`` substeps lead to, one by one, from nowhere on.
 
         Args:
-            start: the first look.
-            later: the second one, in whose axes the march is then; None in the first march.
+            look: in whose axes the march is, and with whose mass matrix.
+            start: another one, at the start, whence levers and free accelerations change
+                to ``look``, where it is the mean time of all substeps; None: they stay.
             speed: at the start, ``(nv, N)``.
             joints: where those with limits are, ``(L, N)``.
             count: of substeps.
         """
-        step, levers, normal, free = self.step_size, *start[:2], start.free
-        inverse, bend, drift = start.inverse, None, None
-        if later is not None:
-            turn = later.rotation.mT @ start.rotation
-            levers, normal = _rotated(levers, turn), _rotated(normal, turn)
-            free = self._turned(free, turn)
+        step, levers, normal, depth, free, inverse, _ = self.step_size, *look
+        bend, drift = None, None
+        if start is not None:
+            turn = look.rotation.mT @ start.rotation
+            levers, normal = (_rotated(x, turn) for x in (start.levers, start.normal))
+            free, depth = self._turned(start.free, turn), start.depth
             share = 2.0 / max(self.substeps - 1, 1)  # of the way to it, each substep
-            bend, drift = share * (later.levers - levers), share * (later.free - free)
-            inverse = later.inverse
-        first, depth, moved = levers, start.depth, torch.zeros_like(speed)
+            bend, drift = share * (look.levers - levers), share * (look.free - free)
+        first, moved = levers, torch.zeros_like(speed)
         marches, reaches = [_March(speed, moved)], self.reaches.to(speed)
         for number in range(count):
             if bend is not None:

@@ -3,7 +3,7 @@
 The ground and the limits of the paper's robots are explicit springs, and between two looks
 at a robot little changes but what they push with. A network that has to find all that out
 errs by a tenth of a step, `GroundStep` by a hundredth. So the network is left with the
-rest, and has the more say the more the second look changed.
+rest, and has the more say the more wrong the last look's velocity was.
 """
 
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ from torchrl_nerd.transforms import Stats
 class GroundedNeRD(NeRD):
     """A `GroundStep` and its learned correction; otherwise a `NeRD` like any other.
 
-    After the features the token holds what the second look changed of each velocity, then
-    the change of the state that the step foresees, normalised as targets are, and its
-    doubt, 0 to 1: the root mean square of what the second look changed.
+    After the features the token holds by how much the velocity at the last look was wrong,
+    then the change of the state that the step foresees, normalised as targets are, and its
+    doubt, 0 to 1: the root mean square of what was wrong.
 
     Args:
         scene: of a robot that `GroundStep` can move.
@@ -45,13 +45,15 @@ class GroundedNeRD(NeRD):
         config: GroundedConfig,
         stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
-        step = GroundStep(scene)  # refuses before anything is built
+        step = GroundStep(
+            scene, config.looks, config.stride
+        )  # refuses before anything is built
         super().__init__(scene, config, stats)
         self.ground_step = step
 
     @property
     def num_hints(self) -> int:
-        """The second look's changes."""
+        """What was wrong at the last look."""
         return self.scene.layout.nv
 
     def foresee(
@@ -61,11 +63,11 @@ class GroundedNeRD(NeRD):
         joint_torque: Tensor,
         terrain: Tensor | None = None,
     ) -> Tensor:
-        """What the second look changed, the step's change, its doubt."""
+        """What was wrong at the last look, the step's change, its doubt."""
         exact = torch.promote_types(self.dtype, torch.float32)
-        *after, second = self.ground_step(qpos, qvel, joint_torque, terrain, exact)
+        *after, wrong = self.ground_step(qpos, qvel, joint_torque, terrain, exact)
         change = self.state_delta.delta(qpos, qvel, *after)
         change = self.normalize.normalize(TARGET, change)
-        second = second / self.normalize.std(TARGET)[: self.num_hints]
-        doubt = second.square().mean(-1, keepdim=True).sqrt().clamp_max(1.0)
-        return torch.cat((second, change, doubt), -1)
+        wrong = wrong / self.normalize.std(TARGET)[: self.num_hints]
+        doubt = wrong.square().mean(-1, keepdim=True).sqrt().clamp_max(1.0)
+        return torch.cat((wrong, change, doubt), -1)

@@ -40,6 +40,8 @@ NETWORKS: dict[str, NetworkConfig] = {
 STEPS: dict[str, NetworkConfig] = {
     "free": FreeConfig(),
     "grounded": GroundedConfig(),
+    "grounded-small": GroundedConfig(depth=1, width=16),
+    "grounded-fast": GroundedConfig(looks=1, stride=2),
 }
 """Those that correct a step: of a `FreeNeRD`, for robots that nothing touches, and of a
 `GroundedNeRD`, for robots on springs."""
