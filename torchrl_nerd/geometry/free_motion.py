@@ -217,6 +217,16 @@ def rows_last(x: Tensor, size: int) -> Tensor:
     return flat.permute(tuple(reversed(range(flat.ndim))))
 
 
+def inverted(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses ``(n, n, N)`` of positive definite matrices, and times ``right (n, N)``."""
+    if len(matrix) > FEW or not torch.compiler.is_compiling():
+        inverse = torch.linalg.inv_ex(matrix.movedim(-1, 0))[0]
+        return inverse.permute(1, 2, 0), (inverse @ right.mT[..., None])[..., 0].mT
+    one = torch.eye(len(matrix), dtype=matrix.dtype, device=matrix.device)
+    columns = [_solve(matrix, column[:, None]) for column in one]
+    return torch.stack(columns, 1), _solve(matrix, right)
+
+
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solutions ``(n, N)`` of positive definite ``(n, n, N)``.
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import BasePose
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.free_motion import FreeMotion, rows_last
+from torchrl_nerd.geometry.free_motion import FreeMotion, inverted, rows_last
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics, cross
 from torchrl_nerd.geometry.manifold import integrate_pos
@@ -205,15 +205,14 @@ class GroundStep(nn.Module):
         matrix, push = self.motion.equation(
             qpos, qvel, joint_torque, rotation, corners, places, 2.0 * self.step_size
         )
-        inverse = torch.linalg.inv_ex(matrix.movedim(-1, 0))[0]
-        free = (inverse @ push.mT[..., None])[..., 0].mT
+        inverse, free = inverted(matrix, push)
         depth, normal = self.radii - distance.mT, rows_last(normal, 2)
         # spheres touch where they are halfway into the ground
         points = (
             rows_last(points, 2) - (self.radii - 0.5 * depth.clamp_min(0.0)) * normal
         )
         levers = self._levers(points, rows_last(places, 2))
-        parts = levers, normal, depth, free, inverse.permute(1, 2, 0)
+        parts = levers, normal, depth, free, inverse
         levers, normal, depth, free, inverse = (x.to(dtype).contiguous() for x in parts)
         return _Look(levers, normal, depth, free, inverse, rotation)
 
