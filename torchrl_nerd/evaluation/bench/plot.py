@@ -11,6 +11,8 @@ if TYPE_CHECKING:  # matplotlib is an extra
     from matplotlib.axes import Axes
     from matplotlib.transforms import Bbox
 
+MOST_SHIFT = 14  # points that a name may stand lower than its row
+
 
 def plot_race(report: BenchReport, path: Path, batch: int | None = None) -> None:
     """One panel per quantity, the Pareto front as a line.
@@ -34,7 +36,8 @@ def plot_race(report: BenchReport, path: Path, batch: int | None = None) -> None
         for name, point in points.items():
             color = COLORS[0] if name.startswith("MuJoCo") else COLORS[1]
             axes.plot(*point, "o", color=color)
-        front = [points[name] for name in report.front(batch, quantity)]
+        best = report.front(batch, quantity)
+        front = [points[name] for name in best]
         axes.plot(*zip(*front, strict=True), "-", color=COLORS[2], label="Pareto front")
         for number, (name, errors) in enumerate(report.floors.items()):
             style = (":", "-.", "--")[number % 3]
@@ -49,18 +52,29 @@ def plot_race(report: BenchReport, path: Path, batch: int | None = None) -> None
             ylabel=f"control steps per second, {batch} rows",
         )
         axes.legend(frameon=False, fontsize=7)
-        _write_names(axes, points)
+        _write_names(axes, points, best)
     save_figure(figure, path)
 
 
-def _write_names(axes: "Axes", points: dict[str, tuple[float, float]]) -> None:
-    """Names beside their points, lower where they would cover each other."""
+def _write_names(
+    axes: "Axes", points: dict[str, tuple[float, float]], first: list[str]
+) -> None:
+    """Names beside their points, a little lower where they would cover each other.
+
+    Where there is no room that a name has none; the table has it.
+    """
     written: list[Bbox] = []
-    for name, point in sorted(points.items(), key=lambda item: -item[1][1]):
+    others = sorted(points.keys() - set(first), key=lambda name: -points[name][1])
+    for name in [*first, *others]:
         text = axes.annotate(
-            name, point, (6, -3), textcoords="offset points", fontsize=7
+            name, points[name], (6, -3), textcoords="offset points", fontsize=7
         )
-        while any(text.get_window_extent().overlaps(other) for other in written):
+        for _ in range(MOST_SHIFT):
+            if not any(text.get_window_extent().overlaps(other) for other in written):
+                break
             x, y = text.get_position()
             text.set_position((x, y - 1))
+        else:
+            text.remove()
+            continue
         written.append(text.get_window_extent())
