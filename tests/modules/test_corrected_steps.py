@@ -5,6 +5,7 @@ import torch
 from dynamics_helpers import (
     FREE,
     GROUNDED,
+    STEPPED,
     each_stepped,
     enliven,
     random_drive,
@@ -12,7 +13,7 @@ from dynamics_helpers import (
     scene_stats,
     unequal_keys,
 )
-from helpers import random_transitions
+from helpers import in_ground, random_transitions
 
 from torchrl_nerd.checkpoint import (
     load_checkpoint,
@@ -21,6 +22,7 @@ from torchrl_nerd.checkpoint import (
     save_checkpoint,
 )
 from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.evaluation.stability.states import turned
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.free import FreeNeRD
@@ -102,6 +104,24 @@ def test_rows_do_not_see_each_other(scene, network, generator):
         torch.testing.assert_close(
             alone[key][0], together[key][3], atol=1e-4, rtol=1e-4
         )
+
+
+@pytest.mark.parametrize(
+    ("scene", "network"), [(s, n) for s, n in STEPPED if s.base.is_floating]
+)
+def test_north_is_a_way_like_any_other(scene, network, generator):
+    model, rows = (
+        lively(scene, network, generator).double(),
+        in_ground(scene, ROWS, generator),
+    )
+    quat = rows[QPOS][:, scene.base.qpos_address + 3 :][:, :4]
+    quat.copy_(quat / quat.norm(dim=-1, keepdim=True))
+    angle = torch.pi * torch.rand(1, generator=generator).double()
+    turn = torch.cat((angle.cos(), torch.zeros(2), angle.sin()))
+    there = step(model, turned(scene, rows, turn))
+    expected = turned(scene, step(model, rows), turn)
+    for key in (QPOS, QVEL):
+        torch.testing.assert_close(there[key], expected[key], atol=1e-6, rtol=1e-6)
 
 
 def test_where_there_is_no_doubt_the_network_has_no_say(generator):

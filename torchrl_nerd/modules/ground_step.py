@@ -151,7 +151,8 @@ class GroundStep(nn.Module):
 
         Returns:
             The next ``qpos`` and ``qvel``, and the velocity that the substeps have at the
-            time of the last look less the one that it was taken with, ``(*batch, nv)``.
+            time of the last look less the one that it was taken with, ``(*batch, nv)``, a
+            floating base's in its own axes there.
         """
         batch, state = qpos.shape[:-1], (qpos, qvel, joint_torque)
         qpos, qvel, joint_torque = (x.flatten(0, -2) for x in state)
@@ -169,8 +170,8 @@ class GroundStep(nn.Module):
             look = self._look(place, guess, *given)
         speed = self._turned(qvel.mT, look.rotation.mT).to(dtype)
         marches = self._march(look, start, speed, joints, self.substeps)
-        middle = self._middle(marches).speed.to(qvel)
-        wrong = self._turned(middle, look.rotation).mT - guess
+        guess = self._turned(guess.mT, look.rotation.mT)
+        wrong = (self._middle(marches).speed - guess).mT
         found = *self._moved(qpos, marches[-1], look.rotation), wrong
         return tuple(x.unflatten(0, batch) for x in found)  # pyright: ignore
 

@@ -82,7 +82,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "ant": _grounded("ant/run", 20_000, 20_000, validate_every=4_000, bf16_share=0.85),
     "anymal": _grounded(
-        "anymal/forward", 6_000, 12_000, validate_every=4_000, bf16_share=0.8
+        "anymal/forward", 15_000, 20_000, validate_every=4_000, bf16_share=0.8
     ),
     "franka": _mlp(
         "franka/reach_torque",
