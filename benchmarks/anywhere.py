@@ -42,6 +42,8 @@ class Options:
     scene: Positional[str] = "ant"
     model: Path | None = None
     """Checkpoint folder; the shipped model by default."""
+    double: bool = False
+    """The model in float64: its springs are in float32 like its network."""
     distance: float = 10_000.0
     """m, level, in a random direction."""
     rows: int = 256
@@ -79,7 +81,8 @@ def main(options: Options) -> dict[str, float]:
     protocol = PROTOCOLS[options.scene]()
     ((case, source),) = protocol.cases.items()
     scene, steps = scene_of(source), max(protocol.horizons)
-    learned = NeRDDynamics(from_pretrained(options.model or options.scene, scene))
+    model = from_pretrained(options.model or options.scene, scene)
+    learned = NeRDDynamics(model.double() if options.double else model)
     generator = torch.Generator().manual_seed(options.seed)
     yaw, way = (2.0 * math.pi * torch.rand(2, generator=generator)).tolist()
     shift = torch.tensor([math.cos(way), math.sin(way), 0.0]).double()
