@@ -90,6 +90,7 @@ class GroundStep(nn.Module):
         own = round(scene.control_step / float(model.opt.timestep))
         self.looks, self.substeps = looks, max(1, own // stride)
         self.step_size = scene.control_step / self.substeps
+        self.ahead = 0.5 * (self.substeps - 1) * self.step_size  # s, of their mean time
         axes, points = JointAxes.of(model, scene.base), scene.contacts
         self.num_points, self.num_axes = len(points), len(axes.joints)
         self.contact, self.limit = ContactSprings(scene), LimitSprings(model, axes)
@@ -161,14 +162,17 @@ class GroundStep(nn.Module):
         joints = qpos.mT[self.limited_places].to(dtype)
         if self.looks == 1:
             start, guess = None, qvel
-            look = self._look_ahead(qpos, qvel, *given)
+            place = integrate_pos(self.layout, qpos, self.ahead * qvel)
         else:
             start = self._look(qpos, qvel, *given)
             speed = self._turned(qvel.mT, start.rotation.mT).to(dtype)
             marches = self._march(start, None, speed, joints, self.substeps // 2)
             place, guess = self._moved(qpos, self._middle(marches), start.rotation)
-            look = self._look(place, guess, *given)
+        look = self._look(place, guess, *given)
         speed = self._turned(qvel.mT, look.rotation.mT).to(dtype)
+        if start is None:  # back to the depths of the start
+            rising = (self._velocity(look.levers, speed) * look.normal).sum(0)
+            look = look._replace(depth=look.depth + self.ahead * rising)
         marches = self._march(look, start, speed, joints, self.substeps)
         guess = self._turned(guess.mT, look.rotation.mT)
         wrong = (self._middle(marches).speed - guess).mT
@@ -216,22 +220,6 @@ class GroundStep(nn.Module):
         parts = levers, normal, depth, free, inverse
         levers, normal, depth, free, inverse = (x.to(dtype).contiguous() for x in parts)
         return _Look(levers, normal, depth, free, inverse, rotation)
-
-    def _look_ahead(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None,
-        dtype: torch.dtype,
-    ) -> _Look:
-        """A look at the mean time of the substeps, with the depths of the start."""
-        ahead = 0.5 * (self.substeps - 1) * self.step_size
-        place = integrate_pos(self.layout, qpos, ahead * qvel)
-        look = self._look(place, qvel, joint_torque, terrain, dtype)
-        speed = self._turned(qvel.mT, look.rotation.mT).to(dtype)
-        rising = (self._velocity(look.levers, speed) * look.normal).sum(0)
-        return look._replace(depth=look.depth + ahead * rising)
 
     def _levers(self, points: Tensor, places: Tensor) -> Tensor:
         """What each of its C rates moves a point by, ``(3, P, C, N)``."""

@@ -45,9 +45,8 @@ class GroundedNeRD(NeRD):
         config: GroundedConfig,
         stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
-        step = GroundStep(
-            scene, config.looks, config.stride
-        )  # refuses before anything is built
+        # refuses before anything is built
+        step = GroundStep(scene, config.looks, config.stride)
         super().__init__(scene, config, stats)
         self.ground_step = step
 
