@@ -1,6 +1,7 @@
 """The learned stand-in for the solver; everything round it is shared with the truth."""
 
-from typing import Literal, cast
+from collections.abc import Mapping
+from typing import Any, Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,8 +12,16 @@ from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import TOKEN, Memory, NeRD, Network
 from torchrl_nerd.modules.window import WindowNetwork
+from torchrl_nerd.row_threads import RowThreads, parts_of
 
 Inference = Literal["streaming", "window"]
+
+# A second thread waits in a short loop for longer than it works, and Python takes as long
+# to call one; so one thread, called from C++, and rows in parts if that is not enough.
+SHORT_LOOPS = {"options": {"cpp.threads": 1, "cpp_wrapper": True}}
+LEAST_WORK = (
+    2048  # rows times dofs of a part: less takes longer to hand over than it saves
+)
 
 
 class NeRDDynamics:
@@ -57,7 +66,22 @@ class NeRDDynamics:
         self.network: Network = network
         self._memory: Memory | None = None
         self._rows = 0
-        self._compiled = Compiled(self._predict, **model.compile_options)
+        self._compiled = Compiled(self._predict, **self.compile_options)
+        self._in_parts = RowThreads(self._compiled)
+
+    @property
+    def compile_options(self) -> Mapping[str, Any]:
+        """Of `torch.compile`, for a step."""
+        model = self.model
+        is_short = model.has_short_loops and model.device.type == "cpu"
+        return SHORT_LOOPS if is_short else {}
+
+    def parts(self, rows: int) -> int:
+        """In how many parts, each on a thread of its own, a compiled step is made."""
+        is_whole = self.differentiable or self._compiled.is_eager
+        if is_whole or not self.compile_options:
+            return 1
+        return parts_of(rows, max(1, LEAST_WORK // self.scene.layout.nv))
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""
@@ -95,17 +119,25 @@ class NeRDDynamics:
         if self._memory is None or self._rows != len(qpos):
             self._rows = len(qpos)
             self._memory = self.network.empty_memory(self._rows)
-        predict = self._compiled if self.compile else self._predict
+        given = qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
         with torch.set_grad_enabled(self.differentiable):
-            next_qpos, next_qvel, distance = predict(
-                qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
-            )
+            next_qpos, next_qvel, distance = self._run(given)
         after = TensorDict(
             {QPOS: next_qpos.to(there), QVEL: next_qvel.to(there)},
             batch_size=state.batch_size,
             device=state.device,
         )
         return after, None if distance is None else distance.to(there)
+
+    def _run(self, given: tuple) -> tuple[Tensor, Tensor, Tensor | None]:
+        """`_predict`, as it is or compiled, of all rows at once or in parts."""
+        if not self.compile:
+            return self._predict(*given)
+        if not torch.compiler.is_compiling():
+            parts = self.parts(self._rows)
+            if parts > 1:
+                return self._in_parts(parts, *given)
+        return self._compiled(*given)
 
     def _predict(
         self,

@@ -81,7 +81,8 @@ class SceneEnv(EnvBase):
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
         self.guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
         self._transition = Transition(task, dynamics)
-        self.eager()
+        self._transit = self._transition.step
+        self._restart = self._transition.restart
         self.recorder: FaultRecorder | None = None
         if fault_folder is not None:
             name = type(dynamics).__name__
@@ -107,9 +108,15 @@ class SceneEnv(EnvBase):
 
         Args:
             warmup: eager steps before the first compiled one; 1 where not given.
-            kwargs: of `torch.compile`; where no mode is among them, what suits the model.
+            kwargs: of `torch.compile`; where no mode, backend or options are among
+                them, those that suit the model.
         """
-        suits = {} if "mode" in kwargs else compile_options(self.dynamics)
+        suits: Mapping[str, Any] = {}
+        if (learned := self._learned) is not None:
+            is_chosen = not kwargs.keys().isdisjoint(("mode", "backend", "options"))
+            suits = {} if is_chosen else learned.compile_options
+            learned.compile = not kwargs and learned.parts(self.batch_size.numel()) > 1
+            self._transition.is_round = learned.compile
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
         self._transit = Compiled(self._transition.step, **options)
         self._restart = Compiled(self._transition.restart, **options)
@@ -117,9 +124,18 @@ class SceneEnv(EnvBase):
 
     def eager(self) -> "SceneEnv":
         """Step without a compiler; returns the env itself."""
+        if (learned := self._learned) is not None:
+            learned.compile = False
         self._transit = self._transition.step
         self._restart = self._transition.restart
         return self
+
+    @property
+    def _learned(self) -> NeRDDynamics | None:
+        """The model that steps, guarded or not."""
+        dynamics = self.dynamics
+        inner = dynamics.learned if isinstance(dynamics, GuardedDynamics) else dynamics
+        return inner if isinstance(inner, NeRDDynamics) else None
 
     @property
     def _state_sizes(self) -> dict[str, int]:
@@ -292,10 +308,3 @@ def _emptied(rows: Tensor, value: Any) -> Any:
     if isinstance(value, TensorDictBase):
         return value.apply(lambda x: _emptied(rows, x))
     return value
-
-
-def compile_options(dynamics: Dynamics) -> Mapping[str, Any]:
-    """What `torch.compile` is told of these dynamics, see `NeRD.compile_options`."""
-    learned = dynamics.learned if isinstance(dynamics, GuardedDynamics) else dynamics
-    is_learned = isinstance(learned, NeRDDynamics)
-    return learned.model.compile_options if is_learned else {}

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.files import writable_folder
@@ -26,7 +25,7 @@ FARTHEST = 1e9  # m and rad
 HISTORY = 16  # control steps in a dump
 
 
-def find_faults(action: Tensor, moved: TensorDictBase) -> Tensor:
+def find_faults(action: Tensor, moved: Mapping[str, Tensor]) -> Tensor:
     """The reason of each row's fault, an index of `REASONS`.
 
     Args:

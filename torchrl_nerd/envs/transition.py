@@ -5,9 +5,10 @@ of a control step can be compiled into one piece.
 """
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.envs.faults import find_faults
 from torchrl_nerd.envs.streams import uniforms
@@ -32,10 +33,16 @@ class Transition:
     Args:
         task: controller, observation, reward, end, starts.
         dynamics: what steps the state; guarded by ``"truncate"`` it also ends episodes.
+
+    | attribute | meaning |
+    |---|---|
+    | ``is_round`` | the dynamics has compiled code of its own, and `step` compiles to what
+      is round it |
     """
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         self.task, self.dynamics = task, dynamics
+        self.is_round = False
         self.least_trust = 0.0  # no trust is below it
         if isinstance(dynamics, GuardedDynamics) and dynamics.guard == "truncate":
             self.least_trust = dynamics.least_trust
@@ -54,9 +61,8 @@ class Transition:
             dynamics has one.
         """
         given = torch.where(torch.all(action.isfinite(), -1, keepdim=True), action, 0.0)
-        start = TensorDict(state, batch_size=action.shape[:1], device=action.device)
-        moved, torque = self._control_step(start, given, state.get(TERRAIN))
-        trust = moved.get(TRUST, None)
+        moved, torque = self._control_step(state, given, state.get(TERRAIN))
+        trust = moved.get(TRUST)
         for _ in range(self.task.steps_per_action - 1):
             torch._dynamo.graph_break()  # two steps in one piece take minutes to compile
             moved, torque = self._control_step(moved, given, state.get(TERRAIN))
@@ -67,7 +73,7 @@ class Transition:
         for key in (QPOS, QVEL):
             after[key] = torch.where(is_good, moved[key], state[key])
         felt = {}
-        if SENSORDATA in moved.keys():
+        if SENSORDATA in moved:
             felt[SENSORDATA] = torch.where(is_good, moved[SENSORDATA], 0.0)
         shown = after | felt | {ACTION: given}
         terminated = self.task.terminated(shown)[:, None] | ~is_good
@@ -87,11 +93,23 @@ class Transition:
         }
 
     def _control_step(
-        self, moving: TensorDictBase, action: Tensor, terrain: Tensor | None
-    ) -> tuple[TensorDictBase, Tensor]:
+        self, moving: Tensors, action: Tensor, terrain: Tensor | None
+    ) -> tuple[Tensors, Tensor]:
         """The state one control step later, and the torque that took it there."""
-        torque = self.task.controller(action, moving[QPOS], moving[QVEL])
-        return self.dynamics.step(moving, torque, terrain), torque
+        qpos, qvel = moving[QPOS], moving[QVEL]
+        torque = self.task.controller(action, qpos, qvel)
+        move = self._move_apart if self.is_round else self._move
+        return move(qpos, qvel, torque, terrain), torque
+
+    def _move(
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor, terrain: Tensor | None
+    ) -> Tensors:
+        state = TensorDict({QPOS: qpos, QVEL: qvel}, qpos.shape[:1], device=qpos.device)
+        return dict(self.dynamics.step(state, torque, terrain).items())
+
+    @uncompiled
+    def _move_apart(self, *given: Tensor | None) -> Tensors:
+        return self._move(*given)  # pyright: ignore
 
     def restart(
         self,

@@ -39,6 +39,7 @@ class FreeNeRD(NeRD):
     """
 
     has_simulator = True
+    has_short_loops = True
 
     def __init__(
         self,

@@ -36,8 +36,7 @@ class GroundedNeRD(NeRD):
     """
 
     has_simulator = True
-    # hundreds of short loops: a second thread waits for longer than it works
-    compile_options = {"options": {"cpp.threads": 1}}
+    has_short_loops = True
 
     def __init__(
         self,

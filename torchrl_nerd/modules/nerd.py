@@ -102,7 +102,7 @@ class NeRD(nn.Module):
     """
 
     has_simulator = False  # within, whose change the network is shown, see `foresee`
-    compile_options: Mapping[str, Any] = {}  # of `torch.compile`, for a step of it
+    has_short_loops = False  # hundreds of them, when compiled, and no history
 
     def __init__(
         self,

@@ -1,0 +1,122 @@
+"""Rows worked on in parts are the rows worked on at once."""
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from dynamics_helpers import HAS_COMPILER, random_actions, random_drive, roll
+from torch import Tensor
+
+from torchrl_nerd import NeRDEnv, from_pretrained
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.dynamics import nerd as learned
+from torchrl_nerd.row_threads import RowThreads, parts_of
+
+TASK, ROWS, STEPS = "double_pendulum/passive", 6, 4
+CLOSE = {"atol": 1e-5, "rtol": 1e-5}
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_parts_are_the_whole(parts, generator):
+    def double(pair: dict[str, Tensor], other: Tensor | None, number: int) -> tuple:
+        return {"sum": pair["a"] + number, "same": pair["b"]}, other, number
+
+    pair = {k: torch.rand(6, 2, generator=generator) for k in ("a", "b")}
+    each = RowThreads(double)
+    for other in (None, torch.rand(6, generator=generator)):
+        found, expected = each(parts, pair, other, 5), double(pair, other, 5)
+        for key, value in expected[0].items():
+            assert torch.equal(found[0][key], value)
+        assert found[1] is other if other is None else torch.equal(found[1], other)
+        assert found[2] == 5
+
+
+def test_as_many_parts_as_pay():
+    assert [parts_of(rows, 4) for rows in (1, 7, 8, 9, 100)] == [1, 1, 2, 1, 2]
+    torch.set_num_threads(4)
+    assert [parts_of(rows, 4) for rows in (12, 15, 16, 100, 101)] == [3, 3, 4, 4, 1]
+
+
+def test_each_part_has_a_thread_and_each_thread_is_alone():
+    """Both parts are at work at the same time, in threads with one of torch's each."""
+    met, seen = threading.Barrier(2, timeout=60), []
+
+    def meet(x: Tensor) -> Tensor:
+        if calls > 2:
+            met.wait()
+        seen.append((threading.get_ident(), torch.get_num_threads()))
+        assert not torch.is_grad_enabled()
+        return x
+
+    each = RowThreads(meet)
+    for calls in range(1, 5):
+        seen.clear()
+        each(2, torch.zeros(2))
+    assert len({ident for ident, _ in seen}) == 2
+    assert threading.get_ident() not in dict(seen)
+    assert [number for _, number in seen] == [1, 1]
+    assert torch.get_num_threads() == 2  # here, and where a thread begins later
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(torch.get_num_threads).result() == 2
+
+
+def test_it_raises_what_a_part_raises():
+    def refuse(x: Tensor) -> Tensor:
+        if x[0] > 0:
+            raise ValueError("expected none of those")
+        return x
+
+    with pytest.raises(ValueError, match="none of those"):
+        RowThreads(refuse)(2, torch.arange(2))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_process_has_threads_of_its_own():
+    each = RowThreads(torch.neg)
+    each(2, torch.arange(4))
+    child = os.fork()
+    if not child:
+        is_right = torch.equal(each(2, torch.arange(4)), -torch.arange(4))
+        os._exit(0 if is_right else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
+    monkeypatch.setattr(learned, "LEAST_WORK", 2)
+    model = from_pretrained("double_pendulum-small")
+    drive = random_drive(model.scene, ROWS, STEPS, generator)
+    dynamics = NeRDDynamics(model, compile=True)
+    assert dynamics.parts(ROWS) == 2
+    found, expected = roll(dynamics, *drive), roll(NeRDDynamics(model), *drive)
+    torch.testing.assert_close(found, expected, **CLOSE)
+    assert dynamics._compiled.is_eager != HAS_COMPILER
+
+    eager, env = (NeRDEnv(TASK, model, ROWS, seed=3) for _ in range(2))
+    env.compile()
+    assert env._transition.is_round
+    actions = random_actions(eager, STEPS, generator)
+    for action in actions:
+        ends = [each.step(each.reset().set("action", action)) for each in (eager, env)]
+        torch.testing.assert_close(*ends, **CLOSE)
+    assert not env.eager().dynamics.compile
+
+
+def test_what_must_stay_whole_does(generator, monkeypatch):
+    """Gradients, a history, one thread."""
+    monkeypatch.setattr(learned, "LEAST_WORK", 2)
+    model = from_pretrained("double_pendulum-small")
+    assert NeRDDynamics(model, differentiable=True).parts(ROWS) == 1
+    assert NeRDDynamics(from_pretrained("cartpole")).parts(ROWS) == 1
+    torch.set_num_threads(1)
+    assert NeRDDynamics(model).parts(ROWS) == 1
