@@ -3,6 +3,7 @@
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchrl_nerd import NeRDEnv, from_pretrained
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.dynamics import nerd as learned
-from torchrl_nerd.row_threads import RowThreads, parts_of
+from torchrl_nerd.row_threads import WARM, RowThreads, parts_of
 
 TASK, ROWS, STEPS = "double_pendulum/passive", 6, 4
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
@@ -49,17 +50,17 @@ def test_as_many_parts_as_pay():
 
 def test_each_part_has_a_thread_and_each_thread_is_alone():
     """Both parts are at work at the same time, in threads with one of torch's each."""
-    met, seen = threading.Barrier(2, timeout=60), []
+    met, seen, calls = threading.Barrier(2, timeout=60), [], count(1)
 
     def meet(x: Tensor) -> Tensor:
-        if calls > 2:
+        if next(calls) > 2 * WARM:
             met.wait()
         seen.append((threading.get_ident(), torch.get_num_threads()))
         assert not torch.is_grad_enabled()
         return x
 
     each = RowThreads(meet)
-    for calls in range(1, 5):
+    for _ in range(WARM + 2):
         seen.clear()
         each(2, torch.zeros(2))
     assert len({ident for ident, _ in seen}) == 2

@@ -9,7 +9,7 @@ import torch
 from helpers import make_scene, random_transitions
 
 from torchrl_nerd.geometry.base import base_pose
-from torchrl_nerd.geometry.free_motion import FEW, FreeMotion, _solve
+from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.keys import QPOS, QVEL
@@ -87,16 +87,3 @@ def test_other_joints_are_refused():
       </body></worldbody></mujoco>""")
     with pytest.raises(ValueError, match="one to a body, to foresee what they do, got"):
         JointAxes.of(ball.model, ball.base)
-
-
-@pytest.mark.parametrize("size", [1, 2, FEW, FEW + 1, 14])
-def test_what_is_compiled_solves_as_lapack_does(size, generator):
-    """Few unknowns by elimination, which is all rows at once, many by LAPACK itself."""
-    half = torch.randn(5, size, size, dtype=torch.float64, generator=generator)
-    matrix = half @ half.mT + torch.eye(size)
-    right = torch.randn(5, size, dtype=torch.float64, generator=generator)
-    given = matrix.movedim(0, -1), right.mT
-    expected = torch.linalg.solve(matrix, right).mT
-    traced = torch.compile(_solve, backend="eager", fullgraph=True)
-    for solve in (_solve, traced):
-        torch.testing.assert_close(solve(*given), expected, atol=1e-9, rtol=1e-9)

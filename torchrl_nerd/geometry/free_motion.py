@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.elimination import solve
 from torchrl_nerd.geometry.frames import quat_matrix
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import cross
 
-FEW = 8  # unknowns; fourteen would take minutes to compile
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float)
 
 
@@ -124,7 +124,7 @@ class FreeMotion(nn.Module):
         """
         where = rotation, corners, places
         parts = self.equation(qpos, qvel, joint_torque, *where, period)
-        acceleration = _solve(*parts).movedim(0, -1).reshape(qvel.shape)
+        acceleration = solve(*parts).movedim(0, -1).reshape(qvel.shape)
         if not self.num_whole:
             return acceleration
         linear = (rotation @ acceleration[..., :3, None])[..., 0]
@@ -215,38 +215,6 @@ def rows_last(x: Tensor, size: int) -> Tensor:
     batch = x.ndim - size
     flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])
     return flat.permute(tuple(reversed(range(flat.ndim))))
-
-
-def inverted(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses ``(n, n, N)`` of positive definite matrices, and times ``right (n, N)``."""
-    if len(matrix) > FEW or not torch.compiler.is_compiling():
-        inverse = torch.linalg.inv_ex(matrix.movedim(-1, 0))[0]
-        return inverse.permute(1, 2, 0), (inverse @ right.mT[..., None])[..., 0].mT
-    one = torch.eye(len(matrix), dtype=matrix.dtype, device=matrix.device)
-    columns = [_solve(matrix, column[:, None]) for column in one]
-    return torch.stack(columns, 1), _solve(matrix, right)
-
-
-def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solutions ``(n, N)`` of positive definite ``(n, n, N)``.
-
-    By LAPACK, row by row; where few unknowns are compiled, by Gauss's elimination without
-    pivots, all rows at once, which becomes one piece with what is round it.
-    """
-    if len(right) > FEW or not torch.compiler.is_compiling():
-        return torch.linalg.solve_ex(matrix.movedim(-1, 0), right.mT)[0].mT
-    columns, rows = [], []
-    while len(right):
-        row = matrix[0] / matrix[0, 0]
-        columns.append(row[1:])
-        rows.append(right[0] / matrix[0, 0])
-        right = right[1:] - matrix[1:, 0] * rows[-1]
-        matrix = matrix[1:, 1:] - matrix[1:, :1] * row[1:]
-    found = [rows.pop()]
-    while rows:
-        column = columns[len(rows) - 1]
-        found.insert(0, rows.pop() - (column * torch.stack(found)).sum(0))
-    return torch.stack(found)
 
 
 def _four_points(model: mujoco.MjModel, body: int) -> np.ndarray:

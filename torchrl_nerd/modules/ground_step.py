@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import BasePose
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.free_motion import FreeMotion, inverted, rows_last
+from torchrl_nerd.geometry.elimination import Limbs, inverted
+from torchrl_nerd.geometry.free_motion import FreeMotion, rows_last
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics, cross
 from torchrl_nerd.geometry.manifold import integrate_pos
@@ -94,6 +95,7 @@ class GroundStep(nn.Module):
         axes, points = JointAxes.of(model, scene.base), scene.contacts
         self.num_points, self.num_axes = len(points), len(axes.joints)
         self.contact, self.limit = ContactSprings(scene), LimitSprings(model, axes)
+        self.limbs = Limbs.of(model)
         self.motion = FreeMotion(model, scene.base, axes, scene.actuated)
         bodies = points.bodies + axes.bodies + self.motion.bodies
         places = points.positions, axes.positions, self.motion.positions
@@ -210,7 +212,7 @@ class GroundStep(nn.Module):
         matrix, push = self.motion.equation(
             qpos, qvel, joint_torque, rotation, corners, places, 2.0 * self.step_size
         )
-        inverse, free = inverted(matrix, push)
+        inverse, free = inverted(matrix, push, self.limbs)
         depth, normal = self.radii - distance.mT, rows_last(normal, 2)
         # spheres touch where they are halfway into the ground
         points = (
