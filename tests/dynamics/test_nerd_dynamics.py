@@ -8,6 +8,7 @@ from dynamics_helpers import (
     HAS_COMPILER,
     LEARNED,
     double_model,
+    enliven,
     in_small_steps,
     random_drive,
     random_model,
@@ -16,6 +17,7 @@ from dynamics_helpers import (
 )
 from torch import Tensor
 
+from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
 from torchrl_nerd.scenes import SCENES, load_scene
@@ -167,3 +169,21 @@ def test_bad_choices_are_refused_in_one_sentence(generator):
         NeRDDynamics(model, inference="batch")
     with pytest.raises(ValueError, match="window of at least 1.*got 0"):
         NeRDDynamics(model, inference="window", window=0)
+
+
+def test_a_compiled_step_follows_its_weights(generator):
+    """Changed in place, put in another's stead, or of another dtype."""
+    model = from_pretrained("double_pendulum-small")
+    drive = random_drive(model.scene, 4, 3, generator)
+    compiled = NeRDDynamics(model, compile=True)
+    roll(compiled, *drive)
+    other = from_pretrained("double_pendulum-small").state_dict()
+    for change in (
+        lambda: enliven(model.network, generator),
+        lambda: model.load_state_dict(other, assign=True),
+        model.double,
+    ):
+        change()
+        found, expected = roll(compiled, *drive), roll(NeRDDynamics(model), *drive)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    assert not compiled._compiled.is_eager or not HAS_COMPILER

@@ -6,7 +6,7 @@ import torch
 from helpers import every_scene
 from torch import Tensor
 
-from torchrl_nerd.geometry.elimination import FEW, Limbs, inverted, solve
+from torchrl_nerd.geometry.elimination import FEW, Limbs, inverted, solve, times
 
 CLOSE = {"atol": 1e-9, "rtol": 1e-9}
 
@@ -34,6 +34,15 @@ def test_few_unknowns_or_many(size, generator):
         found = each(matrix, right)
         torch.testing.assert_close(found[0], inverse.movedim(0, -1), **CLOSE)
         torch.testing.assert_close(found[1], expected, **CLOSE)
+
+
+@pytest.mark.parametrize("columns", [1, FEW, FEW + 1])
+def test_few_columns_or_many(columns, generator):
+    matrix = torch.randn(3, columns, dtype=torch.float64, generator=generator)
+    rows = torch.randn(2, 4, columns, 5, dtype=torch.float64, generator=generator)
+    expected = torch.einsum("mn,abnk->abmk", matrix, rows)
+    for each in (times, traced(times)):
+        torch.testing.assert_close(each(matrix, rows), expected, **CLOSE)
 
 
 @pytest.mark.parametrize("limbs", [Limbs(6, 4, 2), Limbs(1, 3, 4), Limbs(7, 2, 8)])

@@ -16,9 +16,31 @@ from torchrl_nerd.row_threads import RowThreads, parts_of
 
 Inference = Literal["streaming", "window"]
 
+
+def _of_tensors(guards: list[Any]) -> list[bool]:
+    """Which of a compiled step's checks are made: of tensors, and of torch's own state.
+
+    The thousand that ask in every step whether the model is still made of the same parts
+    take a tenth of a small one's time.
+    """
+    return [
+        not guard.is_global
+        and (guard.guard_type == "TENSOR_MATCH" or "self." not in guard.name)
+        for guard in guards
+    ]
+
+
 # A second thread waits in a short loop for longer than it works, and Python takes as long
-# to call one; so one thread, called from C++, and rows in parts if that is not enough.
-SHORT_LOOPS = {"options": {"cpp.threads": 1, "cpp_wrapper": True}}
+# to call one; so one thread, called from C++, and rows in parts if that is not enough. For
+# a number of rows each: code for any number takes longer, to compile four times as long.
+SHORT_LOOPS = {
+    "dynamic": False,
+    "options": {
+        "cpp.threads": 1,
+        "cpp_wrapper": True,
+        "guard_filter_fn": _of_tensors,
+    },
+}
 LEAST_WORK = (
     2048  # rows times dofs of a part: less takes longer to hand over than it saves
 )

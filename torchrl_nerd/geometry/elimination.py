@@ -14,7 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-FEW = 8  # unknowns; fourteen would take minutes to compile
+FEW = 8  # unknowns or columns; fourteen would take minutes to compile
+
+
+def times(matrix: Tensor, rows: Tensor) -> Tensor:
+    """``matrix (m, n)`` times each of ``rows (*size, n, N)``.
+
+    Where few are compiled, sums, which become one piece with what is round them.
+    """
+    if matrix.shape[-1] <= FEW and torch.compiler.is_compiling():
+        return (matrix[..., None] * rows.unsqueeze(-3)).sum(-2)
+    return matrix @ rows
 
 
 class Limbs(NamedTuple):

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.elimination import solve
+from torchrl_nerd.geometry.elimination import solve, times
 from torchrl_nerd.geometry.frames import quat_matrix
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import cross
@@ -42,7 +42,8 @@ class _Inertia(NamedTuple):
 
     def of_groups(self, members: Tensor) -> "_Inertia":
         """Of several together, ``members (groups, n)``."""
-        return _Inertia(*(members @ moment for moment in self))
+        first, second = (times(members, moment) for moment in self[1:])
+        return _Inertia(members @ self.mass, first, second)
 
 
 class FreeMotion(nn.Module):
@@ -199,15 +200,16 @@ class FreeMotion(nn.Module):
         if self.num_whole:
             rate = torch.cat((torch.zeros_like(rate[:3]), rate[3:]))
         turned, moved = rate * spin, rate * slide
-        omega, velocity = self.together.mT @ turned, self.together.mT @ moved
+        omega, velocity = (times(self.together.mT, x) for x in (turned, moved))
         bend = cross(omega, turned), cross(omega, moved) + cross(velocity, turned)
-        omega, velocity = self.carries.mT @ turned, self.carries.mT @ moved
-        alpha, acceleration = (self.carries.mT @ x for x in bend)
+        omega, velocity = (times(self.carries.mT, x) for x in (turned, moved))
+        alpha, acceleration = (times(self.carries.mT, x) for x in bend)
         moment, force = bodies.momentum(alpha, acceleration - gravity[:, None])
         angular, linear = bodies.momentum(omega, velocity)
         force = force + cross(omega, linear)
         moment = moment + cross(omega, angular) + cross(velocity, linear)
-        return (spin * (self.carries @ moment) + slide * (self.carries @ force)).sum(0)
+        moment, force = (times(self.carries, x) for x in (moment, force))
+        return (spin * moment + slide * force).sum(0)
 
 
 def rows_last(x: Tensor, size: int) -> Tensor:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import BasePose
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.elimination import Limbs, inverted
+from torchrl_nerd.geometry.elimination import Limbs, inverted, times
 from torchrl_nerd.geometry.free_motion import FreeMotion, rows_last
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics, cross
@@ -276,7 +276,7 @@ class GroundStep(nn.Module):
             force = self.contact(depth, rising, sliding, normal)
             at = joints + moved[self.limited], speed[self.limited]
             pushes = (levers * force[:, :, None]).sum(0).flatten(0, 1), self.limit(*at)
-            push = reaches @ torch.cat(pushes)
+            push = times(reaches, torch.cat(pushes))
             if self.whole:
                 push = torch.cat((force.sum(1), push[self.whole :]))
             gain = free if drift is None else torch.add(free, drift, alpha=number)

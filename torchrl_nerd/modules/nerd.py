@@ -40,7 +40,7 @@ NETWORKS: dict[str, NetworkConfig] = {
 STEPS: dict[str, NetworkConfig] = {
     "free": FreeConfig(),
     "grounded": GroundedConfig(),
-    "grounded-small": GroundedConfig(depth=1, width=16),
+    "grounded-small": GroundedConfig(depth=1, width=16, looks=1),
     "grounded-fast": GroundedConfig(looks=1, stride=2),
 }
 """Those that correct a step: of a `FreeNeRD`, for robots that nothing touches, and of a
