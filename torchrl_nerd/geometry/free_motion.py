@@ -42,8 +42,7 @@ class _Inertia(NamedTuple):
 
     def of_groups(self, members: Tensor) -> "_Inertia":
         """Of several together, ``members (groups, n)``."""
-        first, second = (times(members, moment) for moment in self[1:])
-        return _Inertia(members @ self.mass, first, second)
+        return _Inertia(*(times(members, moment) for moment in self))
 
 
 class FreeMotion(nn.Module):
