@@ -23,6 +23,7 @@ import torchrl_nerd
 from torchrl_nerd import load_scene
 from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.policy import Policy, save_policy
+from torchrl_nerd.tasks import TASKS, make_task
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -86,7 +87,11 @@ def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
             copyfile(EXCERPT, name)
         for option, folder in pairwise(words):
             if option == "--policy":
-                save_policy(Policy([29, 8]), Path(folder), {"task": "ant/run"})
+                scene = words[2] if words[1] == "data" else "ant"
+                name = next(name for name in TASKS if name.startswith(f"{scene}/"))
+                task = make_task(name)
+                sizes = [task.observation_size, task.controller.num_actions]
+                save_policy(Policy(sizes), Path(folder), {"task": name})
         assert main([*words[1:], "--dry-run"]) == 0, capsys.readouterr().err
 
 
