@@ -97,12 +97,13 @@ def test_it_keeps_the_substeps_that_it_learned_from(generator, tmp_path):
 
 @each_stepped
 def test_rows_do_not_see_each_other(scene, network, generator):
-    model = lively(scene, network, generator)
+    # in float64: springs may magnify the rounding of float32 a thousand times
+    model = lively(scene, network, generator).double()
     rows = random_transitions(scene, ROWS, generator)
     together, alone = step(model, rows), step(model, rows[3:4])
     for key in (QPOS, QVEL):
         torch.testing.assert_close(
-            alone[key][0], together[key][3], atol=1e-4, rtol=1e-4
+            alone[key][0], together[key][3], atol=1e-6, rtol=1e-6
         )
 
 
