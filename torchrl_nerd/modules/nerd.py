@@ -42,6 +42,7 @@ STEPS: dict[str, NetworkConfig] = {
     "grounded": GroundedConfig(),
     "grounded-small": GroundedConfig(depth=1, width=16, looks=1),
     "grounded-fast": GroundedConfig(looks=1, stride=2),
+    "grounded-fine": GroundedConfig(looks=3),
 }
 """Those that correct a step: of a `FreeNeRD`, for robots that nothing touches, and of a
 `GroundedNeRD`, for robots on springs."""
