@@ -8,6 +8,7 @@ from dynamics_helpers import (
     STEPPED,
     each_stepped,
     enliven,
+    little_data,
     random_drive,
     roll,
     scene_stats,
@@ -23,12 +24,14 @@ from torchrl_nerd.checkpoint import (
 )
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.stability.states import turned
+from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.grounded import GroundedNeRD
 from torchrl_nerd.modules.nerd import STEPS
 from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.training.sequences import cover
 from torchrl_nerd.training.start import begin_from
 
 ROWS = 32
@@ -68,6 +71,31 @@ def test_a_fresh_one_moves_as_its_step_does(scene, network, generator):
     after, size = step(model, rows), 1.0 + (qvel - rows[QVEL]).abs().amax()
     assert (after[QPOS] - qpos).abs().max() < 1e-5 * size
     assert (after[QVEL] - qvel).abs().max() < 1e-5 * size
+
+
+@each_stepped
+def test_changes_are_bounded_by_speed_and_not_by_the_data(scene, network, generator):
+    """A step knows of impacts that are harder than any in the data."""
+    model, rows = fresh(scene, network), random_transitions(scene, ROWS, generator)
+    expected = step(model, rows)
+    cover(model, little_data(scene))
+    coverage, limit = model.coverage, model.coverage.speed
+    for end in (coverage.target_low, coverage.target_high):
+        end.zero_()  # data in which nothing ever changed
+    coverage.still.zero_()
+    after = step(model, rows)
+    is_slow = (coverage.sizes(expected[QVEL]) < limit).all(-1)
+    assert is_slow.any()
+    for key in (QPOS, QVEL):
+        torch.testing.assert_close(after[key][is_slow], expected[key][is_slow])
+    enliven(model.network, generator)
+    coverage.qpos_low.fill_(-torch.inf), coverage.qpos_high.fill_(torch.inf)
+    rows[JOINT_TORQUE] = 1e2 * rows[JOINT_TORQUE]
+    after = step(model, rows)
+    assert (coverage.sizes(after[QVEL]) <= limit * (1.0 + 1e-9)).all()
+    way = 0.5 * coverage.sizes(rows[QVEL]) + 1.5 * limit  # m/s: trapezoid, residual
+    moved = differentiate_pos(scene.layout, rows[QPOS], after[QPOS])
+    assert (coverage.sizes(moved) <= 2.0 * scene.control_step * way).all()
 
 
 @each_stepped

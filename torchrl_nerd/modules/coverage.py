@@ -4,8 +4,9 @@ A network says something of any input, far from its training data too. Here inpu
 taken back to the box that the data filled, changes of the state stay within the largest
 ones seen, speeds within twice the largest, and joints stop where the data end beyond
 their limits: nothing inside the box is touched, and whatever is outside stays finite and
-bounded. What is as good as still stays where it is. How far an input lies outside is a
-number that can be looked at, see `Coverage.distance`.
+bounded. A simulator within a model knows harder impacts than any seen: its changes stay
+within what the bound on speeds leaves. What is as good as still stays where it is. How
+far an input lies outside is a number that can be looked at, see `Coverage.distance`.
 """
 
 import torch
@@ -127,6 +128,16 @@ class Coverage(nn.Module):
     def clamp_target(self, target: Tensor) -> Tensor:
         """Normalised changes of the state ``(*batch, D)`` within the box."""
         return target.clamp(self.target_low, self.target_high)
+
+    def clamp_change(self, change: Tensor, step: float) -> Tensor:
+        """Changes ``(*batch, 2 nv)`` no larger than from the largest speed to its opposite.
+
+        Args:
+            change: of velocities, then of positions beside the trapezoid, see `StateDelta`.
+            step: s, in which they happen.
+        """
+        largest = torch.cat((2.0 * self.speed, step * self.speed))
+        return change.clamp(-largest, largest)
 
     def limit_speed(self, qvel: Tensor) -> Tensor:
         """Velocities ``(*batch, nv)``, slowed to the limit where they are beyond it."""
