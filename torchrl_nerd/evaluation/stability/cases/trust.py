@@ -125,4 +125,5 @@ CASE = Case(
     "inputs unlike those of training are told apart, and MuJoCo takes over for them",
     _run,
     lines={MISSED: 0.05, RATIO: 2.0},
+    needs_dynamics=True,
 )
