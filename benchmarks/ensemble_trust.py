@@ -8,12 +8,14 @@ velocities from their mean, in the first one's units, and its price a step of ea
 and errors are those of `nerd stability SCENE --cases trust`.
 """
 
-from argparse import ArgumentParser
+from dataclasses import dataclass
 from typing import cast
 
 import torch
+import tyro
 from tensordict import TensorDict
 from torch import Generator, Tensor
+from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import NeRDDynamics
@@ -21,6 +23,16 @@ from torchrl_nerd.evaluation.stability.cases.trust import auc, inputs, scores
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.scenes import load_scene
+
+
+@dataclass
+class Options:
+    """Which models, over which robot."""
+
+    scene: Positional[str]
+    models: Positional[tuple[str, ...]]
+    """Shipped ones or folders; the first is judged."""
+    seed: int = 0
 
 
 def spread(models: list[NeRD], data: TensorDict) -> Tensor:
@@ -38,18 +50,11 @@ def spread(models: list[NeRD], data: TensorDict) -> Tensor:
     return off.square().mean((0, 2)).sqrt()
 
 
-def main() -> None:
-    """Print both areas under the ROC curve."""
-    parser = ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene")
-    parser.add_argument(
-        "models", nargs="+", help="shipped ones or folders, first judged"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    scene = load_scene(args.scene)
-    models = [from_pretrained(name, scene) for name in args.models]
-    generator = Generator().manual_seed(args.seed)
+def main(options: Options) -> None:
+    """Print the areas under the ROC curve."""
+    scene = load_scene(options.scene)
+    models = [from_pretrained(name, scene) for name in options.models]
+    generator = Generator().manual_seed(options.seed)
     inside, _, outside = inputs(scene, generator)
     data = cast(TensorDict, torch.cat((inside, outside)))
     found = scores(models[0], data, spread=spread(models, data))
@@ -63,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Options, description=__doc__))
