@@ -15,6 +15,7 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.scenes.contact_points import ContactPoints
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling, sample_torque
 
@@ -99,6 +100,20 @@ def random_transitions(scene: Scene, rows: int, generator: Generator) -> TensorD
         scale = torch.ones(rows, 1, dtype=torch.float64)
     torque = sample_torque(scene.sampling, scale, 1, generator)[:, 0]
     return true_step(scene, TensorDict(start, batch_size=[rows]), torque)
+
+
+def with_points_in_order(scene: Scene, order: Tensor) -> Scene:
+    """The same robot, its contact points listed in another order ``(P,)``."""
+    points, other = scene.contacts, replace(scene)
+    index, place = order.numpy(), order.argsort().tolist()
+    vars(other)["contacts"] = ContactPoints(
+        bodies=[points.bodies[i] for i in index],
+        positions=points.positions[index],
+        radii=points.radii[index],
+        margins=points.margins[index],
+        stands_for=[place[i] if i >= 0 else -1 for i in points.stands_for],
+    )
+    return other
 
 
 def in_ground(scene: Scene, rows: int, generator: Generator) -> TensorDict:

@@ -15,6 +15,7 @@ from pathlib import Path
 from shutil import copyfile
 
 import pytest
+import stability_table
 import torch
 from helpers import EXCERPT
 from tensordict import TensorDict
@@ -150,6 +151,13 @@ def test_examples_in_docstrings_run(path):
     module = importlib.import_module(name)
     failed, tried = doctest.testmod(module, extraglobs=SHARED | vars(module))
     assert tried > 0 and failed == 0
+
+
+def test_the_tables_of_hard_cases_are_what_was_measured():
+    found = stability_table.read(ROOT / "docs" / "figures")
+    page = (ROOT / "docs" / "stability.md").read_text()
+    assert stability_table.with_lines(found) in page
+    assert stability_table.without_lines(found) in page
 
 
 def test_the_site_shows_pages_that_exist():

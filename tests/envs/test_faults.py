@@ -153,6 +153,11 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     dump = read_dump(path)
     assert dump.about["reason"] == "action" and dump.about["row"] == str(row)
     assert torch.equal(dump.steps["qpos"][1:], good["qpos"][row])
+    assert ("features" in dump.steps.keys()) == (model is not None)
+    if model is not None:
+        given = (dump.steps[k] for k in ("qpos", "qvel", "joint_torque"))
+        features = model.features(*given, None).nan_to_num()
+        assert torch.equal(dump.steps["features"].nan_to_num(), features)
     stamp = path.stat().st_mtime_ns
     act(env, bad)
     assert path.stat().st_mtime_ns == stamp

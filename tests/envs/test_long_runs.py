@@ -2,6 +2,7 @@
 
 import functools
 import resource
+from math import ceil
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -11,15 +12,24 @@ from dynamics_helpers import EnvMaker, random_actions
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv
 
-from torchrl_nerd.tasks import TASKS
+from torchrl_nerd.tasks import TASKS, make_task
 
 TASK = next(iter(TASKS))
 ROWS, HORIZON = 4, 5
 WARM_UP = 20  # steps until caches and pools are as large as they get
 GROWTH = 2 * 2**20  # bytes, of all the steps
+MANY = 1024
+DAY = ceil(
+    86_400 / (MANY * make_task(TASK).scene.control_step)
+)  # steps of so many rows
 
 each_length = pytest.mark.parametrize(
-    "steps", [50, pytest.param(5_000, marks=pytest.mark.slow)]
+    ("rows", "steps"),
+    [
+        (ROWS, 50),
+        pytest.param(ROWS, 5_000, marks=pytest.mark.slow),
+        pytest.param(MANY, DAY, marks=pytest.mark.slow),
+    ],
 )
 
 
@@ -37,8 +47,8 @@ def children() -> set[str]:
 
 @each_length
 @pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
-def test_memory_does_not_grow_with_steps_and_resets(dynamics, steps, generator):
-    env = EnvMaker(TASK, dynamics, generator, HORIZON)(ROWS)
+def test_memory_does_not_grow_with_steps_and_resets(dynamics, rows, steps, generator):
+    env = EnvMaker(TASK, dynamics, generator, HORIZON)(rows)
     actions = random_actions(env, 64, generator)
     now, sizes = env.reset(), {}
     for step in range(WARM_UP + steps + 1):

@@ -5,6 +5,9 @@ import json
 import pytest
 import torch
 from dynamics_helpers import EnvMaker, random_model
+from tensordict import TensorDictBase
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from torchrl_nerd.cli.main import main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
@@ -15,7 +18,7 @@ from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_ca
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, settled, starts
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, EnvWorld
 from torchrl_nerd.evaluation.traces import energy as traced_energy
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes import Scene, load_scene
 
 SCALE = 0.001
 SLOW = (
@@ -72,8 +75,57 @@ def test_an_env_is_a_world_too(dynamics, generator):
     plain = DynamicsWorld(make(4).dynamics)
     mine, expected = (w.roll(start, 3) for w in (world, plain))
     torch.testing.assert_close(mine["qpos"], expected["qpos"], atol=1e-9, rtol=1e-9)
-    with pytest.raises(ValueError, match="expected 4 states"):
-        world.roll(start[:2], 3)
+    few = world.roll(start[:3], 3)  # rows that are left over do not show
+    torch.testing.assert_close(few["qpos"], mine["qpos"][:3])
+
+
+class Foreign(EnvBase):
+    """A scene in an env that is none of this package's: qpos, qvel and an action."""
+
+    _supports_set_state = True
+
+    def __init__(self, scene: Scene, rows: int) -> None:
+        super().__init__(batch_size=[rows])
+        self.dynamics = MujocoDynamics(scene, num_threads=1)
+        self.high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
+        model = scene.model
+
+        def numbers(size: int) -> Unbounded:
+            return Unbounded((rows, size), dtype=torch.float64)
+
+        sizes = {"qpos": model.nq, "qvel": model.nv}
+        self.observation_spec = Composite(
+            {key: numbers(size) for key, size in sizes.items()}, shape=[rows]
+        )
+        self.action_spec = numbers(len(self.high))
+        self.reward_spec = numbers(1)
+
+    def _reset(self, tensordict: TensorDictBase, **kwargs) -> TensorDictBase:
+        self.now = tensordict.select("qpos", "qvel").clone()
+        self.dynamics.reset(self.now)
+        return self.now.clone()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.now = self.dynamics.step(self.now, self.high * tensordict["action"])
+        over = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        return self.now.clone().update({"reward": over.double(), "done": over})
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is drawn."""
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cube"])
+def test_cases_run_over_any_env_that_shows_qpos_and_qvel(name, generator):
+    scene = load_scene(name)
+    worlds = [
+        DynamicsWorld(MujocoDynamics(scene, num_threads=1)),
+        EnvWorld(Foreign(scene, 8), scene, is_true=True),
+    ]
+    results = list(run_cases(*worlds, choose_cases(SHORT), scale=SCALE))
+    assert len(results) > 3
+    for result in results:
+        assert not CASES[result.case].needs_dynamics
+        assert result.learned == pytest.approx(result.true, abs=1e-9, nan_ok=True)
 
 
 def test_momentum_and_energy_are_those_of_a_falling_cube(generator):

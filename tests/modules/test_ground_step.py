@@ -6,7 +6,13 @@ import mujoco
 import pytest
 import torch
 from dynamics_helpers import GROUNDED, each_grounded
-from helpers import in_ground, make_scene, random_transitions, true_step
+from helpers import (
+    in_ground,
+    make_scene,
+    random_transitions,
+    true_step,
+    with_points_in_order,
+)
 
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
@@ -223,3 +229,12 @@ def test_so_are_contacts_and_limits_of_another_law():
     model.jnt_solref[:] = (0.02, 1.0)
     with pytest.raises(ValueError, match="expected limits that are springs"):
         GroundStep(replace(scene, model=model))
+
+
+@each_grounded
+@each_looks
+def test_points_in_another_order_push_alike(scene, looks, generator):
+    rows = touching(scene, generator, looks)
+    order = torch.randperm(len(scene.contacts), generator=generator)
+    got = moved(with_points_in_order(scene, order), rows, looks)
+    torch.testing.assert_close(got, moved(scene, rows, looks), rtol=1e-6, atol=1e-6)

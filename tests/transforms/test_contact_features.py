@@ -14,6 +14,7 @@ from helpers import (
     moved_scene,
     random_transitions,
     true_step,
+    with_points_in_order,
 )
 
 from torchrl_nerd.keys import (
@@ -181,6 +182,38 @@ def test_far_from_the_ground_all_is_zero(scene, generator):
         rows = raised(scene, rows, torch.full((ROWS,), 100.0))
     for value in contact_features(scene, rows).values():
         assert not value.any()
+
+
+@touching_scene
+def test_points_in_another_order_are_features_in_that_order(scene, generator):
+    rows = near_ground(scene, generator)
+    order = torch.randperm(len(scene.contacts), generator=generator)
+    got = contact_features(with_points_in_order(scene, order), rows)
+    want = contact_features(scene, rows)
+    for key, value in got.items():
+        torch.testing.assert_close(value, want[key][:, order], rtol=0.0, atol=1e-12)
+
+
+@touching_scene
+@pytest.mark.parametrize("junk", [1e30, -1e30])
+def test_what_far_points_do_is_not_seen(scene, junk, generator, monkeypatch):
+    """Points beyond their margin may move as they like: they have no slot of their own."""
+    rows, transform = near_ground(scene, generator), ContactFeatures(scene)
+    given = rows[QPOS], rows[QVEL], rows.get(TERRAIN, None)
+    features = transform.contact_features(*given)
+    is_far = features[0] == 0.0
+    assert is_far.any()
+    true = transform.kinematics.forward
+
+    def spoilt(qpos, qvel):
+        places, velocity = true(qpos, qvel)
+        velocity = velocity.clone()
+        velocity[:, : transform.count][is_far] = junk
+        return places, velocity
+
+    monkeypatch.setattr(transform.kinematics, "forward", spoilt)
+    for got, want in zip(transform.contact_features(*given), features, strict=True):
+        assert torch.equal(got, want)
 
 
 @touching_scene

@@ -39,6 +39,8 @@ class Stability(DeviceCommand):
     """Of starts and torques."""
     scale: float = 1.0
     """Share of the long rollouts' steps and of large batches' rows, in (0, 1]."""
+    compile: bool = False
+    """Compile the model's step: long cases take a fraction of the time."""
     plot: Path | None = None
     """Draw every figure as a share of its line to this PNG."""
 
@@ -50,7 +52,7 @@ class Stability(DeviceCommand):
         scene = load_scene(self.scene)
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         truth = DynamicsWorld(MujocoDynamics(scene))
-        learned = DynamicsWorld(NeRDDynamics(model))
+        learned = DynamicsWorld(NeRDDynamics(model, compile=self.compile))
         results = []
         for result in run_cases(truth, learned, cases, self.seed, self.scale):
             verdict = "met" if result.passes else "NOT MET"

@@ -86,7 +86,10 @@ class SceneEnv(EnvBase):
         self.recorder: FaultRecorder | None = None
         if fault_folder is not None:
             name = type(dynamics).__name__
-            self.recorder = FaultRecorder(fault_folder, self.scene.name, name)
+            learned = self._learned
+            model = None if learned is None else learned.model
+            where = fault_folder, self.scene.name
+            self.recorder = FaultRecorder(*where, name, model)
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self.register_buffer("_episode", zeros)

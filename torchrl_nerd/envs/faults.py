@@ -2,7 +2,8 @@
 
 A fault ends its row as ``terminated`` at its last good state and leaves the others bitwise
 as they are. With a folder to write to, the first fault of each kind leaves a dump there:
-the last states, torques, actions and the ground of one such row.
+the last states, torques, actions and the ground of one such row, and what the model made
+of them.
 """
 
 from collections import deque
@@ -13,7 +14,8 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.files import writable_folder
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.tensor_files import write_tensors
 
 REASONS = ("none", "action", "diverged", "runaway")
@@ -50,12 +52,20 @@ class FaultRecorder:
         folder: where; made if it is not there.
         scene: name of the robot, for the replay.
         dynamics: name of what stepped it.
+        model: of a learned one; its ``features (T, F)`` go into the dump.
 
     Raises:
         ValueError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, scene: str, dynamics: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        scene: str,
+        dynamics: str,
+        model: NeRD | None = None,
+    ) -> None:
+        self.model = model
         self.folder = writable_folder(folder)
         self.about = {"scene": scene, "dynamics": dynamics}
         self._steps: deque[dict[str, Tensor]] = deque(maxlen=HISTORY)
@@ -86,6 +96,11 @@ class FaultRecorder:
     def _write(self, kind: int, row: int) -> Path:
         keys = self._steps[0].keys()
         tensors = {k: torch.stack([s[k][row] for s in self._steps]) for k in keys}
+        if self.model is not None:
+            here = {key: value.to(self.model.device) for key, value in tensors.items()}
+            state, torque = (here[QPOS], here[QVEL]), here["joint_torque"]
+            features = self.model.features(*state, torque, here.get(TERRAIN))
+            tensors["features"] = features.detach().cpu()
         about = {**self.about, "reason": REASONS[kind], "row": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
         write_tensors(path, tensors, about)

@@ -22,6 +22,7 @@ class Case:
     | ``physics`` | what should happen, and why, in a sentence |
     | ``run`` | measures one world; ``scale`` in (0, 1] shortens long rollouts |
     | ``applies`` | whether it makes sense for a robot |
+    | ``needs_dynamics`` | whether an env, which shows states alone, does not do |
     | ``true_lines``, ``lines`` | largest allowed figure in true and learned dynamics |
 
     A figure without a line is for information. The line of the true dynamics validates
@@ -34,6 +35,7 @@ class Case:
     applies: Callable[[Scene], bool] = lambda scene: True
     true_lines: Figures = field(default_factory=dict)
     lines: Figures = field(default_factory=dict)
+    needs_dynamics: bool = False
 
     def passes(self, figures: Figures, is_true: bool) -> bool:
         """Whether every figure that has a line keeps it; one that is no number does not."""

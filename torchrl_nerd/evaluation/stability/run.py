@@ -55,13 +55,15 @@ def run_cases(
 
     Args:
         truth: MuJoCo.
-        learned: the same robot's model.
+        learned: the same robot's model, or any env of it; cases that need more than its
+            states are left out then.
         cases: which.
         seed: of starts and torques; each case has a stream of its own, the same in both.
         scale: share of the long rollouts' steps and of large batches' rows, in (0, 1].
     """
     for case in cases:
-        if not case.applies(learned.scene):
+        is_blind = case.needs_dynamics and learned.dynamics is None
+        if is_blind or not case.applies(learned.scene):
             continue
         began, figures = time.monotonic(), []
         for world in (truth, learned):

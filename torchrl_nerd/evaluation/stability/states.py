@@ -93,6 +93,19 @@ def uniform_torque(scene: Scene, rows: int, steps: int, generator: Generator) ->
     return sample_torque(scene.sampling, scale, steps, generator)
 
 
+def extreme_torques(scene: Scene, rows: int, steps: int) -> dict[str, Tensor]:
+    """None, all there is and more, by name ``(rows, steps, num_actuated)``."""
+    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
+    full = high.expand(rows, steps, -1)
+    sign = 1.0 - 2.0 * (torch.arange(steps, dtype=torch.float64) % 2.0)
+    return {
+        "zero": torch.zeros_like(full),
+        "saturated": full,
+        "1000-fold": 1000.0 * full,
+        "alternating": sign[:, None] * full,
+    }
+
+
 def turned(scene: Scene, states: TensorDict, turn: Tensor) -> TensorDict:
     """States of a floating robot, turned about the world's origin, its ground with it.
 

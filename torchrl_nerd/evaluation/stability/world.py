@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
-from torchrl_nerd.evaluation.stability.states import idle
+from torchrl_nerd.evaluation.stability.states import idle, rows_of
 from torchrl_nerd.evaluation.traces import trace
 from torchrl_nerd.keys import ACTION, QPOS, QVEL
 from torchrl_nerd.scenes import Scene
@@ -72,10 +72,12 @@ class EnvWorld:
     """Any `EnvBase` that shows ``qpos`` and ``qvel`` and can be set to a state.
 
     Torques become actions by their share of the largest ones of the scene's sampling: a
-    case means the same drive to every env, in the env's own units.
+    case means the same drive to every env, in the env's own units. More states than the
+    env has rows take turns.
 
     Args:
-        env: of one batch dimension; ``reset(td, set_state=True)`` sets its state.
+        env: of one batch dimension; ``reset(td, set_state=True)`` sets its state, ``qpos``
+            and ``qvel`` come back from it and from each step.
         scene: the robot it holds; its own ``scene`` where not given.
         is_true: whether the lines of true dynamics are to be kept.
     """
@@ -94,17 +96,19 @@ class EnvWorld:
         torque: Tensor | None = None,
         every: int = 1,
     ) -> TensorDict:
-        """See `World.roll`; ends of episodes are stepped over.
+        """See `World.roll`; ends of episodes are stepped over."""
+        count, parts = self.env.batch_size.numel(), []
+        for first in range(0, len(start), count):
+            # the last state stands in the rows that are left over
+            rows = torch.arange(first, first + count).clamp_max(len(start) - 1)
+            drive = None if torque is None else torque[rows]
+            parts.append(self._roll(rows_of(start, rows), steps, drive, every))
+        return cast(TensorDict, torch.cat(parts)[: len(start)])
 
-        Raises:
-            ValueError: another number of states than the env has rows.
-        """
-        rows = self.env.batch_size
-        if rows != start.batch_size:
-            raise ValueError(
-                f"expected {rows.numel()} states, one of each row of the env, got "
-                f"{start.batch_size.numel()}"
-            )
+    def _roll(
+        self, start: TensorDict, steps: int, torque: Tensor | None, every: int
+    ) -> TensorDict:
+        """As many states as the env has rows."""
         largest = torch.tensor(self.scene.sampling.torque, dtype=torch.float64)
         state = self.env.reset(start.clone(), set_state=True)
         kept = [state.select(QPOS, QVEL)]

@@ -57,4 +57,5 @@ CASE = Case(
     "how a step is computed changes no more than the order of float32 sums",
     _run,
     lines={COMPILED: 1e-4, THREADS: 1e-4, PROCESS: 1e-4},
+    needs_dynamics=True,
 )

@@ -38,4 +38,5 @@ CASE = Case(
     "float32 is enough for the network; what bfloat16 costs is said",
     _run,
     lines={SINGLE: 1e-5},
+    needs_dynamics=True,
 )

@@ -5,7 +5,7 @@ from torch import Generator
 
 from torchrl_nerd.evaluation.stability.case import Case, Figures, has_motors
 from torchrl_nerd.evaluation.stability.measures import largest
-from torchrl_nerd.evaluation.stability.states import idle, starts
+from torchrl_nerd.evaluation.stability.states import extreme_torques, starts
 from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL
 
@@ -16,17 +16,9 @@ BROKEN = "rows that are no numbers"
 
 def _run(world: World, generator: Generator, scale: float) -> Figures:
     scene = world.scene
-    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
-    full = high.expand(ROWS, 1, -1)
-    drives = {
-        "zero": idle(scene, ROWS)[:, None],
-        "saturated": full,
-        "1000-fold": 1000.0 * full,
-        "alternating": torch.cat((full, -full), 1),
-    }
     figures, fastest, broken = {}, 0.0, 0
     steps = max(20, round(scale * STEPS))
-    for name, torque in drives.items():
+    for name, torque in extreme_torques(scene, ROWS, 2).items():
         path = world.roll(starts(scene, ROWS, generator), steps, torque, steps // 20)
         state = torch.cat((path[QPOS], path[QVEL]), -1)
         broken += int((~state.isfinite()).flatten(1).any(1).sum())

@@ -14,6 +14,7 @@ from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.scenes import Scene
 
 ROWS, LENGTH, STEPS, DRIVEN = 200, 40, 60, 5
 FASTEST = 4.0  # speeds and torques beyond the training range, times
@@ -27,12 +28,8 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     if not isinstance(learned, NeRDDynamics):
         return {MISSED: 0.0, RATIO: 1.0}  # MuJoCo needs no guard
     scene, model = world.scene, learned.model
-    data = simulate(scene, ROWS, LENGTH, generator)
-    data = cast(TensorDict, data[is_sound(data)].flatten(0, 1))
-    order = torch.randperm(len(data), generator=generator)
-    inside, calibration, outside = cast(TensorDict, data[order]).chunk(3)
-    outside = _stretched(outside.clone(), generator)
-    seen, known, unseen = (_scores(model, d) for d in (inside, calibration, outside))
+    inside, calibration, outside = inputs(scene, generator)
+    seen, known, unseen = (scores(model, d) for d in (inside, calibration, outside))
     level = torch.quantile(known["distance"], 1.0 - FALSE_ALARMS)
     beyond = unseen["excess"] > 0.0
     large = torch.quantile(known["error"], 0.99)
@@ -45,7 +42,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     }
     for name in ("distance", "mahalanobis", "excess"):
         score = torch.cat([x[name] for x in (seen, unseen)])
-        figures[f"area under ROC of {name}, large errors"] = _auc(score, wrong)
+        figures[f"area under ROC of {name}, large errors"] = auc(score, wrong)
     guarded = GuardedDynamics(NeRDDynamics(model), "fallback")
     rows = beyond.nonzero()[:ROWS, 0]
     errors = [
@@ -61,7 +58,18 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     return figures
 
 
-def _stretched(data: TensorDict, generator: Generator) -> TensorDict:
+def inputs(
+    scene: Scene, generator: Generator
+) -> tuple[TensorDict, TensorDict, TensorDict]:
+    """Three times as many transitions: two like those of training, one unlike them."""
+    data = simulate(scene, ROWS, LENGTH, generator)
+    data = cast(TensorDict, data[is_sound(data)].flatten(0, 1))
+    order = torch.randperm(len(data), generator=generator)
+    inside, calibration, outside = cast(TensorDict, data[order]).chunk(3)
+    return inside, calibration, stretched(outside.clone(), generator)
+
+
+def stretched(data: TensorDict, generator: Generator) -> TensorDict:
     """Speeds, torques or both up to `FASTEST` times as large."""
     factor = 1.0 + (FASTEST - 1.0) * torch.rand(len(data), 1, generator=generator)
     kind = torch.randint(3, (len(data), 1), generator=generator)
@@ -71,8 +79,11 @@ def _stretched(data: TensorDict, generator: Generator) -> TensorDict:
     return data
 
 
-def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
-    """Scores of inputs, and the normalised one-step errors that they should foretell."""
+def scores(model: NeRD, data: TensorDict, **others: Tensor) -> dict[str, Tensor]:
+    """Scores of inputs, and the normalised one-step errors that they should foretell.
+
+    Rows that MuJoCo gives up on are left out, of other scores ``(rows,)`` too.
+    """
     data = data.to(model.device)
     terrain, torque = data.get(TERRAIN, None), data[JOINT_TORQUE]
     now = data[QPOS], data[QVEL]
@@ -85,16 +96,17 @@ def _scores(model: NeRD, data: TensorDict) -> dict[str, Tensor]:
         output = model.network.step(token, model.network.empty_memory(len(token)))
     error = output.double() - model.normalize.normalize(TARGET, target)
     coverage = model.coverage
-    scores = {
+    found = {
         "error": error.square().mean(-1).sqrt(),
         "distance": coverage.distance(features),
         "mahalanobis": coverage.mahalanobis(features),
         "excess": coverage.excess(features),
+        **others,
     }
-    return {name: score[fine].cpu() for name, score in scores.items()}
+    return {name: score[fine].cpu() for name, score in found.items()}
 
 
-def _auc(score: Tensor, is_large: Tensor) -> float:
+def auc(score: Tensor, is_large: Tensor) -> float:
     """Share of pairs of a large and a small error that the score puts in order.
 
     A tie counts as half a pair, as in Mann and Whitney's statistic.
@@ -125,4 +137,5 @@ CASE = Case(
     "inputs unlike those of training are told apart, and MuJoCo takes over for them",
     _run,
     lines={MISSED: 0.05, RATIO: 2.0},
+    needs_dynamics=True,
 )
