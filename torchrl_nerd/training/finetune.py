@@ -171,8 +171,8 @@ class FineTuner:
                 if update % config.validate_every == 0 or update == total:
                     is_better = self._consider(update / self.updates_per_epoch, loss)
                     bar.set_postfix(self._last)
-                    waited = 0 if is_better else waited + 1
-                    if waited >= config.patience and not is_short:
+                    waited = 0 if is_better or is_short else waited + 1
+                    if waited >= config.patience:
                         break
 
     def _batch(self, starts: Tensor, length: int, generator: Generator) -> TensorDict:
