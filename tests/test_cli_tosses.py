@@ -17,7 +17,6 @@ TINY = [
     "16",
     "--length",
     "2",
-    "--quiet",
 ]
 
 
@@ -53,6 +52,7 @@ def test_what_was_fine_tuned_is_measured(tmp_path, capsys):
     out, figures = tmp_path / "run", tmp_path / "figures.json"
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", str(out), *TINY]
     assert main([*argv, "--scratch", "residual"]) == 0
+    assert "epochs 0.02/0.02" in capsys.readouterr().err
     assert {p.name for p in out.iterdir()} == {
         "model.safetensors",
         "card.json",

@@ -82,6 +82,15 @@ def test_only_what_was_asked_for_changes(model, tosses, update, generator):
                 assert torch.linalg.matrix_rank(change, atol=1e-7) <= 2
 
 
+def test_it_stops_where_validation_stands_still_at_full_length(model, tosses):
+    still = {"lr": 0.0, "physics_lr": 0.0}
+    run = tuner(model, tosses, epochs=1.0, validate_every=1, patience=2, **still)
+    run.run()
+    short = run.config.short_share * run.updates_per_epoch
+    done = run.curve[-1]["epoch"] * run.updates_per_epoch
+    assert done == pytest.approx(int(short) + 2) and done < run.updates_per_epoch
+
+
 def test_runs_of_one_seed_are_the_same(model, tosses):
     first, second = (weights(tuner(model, tosses).run()) for _ in range(2))
     assert all(torch.equal(first[k], second[k]) for k in first)

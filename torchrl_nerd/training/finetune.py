@@ -17,6 +17,7 @@ from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
 from torchrl_nerd.data.cube_tosses import Tosses
+from torchrl_nerd.evaluation.parameter_fit import WINDOWS
 from torchrl_nerd.evaluation.toss_error import STATES
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.residual import ResidualNeRD
@@ -32,6 +33,7 @@ from torchrl_nerd.training.toss_view import TossView
 VALIDATION_STRIDE = 5  # of the validation tosses' sub-trajectories, which overlap
 IMAGES = 8  # isometries per batch
 WARMUP = 10  # updates over which step sizes rise
+BAR = "epochs {n:.2f}/{total:.2f} |{bar}| {elapsed}<{remaining}{postfix}"
 
 
 class FineTuner:
@@ -115,53 +117,63 @@ class FineTuner:
     def run(self) -> NeRD:
         """Train until the epochs are over or validation stands still."""
         self._began = time.monotonic()
-        with tqdm(desc="epochs", disable=self.quiet) as epochs:
-            self._consider(0.0)
-            train = self._fit if self.config.update == "physics" else self._descend
-            train(epochs)
+        self._consider(0.0)
+        if self.config.update == "physics":
+            self._fit()
+        else:
+            self._descend()
         self.model, self.view.encoder = self._best
         return self.model
 
-    def _fit(self, epochs: tqdm) -> None:
+    def _bar(self, count: int, per_epoch: int) -> tqdm:
+        scale = 1.0 / per_epoch
+        bar = tqdm(total=count, unit_scale=scale, bar_format=BAR, disable=self.quiet)
+        bar.set_postfix(self._last)
+        return bar
+
+    def _fit(self) -> None:
         """Physics alone, without gradients; an evaluation counts as its share of one."""
-        model, seen = cast(ResidualNeRD, self.model), 0
+        model, evaluations = cast(ResidualNeRD, self.model), self.config.evaluations
+        epoch = len(self.starts)
+        planned = evaluations * sum(min(windows, epoch) for windows in WINDOWS)
+        seen = 0
 
         def show(windows: int) -> None:
             nonlocal seen
             seen += windows
-            epochs.update(windows / len(self.starts))
+            bar.update(windows)
 
-        evaluations = self.config.evaluations
-        for _ in fit_physics(model, self.view, self.train, evaluations, show):
-            self._consider(seen / len(self.starts))
-            epochs.set_postfix(self._last)
+        with self._bar(planned, epoch) as bar:
+            for _ in fit_physics(model, self.view, self.train, evaluations, show):
+                self._consider(seen / epoch)
+                bar.set_postfix(self._last)
 
-    def _descend(self, epochs: tqdm) -> None:
+    def _descend(self) -> None:
         """All that may change, along the gradient of rollouts."""
         config, waited = self.config, 0
         total = max(1, round(config.epochs * self.updates_per_epoch))
         generator = Generator().manual_seed(config.seed)
         order = torch.zeros(0, dtype=torch.long)
-        epochs.reset(config.epochs)
-        for update in range(1, total + 1):
-            if len(order) == 0:
-                order = torch.randperm(len(self.starts), generator=generator)
-            pick, order = order[: config.rows], order[config.rows :]
-            is_short = update <= config.short_share * total
-            length = max(1, config.length // 2) if is_short else config.length
-            rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
-            for group, peak in zip(
-                self.optimizer.param_groups, self.peaks, strict=True
-            ):
-                group["lr"] = peak * rate
-            loss = self._update(self._batch(self.starts[pick], length, generator))
-            epochs.update(1 / self.updates_per_epoch)
-            if update % config.validate_every == 0 or update == total:
-                is_better = self._consider(update / self.updates_per_epoch, loss)
-                epochs.set_postfix(self._last)
-                waited = 0 if is_better else waited + 1
-                if waited >= config.patience and not is_short:
-                    break
+        with self._bar(total, self.updates_per_epoch) as bar:
+            for update in range(1, total + 1):
+                if len(order) == 0:
+                    order = torch.randperm(len(self.starts), generator=generator)
+                pick, order = order[: config.rows], order[config.rows :]
+                is_short = update <= config.short_share * total
+                length = max(1, config.length // 2) if is_short else config.length
+                rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
+                for group, peak in zip(
+                    self.optimizer.param_groups, self.peaks, strict=True
+                ):
+                    group["lr"] = peak * rate
+                loss = self._update(self._batch(self.starts[pick], length, generator))
+                bar.update()
+                if update % config.validate_every == 0 or update == total:
+                    is_better = self._consider(update / self.updates_per_epoch, loss)
+                    bar.set_postfix(self._last)
+                    waited = 0 if is_better or is_short else waited + 1
+                    if waited >= config.patience:
+                        break
 
     def _batch(self, starts: Tensor, length: int, generator: Generator) -> TensorDict:
         """Windows ``[rows, length + 1]``, mirrored and with a little noise."""

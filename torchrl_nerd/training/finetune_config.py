@@ -28,7 +28,7 @@ class FinetuneConfig:
     | ``use_symmetry`` | show each window as a random one of its mirror images |
     | ``clip`` | largest norm of the network's gradient |
     | ``validate_every`` | updates between rollouts of the validation tosses |
-    | ``patience`` | validations without progress before it stops |
+    | ``patience`` | validations without progress, at full length, before it stops |
     | ``observe`` | whole states, or poses alone: a window encoder finds the start |
     | ``every`` | control steps between observed poses |
     | ``pose_noise`` | m, added to every observed pose: a worse camera |

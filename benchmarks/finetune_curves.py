@@ -1,0 +1,49 @@
+"""Validation curves of docs/real_data.md in one picture: fine-tuned and from scratch.
+
+    python benchmarks/finetune_curves.py --out docs/figures/finetune_curves.png
+
+Reads the curves that `nerd finetune` writes, and prints when each came to its best.
+"""
+
+import argparse
+from pathlib import Path
+
+from torchrl_nerd.evaluation.plots import COLORS, STYLES, make_figure, save_figure
+from torchrl_nerd.files import read_json
+from torchrl_nerd.training.convergence import Curve, converged
+
+FIGURES = Path("docs/figures")
+CURVES = {
+    "fine-tuned": FIGURES / "finetune_cube_curve.json",
+    "from scratch": FIGURES / "scratch_cube_curve.json",
+}
+ERRORS = {"position_m": "error (m)", "orientation_rad": "error (rad)"}
+
+
+def plot_curves(curves: dict[str, Curve], path: Path) -> None:
+    """Both errors on validation tosses over epochs."""
+    figure, panels = make_figure(len(ERRORS), height=4.5)
+    for panel, (error, label) in zip(panels, ERRORS.items(), strict=True):
+        for number, (name, curve) in enumerate(curves.items()):
+            look = {"color": COLORS[number], "ls": STYLES[number], "label": name}
+            epochs = [point["epoch"] for point in curve]
+            panel.plot(epochs, [point[error] for point in curve], **look, marker=".")
+        panel.set(ylabel=label, yscale="log")
+    panels[0].legend(frameon=False)
+    panels[-1].set_xlabel("epochs")
+    save_figure(figure, path)
+
+
+def main() -> None:
+    """Draw and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=FIGURES / "finetune_curves.png")
+    args = parser.parse_args()
+    curves = {name: read_json(path)["curve"] for name, path in CURVES.items()}
+    for name, curve in curves.items():
+        print(name, {key: round(x, 4) for key, x in converged(curve).items()})
+    plot_curves(curves, args.out)
+
+
+if __name__ == "__main__":
+    main()
