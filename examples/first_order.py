@@ -55,14 +55,8 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
     if cfg.start is not None:
         return load_policy(cfg.start, env.task)
     ppo = PPO_CONFIGS.get(cfg.task, PPOConfig())
-    with torch.no_grad():
-        steps = remember(env, ppo.memory).rollout(
-            cfg.episode, break_when_any_done=False
-        )
-    size, num_actions = steps["observation"].shape[-1], env.action_spec.shape[-1]
-    policy = Policy((size, *ppo.widths, num_actions), memory=ppo.memory)
-    policy.standardize.fit(steps["observation"])
-    return policy
+    seen = remember(env, ppo.memory)
+    return Policy.for_env(seen, cfg.episode, ppo.widths, memory=ppo.memory)
 
 
 def train(cfg: Config) -> tuple[Policy, list[float]]:
@@ -97,7 +91,7 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
             progress.set_postfix({name: x.mean for name, x in earned.items()})
             if earned["nerd"].mean > best:
                 best = earned["nerd"].mean
-                save_policy(policy, cfg.out, {"task": cfg.task, "dynamics": "nerd"})
+                save_policy(policy, cfg.out, {**asdict(cfg), "dynamics": "nerd"})
     return load_policy(cfg.out), rewards
 
 

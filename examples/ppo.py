@@ -16,8 +16,7 @@ import torch
 import tyro
 from tensordict import TensorDictBase
 from torch import nn
-from torch.optim import Adam
-from torch.optim.lr_scheduler import LinearLR
+from torch.optim import Adam, lr_scheduler
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, ValueOperator
@@ -26,13 +25,13 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_nerd import make_env
-from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.memory import remember
-from torchrl_nerd.evaluation import plots, policy_transfer
+from torchrl_nerd.evaluation.plots import plot_learning_curve
 from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
-from torchrl_nerd.files import write_json
-from torchrl_nerd.tasks import Task, make_task
+from torchrl_nerd.evaluation.policy_transfer import mean_returns
+from torchrl_nerd.evaluation.transfer_report import report_transfer
+from torchrl_nerd.tasks import Task
 from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -53,19 +52,15 @@ class Run(PPOConfig):
 
 def parse(kind: type[Run] = Run) -> Run:
     """Settings from the command line; the task chooses the defaults of all others."""
-    known, _ = tyro.cli(kind, add_help=False, return_unknown_args=True)
-    task = known.task
-    return tyro.cli(
-        kind, default=kind(**vars(PPO_CONFIGS.get(task, PPOConfig())), task=task)
-    )
+    task = tyro.cli(kind, add_help=False, return_unknown_args=True)[0].task
+    defaults = vars(PPO_CONFIGS.get(task, PPOConfig()))
+    return tyro.cli(kind, default=kind(**defaults, task=task))
 
 
 def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperator]:
     """Both see observations standardised by all that were met, by random actions first."""
-    seen = env.rollout(cfg.horizon, break_when_any_done=False)["observation"]
-    size, num_actions = seen.shape[-1], env.action_spec.shape[-1]
-    policy = Policy((size, *cfg.widths, num_actions), cfg.std, cfg.memory)
-    critic = nn.Sequential(policy.standardize.fit(seen), mlp((size, *cfg.widths, 1)))
+    policy = Policy.for_env(env, cfg.horizon, cfg.widths, cfg.std, cfg.memory)
+    critic = nn.Sequential(policy.standardize, mlp((policy.sizes[0], *cfg.widths, 1)))
     return policy, ValueOperator(critic)
 
 
@@ -80,11 +75,7 @@ def make_learning(
 
 
 def update(
-    batch: TensorDictBase,
-    advantage: GAE,
-    loss: ClipPPOLoss,
-    optimizer: Adam,
-    cfg: Run,
+    batch: TensorDictBase, advantage: GAE, loss: ClipPPOLoss, optimizer: Adam, cfg: Run
 ) -> None:
     """Several passes over a batch ``[num_envs, horizon]``."""
     batch["next", "reward"] *= 1 - cfg.gamma  # values become means of rewards, not sums
@@ -118,11 +109,8 @@ def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:
     )
 
 
-Collect = Callable[..., Iterable[TensorDictBase]]
-
-
 def train(
-    cfg: Run, task: str | Task | None = None, collect: Collect = collect
+    cfg: Run, task: str | Task | None = None, collect: Callable = collect
 ) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
     task = task or cfg.task
@@ -132,42 +120,29 @@ def train(
     actor = make_actor(policy)
     advantage, loss, optimizer = make_learning(actor, critic, cfg)
     frames, total = num_frames(cfg)
-    schedule = LinearLR(optimizer, 1.0, end_factor=0.0, total_iters=total // frames)
-    curve = []
-    progress = tqdm(total=total, unit="frame", unit_scale=True)
+    schedule = lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total // frames)
+    curve, progress = [], tqdm(total=total, unit="frame", unit_scale=True)
     for number, batch in enumerate(collect(cfg, env, actor), 1):
         update(batch, advantage, loss, optimizer, cfg)
         policy.standardize.fit(batch["observation"])
         schedule.step()
         progress.update(frames)
         if number % cfg.evaluate_every == 0 or number * frames == total:
-            where, seed = [cfg.dynamics], cfg.seed + 1
-            episodes = min(256, cfg.episodes)
-            returns = policy_transfer.transfer(task, actor, where, episodes, seed=seed)
-            means = {name: summary.mean for name, summary in returns.items()}
+            episodes, seed = min(256, cfg.episodes), cfg.seed + 1
+            means = mean_returns(task, actor, [cfg.dynamics], episodes, seed=seed)
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})
     return policy, curve
 
 
-def main(cfg: Run, collect: Collect = collect) -> None:
+def main(cfg: Run, collect: Callable = collect) -> None:
     """Learn in one dynamics, measure in all of them, write down what came out."""
     torch.manual_seed(cfg.seed)
     policy, curve = train(cfg, collect=collect)
-    save_policy(policy, cfg.out, {"task": cfg.task, "dynamics": cfg.dynamics})
-    plots.plot_learning_curve(curve, cfg.out / "learning_curve.png")
-
-    actor, seed = make_actor(policy), cfg.seed + 2
-    scene = make_task(cfg.task).scene
-    learned = ("nerd",) if scene.name in shipped_models() else ()
-    everywhere = (cfg.dynamics, *learned, "mujoco", "dm_control")
-    where = cfg.task, actor, everywhere
-    returns = policy_transfer.transfer(*where, cfg.episodes, seed=seed)
-    print(policy_transfer.transfer_table(returns))
-    write_json(cfg.out / "returns.json", {k: asdict(v) for k, v in returns.items()})
-    where = cfg.task, actor, everywhere[:3]
-    episodes = policy_transfer.hardest_episode(*where, seed=seed)
-    plots.plot_states(episodes, scene, cfg.out / "episode.png")
+    save_policy(policy, cfg.out, asdict(cfg))
+    plot_learning_curve(curve, cfg.out / "learning_curve.png")
+    where = cfg.task, make_actor(policy), cfg.dynamics
+    report_transfer(*where, cfg.episodes, cfg.seed + 2, cfg.out)
 
 
 if __name__ == "__main__":

@@ -138,10 +138,8 @@ def main(cfg: Config) -> None:
     seconds = time.monotonic() - began
     print(f"{seconds:.0f} s in all")
     figures = {name: asdict(summary) for name, summary in report.items()}
-    write_json(
-        folder / "report.json",
-        {"suite": suite, "seconds": seconds, "returns": figures},
-    )
+    about = {"configuration": asdict(cfg), "suite": suite, "seconds": seconds}
+    write_json(folder / "report.json", {**about, "returns": figures})
 
 
 if __name__ == "__main__":

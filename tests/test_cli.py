@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from torchrl_nerd import __version__
 from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.files import folder_name
@@ -14,7 +15,6 @@ from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training.recipes import RECIPES
 
 NOTHING_RANDOM = ("doctor", "replay")
-TELLS = ("eval", "stability", "doctor")  # a line as each part is done
 SOON_DONE = ("plot", "explain", "replay")
 QUICK = ("cartpole", "double_pendulum", "cube")  # the others take minutes in all
 TINY = ["--network", "mlp", "--rows", "64", "--rollout-rows", "8", "--quiet"]
@@ -65,7 +65,7 @@ def test_every_command_explains_itself(command, capsys):
     assert f"Example: nerd {command} " in text
     assert "--json " in text and "--dry-run" in text
     assert ("--seed " in text) == (command not in NOTHING_RANDOM)
-    assert ("--quiet" in text) == (command not in (*TELLS, *SOON_DONE))
+    assert ("--quiet" in text) == (command not in SOON_DONE)
 
 
 @pytest.mark.parametrize("command", ["data", "train"])
@@ -218,10 +218,13 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
 
     rows = "16"
     argv = ["eval", name, "--model", best, "--rows", rows, "--seed", str(seed)]
+    argv += ["--quiet"]
     capsys.readouterr()
     assert main([*argv, "--json", str(figures["eval"])]) == 0
     table = capsys.readouterr().out.splitlines()[1:]
     content, protocol = read(figures["eval"]), PROTOCOLS[name]()
+    assert content["command"] == "eval" and content["version"] == __version__
+    assert content["configuration"].items() >= {"model": best, "rows": 16}.items()
     assert (content["scene"], content["rows"], content["seed"]) == (name, 16, seed)
     quantities = scene.model.njnt
     if scene.base.is_floating:
@@ -256,6 +259,7 @@ def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, cap
         assert [path.name for path in (tmp_path / place).iterdir()] == [folder]
 
     model = ["--model", f"runs/{folder}/best", "--rows", "8", "--json", "eval.json"]
+    model += ["--quiet"]
     assert main(["eval", name, *model]) == 0
     rows = json.loads((tmp_path / "eval.json").read_text())["errors"]
     assert {(row["case"], row["steps"]) for row in rows} == {
@@ -301,6 +305,15 @@ def test_names_that_lead_elsewhere_are_refused(
 )
 def test_names_of_robots_are_names_of_folders(name, expected):
     assert folder_name(name) == expected
+
+
+def test_progress_is_shown_apart_from_the_table(tmp_path, monkeypatch, capsys):
+    model = ["--model", "cartpole-micro", "--rows", "2"]
+    assert main(["eval", "cartpole", *model]) == 0
+    shown = capsys.readouterr()
+    assert "cartpole:" in shown.err and "it/s" in shown.err
+    assert main(["eval", "cartpole", *model, "--quiet"]) == 0
+    assert capsys.readouterr() == (shown.out, "")
 
 
 def test_a_scene_is_explained(scene, tmp_path, seed, capsys):

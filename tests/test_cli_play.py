@@ -11,6 +11,7 @@ from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.policy import Policy, save_policy
 from torchrl_nerd.evaluation.render.movie import write_movie
 from torchrl_nerd.evaluation.render.sheet import SIZE
+from torchrl_nerd.files import read_json
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +33,7 @@ def test_a_film_and_its_figures(task, tmp_path, seed, monkeypatch, capsys):
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["film"] == out and figures["steps"] <= 12
     assert all(f["mean"] >= 0.0 and f["unit"] for f in figures["errors"].values())
+    assert figures["configuration"]["seed"] == seed
     with Image.open(tmp_path / out) as film:
         assert film.size == SIZE and film.is_animated
         expected = round(figures["seconds"] * 25) + 1
@@ -48,6 +50,10 @@ def test_a_film_of_a_policy_in_slow_motion(tmp_path, seed):
         assert main([*argv, "--slow", slow, "--out", str(out)]) == 0
         with Image.open(out) as film:
             lengths.append(film.n_frames)
+        how = read_json(tmp_path / f"{slow}.gif.json")[
+            "configuration"
+        ]  # without --json
+        assert (how["slow"], how["policy"]) == (float(slow), str(tmp_path / "policy"))
     assert lengths[1] > 1.5 * lengths[0]
 
 

@@ -5,10 +5,12 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from dm_control import suite as dm_suite
 
 from torchrl_nerd.evaluation.policy import load_policy
+from torchrl_nerd.tasks import make_task
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -52,3 +54,30 @@ def test_a_library_that_knows_gymnasium_alone_learns_in_it(monkeypatch, seed, ca
     assert all(math.isfinite(mean) and mean != 0.0 for mean in found.values())
     np.testing.assert_allclose(found["nerd"], found["mujoco"], rtol=1e-3, atol=1e-3)
     assert "mujoco: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("dynamics", ["nerd", "mujoco"])
+def test_ppo_learns_in_one_dynamics_and_is_measured_in_all(
+    dynamics, monkeypatch, tmp_path, seed, capsys
+):
+    """What `make demo` does; the dynamics are one argument and nothing else changes."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import ppo
+
+    sizes = {"num_envs": 8, "horizon": 4, "total_frames": 64, "minibatch": 16}
+    cfg = ppo.Run(dynamics=dynamics, seed=seed, episodes=4, out=tmp_path, **sizes)
+    ppo.main(cfg)
+    returns = json.loads((tmp_path / "returns.json").read_text())
+    assert set(returns) == {"nerd", "mujoco", "dm_control"}
+    for summary in returns.values():
+        assert summary["episodes"] == 4 and abs(summary["gap"]) < 0.05
+    assert "dm_control  " in capsys.readouterr().out
+    for picture in ("learning_curve.png", "episode.png"):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    card = json.loads((tmp_path / "policy.json").read_text())
+    assert card.items() >= {"dynamics": dynamics, "seed": seed, "horizon": 4}.items()
+    load_policy(tmp_path, make_task(cfg.task))
+
+
+def test_ppo_is_short():
+    assert len((EXAMPLES / "ppo.py").read_text().splitlines()) < 150

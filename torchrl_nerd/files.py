@@ -60,16 +60,18 @@ def _is_running(process: str) -> bool:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON object atomically; numbers that are not finite become null."""
-    text = json.dumps(_without_nan(content), indent=2, allow_nan=False) + "\n"
+    """Write a JSON object atomically; non-finite numbers become null, paths strings."""
+    text = json.dumps(_plain(content), indent=2, allow_nan=False) + "\n"
     write_atomically(path, lambda aside: aside.write_text(text))
 
 
-def _without_nan(content: Any) -> Any:
+def _plain(content: Any) -> Any:
     if isinstance(content, dict):
-        return {key: _without_nan(value) for key, value in content.items()}
+        return {key: _plain(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_without_nan(value) for value in content]
+        return [_plain(value) for value in content]
+    if isinstance(content, Path):
+        return str(content)
     is_odd = isinstance(content, float) and not isfinite(content)
     return None if is_odd else content
 

@@ -18,7 +18,7 @@ def write_tensors(
     tensors: Mapping[str, Tensor],
     about: Mapping[str, str] | None = None,
 ) -> None:
-    """Replace the file by these tensors, from whatever device.
+    """Replace the file by these tensors of any shapes, from whatever device.
 
     Args:
         path: of the file.
@@ -35,7 +35,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name, on the processor.
+    """The tensors of a file, by name, of any shapes, on the processor.
 
     Raises:
         ValueError: in one sentence, no file there, or something else in it.

@@ -1,5 +1,6 @@
 """Two processes that share every batch end where one does, up to rounding."""
 
+import csv
 import os
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from torchrl_nerd.transforms import Stats
 BRIEF = (
     *("--steps", "12", "--rollout-steps", "3", "--rows", "8", "--length", "4"),
     *("--rollout-rows", "4", "--rollout-length", "3", "--warmup", "2"),
-    *("--save-every", "5", "--validate-every", "50", "--quiet", "--threads", "1"),
+    *("--save-every", "5", "--validate-every", "3", "--quiet", "--threads", "1"),
     *("--bf16-share", "0"),  # whose rounding is a thousand times as coarse
 )
 
@@ -44,16 +45,20 @@ def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str
 )
 def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
     generate(load_scene(name), DataConfig(60, 8), tmp_path / "data", quiet=True)
-    states = []
+    states, losses = [], []
     for count in (1, 2):
         out = tmp_path / f"run_{count}"
         said, _ = train(name, tmp_path / "data", out, count, *more)
         assert said.count("checkpoint in") == said.count("\n") == 1
         states.append(load_file(out / "state.safetensors"))
+        with open(out / "log.csv", newline="") as file:
+            losses.append([float(row["loss"]) for row in csv.DictReader(file)])
     assert states[0]["step"] == states[1]["step"] == 15
     for key, value in states[0].items():
         if key.startswith(("model.", "average.")):
             torch.testing.assert_close(states[1][key], value, atol=2e-4, rtol=1e-3)
+    assert len(losses[0]) == 5
+    torch.testing.assert_close(*map(torch.tensor, losses), atol=0.0, rtol=1e-5)
 
 
 def test_shares_that_are_not_equal_are_refused(tmp_path):

@@ -42,6 +42,11 @@ class Bench(DeviceCommand):
     quiet: bool = False
     """No progress bars."""
 
+    @property
+    def picture(self) -> Path | None:
+        """The drawing, where it was asked for."""
+        return self.plot
+
     def run(self) -> dict[str, Any]:
         """Print the tables and return their figures."""
         report = bench(

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,29 @@ class Command(ABC):
     """A command whose fields are its options."""
 
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the figures and all settings to this file."""
     dry_run: bool = False
     """Say what would be done and with which settings, and do none of it."""
 
     @abstractmethod
     def run(self) -> dict[str, Any]:
         """Do it and return the figures."""
+
+    @property
+    def picture(self) -> Path | None:
+        """The film or figure that `run` leaves, where it leaves one."""
+        return None
+
+    @property
+    def record(self) -> Path | None:
+        """Where figures and settings go: as asked for, or beside the picture."""
+        if self.json is not None or self.picture is None:
+            return self.json
+        return self.picture.with_name(f"{self.picture.name}.json")
+
+    def configuration(self) -> dict[str, Any]:
+        """Every option and its value, with which `run` does the same again."""
+        return {k: v for k, v in asdict(self).items() if k not in ("json", "dry_run")}
 
     def plan(self) -> list[str]:
         """What `run` would do, in sentences; bad input is refused as there."""

@@ -101,7 +101,11 @@ class Data(Command):
         ]
 
     def run(self) -> dict[str, Any]:
-        """Write the data set and return its card."""
+        """Write the data set and return its card.
+
+        Raises:
+            ValueError: options that exclude each other, or see `generate`, `load_tosses`.
+        """
         if self.recorded is not None:
             for name, is_given in (("inspect", self.inspect), ("policy", self.policy)):
                 if is_given:

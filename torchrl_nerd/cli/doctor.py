@@ -14,6 +14,9 @@ class Doctor(Command):
     Example: nerd doctor --json results/doctor.json
     """
 
+    quiet: bool = False
+    """No progress bar."""
+
     def run(self) -> dict[str, Any]:
         """Print what was found and return it.
 
@@ -26,7 +29,7 @@ class Doctor(Command):
             for key, value in entries.items():
                 print(f"  {key:<14}{value}")
         print("shipped models: relative difference from their stored steps")
-        checks = shipped_checks()
+        checks = shipped_checks(self.quiet)
         for name, check in checks.items():
             if "error" in check:
                 print(f"  {name:<28}{check['error']}")

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
@@ -56,9 +57,15 @@ class Eval(DeviceCommand):
     """Of recorded tosses: all, train, validation or test, by the recommended seed."""
     baselines: bool = False
     """Beside it, on recorded tosses: MuJoCo, published and fitted, and no motion."""
+    quiet: bool = False
+    """No progress bar."""
 
     def run(self) -> dict[str, Any]:
-        """Print a table and return its rows."""
+        """Print a table and return its rows.
+
+        Raises:
+            ValueError: fewer than 2 rows, or a robot that has no such terrain or model.
+        """
         if self.data is not None:
             return self.run_recorded(self.data)
         scene = load_scene(self.scene)
@@ -76,6 +83,8 @@ class Eval(DeviceCommand):
         rows = []
         header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"
         print(f"{header}{'final':>9}{'p95':>9}  paper")
+        steps = 2 * max(protocol.horizons) * len(protocol.cases)  # learned and true
+        bar = tqdm(total=steps, desc=self.scene, leave=False, disable=self.quiet)
         for case, source in protocol.cases.items():
             place = scene_of(source)
             here = model if place is scene else model.over(place)
@@ -88,6 +97,7 @@ class Eval(DeviceCommand):
                 self.seed,
                 self.device,
                 case in protocol.random_actions,
+                bar.update,
             )
             for horizon, by_name in errors.items():
                 for name, error in by_name.items():
@@ -97,7 +107,8 @@ class Eval(DeviceCommand):
                     figures = (error.mean, error.interval, error.final, error.p95)
                     line = f"{case:<13}{horizon:>6} {name:<17}{error.unit:<3}"
                     line += "".join(f"{figure:>9.5f}" for figure in figures)
-                    print(f"{line}  {paper if paper is not None else '-'}")
+                    bar.write(f"{line}  {paper if paper is not None else '-'}")
+        bar.close()
         settings = {"rows": self.rows, "seed": self.seed}
         settings |= {"inference": self.inference, "fine": self.fine, "bf16": self.bf16}
         return {"scene": self.scene, **settings, "errors": rows}
@@ -108,7 +119,11 @@ class Eval(DeviceCommand):
         return model.to(torch.bfloat16) if self.bf16 else model
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
-        """The same for recorded tosses."""
+        """The same for recorded tosses.
+
+        Raises:
+            ValueError: no such split, or no toss that is long enough.
+        """
         scene = real_scene(self.scene)
         model = self._load(self.model or SHIPPED, scene)
         tosses, split = load_tosses(path, scene)

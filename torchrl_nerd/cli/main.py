@@ -8,6 +8,7 @@ from typing import Any
 
 import tyro
 
+from torchrl_nerd import __version__
 from torchrl_nerd.cli.bench import Bench
 from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.data import Data
@@ -59,8 +60,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("\n".join((*command.plan(), *command.settings())))
             return 0
         figures = command.run()
-        if command.json is not None:
-            write_json(command.json, figures)
+        if command.record is not None:
+            how = {"command": argv[0], "version": __version__}
+            how["configuration"] = command.configuration()
+            write_json(command.record, {**how, **figures})
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail(str(error).splitlines()[0])
     return 0

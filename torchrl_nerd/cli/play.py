@@ -53,11 +53,18 @@ class Play(DeviceCommand):
     quiet: bool = False
     """No progress bar."""
 
+    @property
+    def picture(self) -> Path | None:
+        """The film."""
+        if self.viewer:
+            return None
+        return self.out or Path("runs") / f"{folder_name(self.task)}.gif"
+
     def run(self) -> dict[str, Any]:
         """Play, film or show, and return the errors."""
         task = make_task(self.task)
-        out = self.out or Path("runs") / f"{folder_name(self.task)}.gif"
-        check_display() if self.viewer else check_movie(out)
+        out = self.picture
+        check_display() if out is None else check_movie(out)
         if self.slow <= 0.0:
             raise ValueError(f"expected slow above 0, got {self.slow}")
         size = task.scene.control_step * task.steps_per_action
@@ -82,7 +89,7 @@ class Play(DeviceCommand):
             memory,
         )
         drawn = None
-        if self.viewer:
+        if out is None:
             view(pair, self.slow)
         else:
             drawn = film(pair, out, self.task, self.slow, self.draw, self.quiet)
@@ -94,7 +101,7 @@ class Play(DeviceCommand):
                 f"{error['unit']}"
             )
         shared = {"task": self.task, "seed": self.seed, "renderer": drawn}
-        return {**shared, "film": None if self.viewer else str(out), **figures}
+        return {**shared, "film": out, **figures}
 
 
 def pair_figures(pair: Pair) -> dict[str, Any]:

@@ -41,12 +41,29 @@ class Plot(DeviceCommand):
     out: Path | None = None
     """PNG to write; runs/NAME_rollouts.png, or training.png in the run's folder."""
 
+    @property
+    def picture(self) -> Path:
+        """The PNG."""
+        if self.out is not None:
+            return self.out
+        if self.is_run:
+            return Path(self.what) / "training.png"
+        return Path("runs") / f"{folder_name(self.what)}_rollouts.png"
+
+    @property
+    def is_run(self) -> bool:
+        """Whether the folder of a run was named."""
+        return (Path(self.what) / "log.csv").is_file()
+
     def run(self) -> dict[str, Any]:
-        """Draw and return what was drawn."""
-        folder = Path(self.what)
-        if (folder / "log.csv").is_file():
-            out = self.out or folder / "training.png"
-            log = plot_training(folder, out)
+        """Draw and return what was drawn.
+
+        Raises:
+            ValueError: no such robot, case or model, or a number out of range.
+        """
+        out = self.picture
+        if self.is_run:
+            log = plot_training(Path(self.what), out)
             print(f"{out}: {len(log['step'])} validations")
             return {"run": self.what, "log": log}
         scene = load_scene(self.what)
@@ -70,7 +87,6 @@ class Plot(DeviceCommand):
             self.seed,
             case in protocol.random_actions,
         )
-        out = self.out or Path("runs") / f"{folder_name(self.what)}_rollouts.png"
         plot_traces(traces, out)
         print(f"{out}: {self.what}, {case}, {self.rows} trajectories of {steps} steps")
         return {"scene": self.what, "case": case, **_figures(traces)}

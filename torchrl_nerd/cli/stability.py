@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
@@ -43,9 +45,20 @@ class Stability(DeviceCommand):
     """Compile the model's step: long cases take a fraction of the time."""
     plot: Path | None = None
     """Draw every figure as a share of its line to this PNG."""
+    quiet: bool = False
+    """No progress bar."""
+
+    @property
+    def picture(self) -> Path | None:
+        """The drawing, where it was asked for."""
+        return self.plot
 
     def run(self) -> dict[str, Any]:
-        """Print a line per case, then the table, and return the figures."""
+        """Print a line per case, then the table, and return the figures.
+
+        Raises:
+            ValueError: no such robot, case or model, or a scale out of range.
+        """
         if not 0.0 < self.scale <= 1.0:
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
         cases = choose_cases(list(self.cases) or None)
@@ -53,10 +66,11 @@ class Stability(DeviceCommand):
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         truth = DynamicsWorld(MujocoDynamics(scene))
         learned = DynamicsWorld(NeRDDynamics(model, compile=self.compile))
-        results = []
-        for result in run_cases(truth, learned, cases, self.seed, self.scale):
+        results, count = [], sum(case.applies(scene) for case in cases)
+        found = run_cases(truth, learned, cases, self.seed, self.scale)
+        for result in tqdm(found, "cases", count, leave=False, disable=self.quiet):
             verdict = "met" if result.passes else "NOT MET"
-            print(f"{result.case:<18}{verdict:<9}{result.seconds:>7} s", flush=True)
+            tqdm.write(f"{result.case:<18}{verdict:<9}{result.seconds:>7} s")
             results.append(result)
         print()
         print(as_table(results))

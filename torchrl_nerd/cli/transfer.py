@@ -32,7 +32,11 @@ class Transfer(DeviceCommand):
     """No progress bar."""
 
     def run(self) -> dict[str, Any]:
-        """Print a table and return its rows."""
+        """Print a table and return its rows.
+
+        Raises:
+            ValueError: fewer than 2 episodes; see `load_policy` and `transfer`.
+        """
         if self.episodes < 2:
             raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
         policy = load_policy(self.policy, make_task(self.task))

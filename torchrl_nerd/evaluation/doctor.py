@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
@@ -54,10 +55,10 @@ def machine() -> dict[str, str]:
     }
 
 
-def shipped_checks() -> dict[str, dict[str, Any]]:
+def shipped_checks(quiet: bool = True) -> dict[str, dict[str, Any]]:
     """Self-check of every shipped model: differences, seconds to load, or what failed."""
     found: dict[str, dict[str, Any]] = {}
-    for name in shipped_models():
+    for name in tqdm(shipped_models(), "models", leave=False, disable=quiet):
         began = time.monotonic()
         try:
             model, check = read_checkpoint(PRETRAINED / name)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_nerd.files import read_json, writable_folder, write_json
@@ -101,6 +102,31 @@ class Policy(nn.Module):
         self.standardize = Standardize(self.sizes[0], memory)
         self.mlp = mlp(self.sizes, last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((self.sizes[-1],), math.log(std)))
+
+    @classmethod
+    @torch.no_grad()
+    def for_env(
+        cls,
+        env: EnvBase,
+        steps: int,
+        widths: Sequence[int],
+        std: float = 1.0,
+        memory: int = 1,
+    ) -> "Policy":
+        """A fresh one, standardised by the observations that random actions meet.
+
+        Args:
+            env: shows ``memory`` observations side by side, see `remember`.
+            steps: of each row under random actions.
+            widths: of the hidden layers.
+            std: what the standard deviation begins at.
+            memory: how many observations it sees.
+        """
+        seen = env.rollout(steps, break_when_any_done=False)[OBSERVATION]
+        sizes = (seen.shape[-1], *widths, env.action_spec.shape[-1])
+        policy = cls(sizes, std, memory)
+        policy.standardize.fit(seen)
+        return policy
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the action before squashing, ``(*batch, A)``."""

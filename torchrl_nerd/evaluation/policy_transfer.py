@@ -132,6 +132,18 @@ def transfer(
     return {name: summarize(value, returns[TRUTH]) for name, value in returns.items()}
 
 
+def mean_returns(
+    task: str | Task,
+    actor: Actor,
+    dynamics: Sequence[str | Path],
+    episodes: int,
+    seed: int = 0,
+) -> dict[str, float]:
+    """The means alone of `transfer`, by name of the dynamics."""
+    summaries = transfer(task, actor, dynamics, episodes, seed=seed)
+    return {name: summary.mean for name, summary in summaries.items()}
+
+
 @torch.no_grad()
 def hardest_episode(
     task: str | Task,

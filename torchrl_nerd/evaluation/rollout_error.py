@@ -150,7 +150,15 @@ def open_loop_errors(
     steps: int,
     joint_torque: Tensor | Drive | None = None,
 ) -> dict[str, Tensor]:
-    """`position_errors` of two rollouts from the same start; see `open_loop`."""
+    """`position_errors` of two rollouts from the same start, ``(rows, steps)`` by quantity.
+
+    Args:
+        truth: true dynamics.
+        learned: of the same robot.
+        start: see `open_loop`, as ``steps`` and ``joint_torque``.
+        steps: control steps.
+        joint_torque: N or N m.
+    """
     paths = [open_loop(d, start, steps, joint_torque) for d in (truth, learned)]
     return position_errors(truth.scene, *paths)
 
@@ -166,7 +174,10 @@ def unit_of(scene: Scene, quantity: str) -> str:
 
 
 def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary]:
-    """Summary of each quantity of `position_errors`; non-finite errors stay visible."""
+    """Summary of each quantity of `position_errors`, ``(rows, steps)``, m or rad.
+
+    Errors that are not finite stay visible.
+    """
     summaries = {}
     for name, error in errors.items():
         per_row = error.mean(1)
@@ -189,16 +200,22 @@ def passive_errors(
     seed: int,
     device: torch.device | str = "cpu",
     random_actions: bool = False,
+    tick: Callable[[], object] = lambda: None,
 ) -> dict[int, dict[str, ErrorSummary]]:
     """Open-loop errors at every horizon, from one rollout of the longest.
 
     Passive where the source's controller makes no torque of a zero action; see
-    `action_drive`.
+    `action_drive`. ``tick`` is called before every step of either dynamics.
     """
     start, scene = initial_states(source, rows, seed).to(device), scene_of(source)
     steps = max(horizons)
     drive = action_drive(source, rows, steps, seed, random_actions)
-    errors = open_loop_errors(truth, learned, start, steps, drive)
+
+    def ticking_drive(step: int, state: TensorDictBase) -> Tensor:
+        tick()
+        return drive(step, state)
+
+    errors = open_loop_errors(truth, learned, start, steps, ticking_drive)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
         for horizon in horizons

@@ -93,7 +93,7 @@ def fit_mujoco(
     Args:
         scene: the cube.
         tosses: recorded.
-        train: numbers of the tosses to fit to.
+        train: numbers of the tosses to fit to, ``(count,)``.
         evaluations: of each stage.
         has_centre: seek the centre of mass too; in the cube's middle otherwise.
     """

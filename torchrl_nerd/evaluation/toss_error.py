@@ -80,7 +80,10 @@ def first_state(window: TensorDict) -> TensorDict:
 
 
 def no_motion(tosses: Tosses, starts: Tensor, states: int = STATES) -> tuple:
-    """Errors of a cube that stays where it is; see `toss_errors`."""
+    """Errors of a cube that stays where it is, m and rad, as `toss_errors` gives them.
+
+    ``starts (rows,)``: where sub-trajectories of ``states`` begin.
+    """
     measured = tosses.windows(starts, states)[QPOS]
     return path_errors(measured[:, :1].expand_as(measured[:, 1:]), measured[:, 1:])
 
@@ -135,7 +138,10 @@ def _half_width(means: Tensor) -> Tensor:
 def summarize_both(
     errors: tuple[Tensor, Tensor], tosses: Tosses, starts: Tensor
 ) -> dict[str, TossError]:
-    """``position_error_m`` and ``orientation_error_rad`` of what `toss_errors` gives."""
+    """``position_error_m`` and ``orientation_error_rad`` of what `toss_errors` gives.
+
+    ``starts (rows,)``: where the sub-trajectories begin.
+    """
     toss = tosses.toss_of(starts)
     is_first = starts == tosses.offsets[toss]
     names = ("position_error_m", "orientation_error_rad")

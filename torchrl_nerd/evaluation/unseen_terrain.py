@@ -35,7 +35,7 @@ class DoublePendulumOver(DoublePendulumPassive):
         self.scene = double_pendulum_over(add_ground)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """As over planes, without a row's ground."""
+        """``qpos`` and ``qvel (*batch, 2)`` as over planes, without a row's ground."""
         state = super().initial_state(u)
         del state[TERRAIN]
         return state

@@ -99,7 +99,7 @@ def quat_log(q: Tensor) -> Tensor:
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle in [-pi, pi), rad."""
+    """The same angle in [-pi, pi), ``(*batch,)``, rad."""
     wrapped = torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
     # an angle just below the border may have been rounded up to it
     return torch.where(wrapped >= torch.pi, -torch.pi, wrapped)

@@ -297,7 +297,7 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
 
 
 def eye_like(x: Tensor) -> Tensor:
-    """The 3 x 3 identity with the dtype and device of ``x``."""
+    """The identity ``(3, 3)`` with the dtype and device of ``x``."""
     return torch.eye(3, dtype=x.dtype, device=x.device)
 
 

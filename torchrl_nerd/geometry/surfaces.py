@@ -21,7 +21,11 @@ ON_SURFACE = 1e-12  # m: closer to a centre or an edge, the direction is roundin
 
 
 def plane_distance(points: Tensor, plane: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to a plane (unit normal, offset in m), and its normal."""
+    """To a plane ``(*batch, 4)``: unit normal, offset in m.
+
+    Like all distances here: of points ``(*batch, P, 3)``, m, in the surface's frame, signed
+    ``(*batch, P)``, m, and with it the normal there ``(*batch, P, 3)``.
+    """
     normal, offset = plane[..., :3], plane[..., 3:]
     distance = (points @ normal[..., None])[..., 0] - offset
     return distance, normal[..., None, :].expand_as(points)
@@ -39,7 +43,7 @@ def plane_in_frame(plane: Tensor, position: Tensor, rotation: Tensor) -> Tensor:
 
 
 def sphere_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """To a sphere about the origin; ``size[..., 0]`` is its radius, m."""
+    """To a sphere about the origin; ``size (*batch, 3)`` begins with its radius, m."""
     distance, normal = length_and_direction(points, _z_axis(points))
     return distance - size[..., None, 0], normal
 

@@ -61,7 +61,7 @@ class GroundedNeRD(NeRD):
         joint_torque: Tensor,
         terrain: Tensor | None = None,
     ) -> Tensor:
-        """What was wrong at the last look, the step's change, its doubt."""
+        """What was wrong at the last look, the step's change, its doubt, ``(rows, K)``."""
         exact = torch.promote_types(self.dtype, torch.float32)
         *after, wrong = self.ground_step(qpos, qvel, joint_torque, terrain, exact)
         change = self.state_delta.delta(qpos, qvel, *after)

@@ -40,6 +40,9 @@ class LookAt(nn.Module):
         scene: a robot of hinges and slides, on a free base or a fixed one, over a ground.
         axes: its joints.
         implicit: s, over which the damping of joints acts as it changes; 0: as it is.
+
+    Raises:
+        ValueError: a scene without ground.
     """
 
     joints: Tensor

@@ -63,6 +63,9 @@ class ResidualNeRD(NeRD):
     def decode(
         self, qpos: Tensor, qvel: Tensor, output: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """As `NeRD`, but unbounded: the simulator knows what lies beyond the data."""
+        """As `NeRD.decode`, shapes and units too, but unbounded.
+
+        The simulator knows what lies beyond the data.
+        """
         delta = self.normalize.denormalize(TARGET, output.to(qpos.dtype))
         return self.state_delta.integrate(qpos, qvel, delta)

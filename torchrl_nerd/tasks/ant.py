@@ -47,10 +47,10 @@ class Ant(Task):
 
     @abstractmethod
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Of the state that the step led to."""
+        """Of the state that the step led to, ``(*batch,)``."""
 
     def terminated(self, next_state: State) -> Tensor:
-        """The torso is too low."""
+        """The torso is too low, bool ``(*batch,)``."""
         return next_state[QPOS][..., 2] < MIN_HEIGHT
 
 
@@ -58,7 +58,7 @@ class AntRun(Ant):
     """Reward v_x + 0.1 p_up + p_heading."""
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Of the state that the step led to."""
+        """Of the state that the step led to, ``(*batch,)``."""
         speed = next_state[QVEL][..., 0]
         return speed + 0.1 * uprightness(next_state) + heading(next_state)
 
@@ -67,7 +67,7 @@ class AntSpin(Ant):
     """Reward w_up + p_up: spin to the left as fast as it can."""
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Of the state that the step led to."""
+        """Of the state that the step led to, ``(*batch,)``."""
         return angular_velocity(next_state)[..., 2] + uprightness(next_state)
 
 
@@ -75,7 +75,7 @@ class AntSpinTrack(Ant):
     """Reward 5 exp(-(w_up - 5)^2 - 0.1 w_x^2 - 0.1 w_y^2) + 0.1 p_up."""
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Of the state that the step led to."""
+        """Of the state that the step led to, ``(*batch,)``."""
         x, y, up = angular_velocity(next_state).unbind(-1)
         cost = (up - SPIN_TARGET) ** 2 + 0.1 * x**2 + 0.1 * y**2
         return 5.0 * torch.exp(-cost) + 0.1 * uprightness(next_state)

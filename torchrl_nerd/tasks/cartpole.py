@@ -25,25 +25,25 @@ class CartpoleSwingup(Task):
     observation_size = 4
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """X +-1 m, theta +-pi, velocities +-1."""
+        """``qpos (*batch, 2)`` within 1 m and pi rad, ``qvel`` within 1 m/s and 1 rad/s."""
         start = (2.0 * u - 1.0) * u.new_tensor(START)
         return {QPOS: start[..., :2], QVEL: start[..., 2:]}
 
     def observation(self, state: State) -> Tensor:
-        """x, theta wrapped, x', theta'."""
+        """x, theta wrapped, x', theta': ``(*batch, 4)``, m, rad, m/s, rad/s."""
         position, angle = state[QPOS].unbind(-1)
         where = torch.stack((position, wrap_angle(angle)), -1)
         return torch.cat((where, state[QVEL]), -1)
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Of the state that the step led to."""
+        """Of the state that the step led to, ``(*batch,)``."""
         position, angle = next_state[QPOS].unbind(-1)
         speed, spin = next_state[QVEL].unbind(-1)
         cost = wrap_angle(angle) ** 2 + 0.05 * position**2
         return 5.0 - cost - 0.1 * spin**2 - 0.1 * speed**2
 
     def terminated(self, next_state: State) -> Tensor:
-        """Off the rail or too fast."""
+        """Off the rail or too fast, bool ``(*batch,)``."""
         position = next_state[QPOS][..., 0].abs()
         speed = next_state[QVEL].abs().amax(-1)
         return (position > MAX_POSITION) | (speed > MAX_SPEED)

@@ -70,7 +70,10 @@ class SlopeToss(CubeToss):
     parameters = {TERRAIN: 4}
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """Tosses of the training ranges, as far above the slope as above level ground."""
+        """Tosses of the training ranges, as far above the slope as above level ground.
+
+        ``terrain (*batch, 4)`` beside them: the plane's unit normal and its offset, m.
+        """
         toss, slope = u.split([CubeToss.num_uniforms, 2], -1)
         state = super().initial_state(toss)
         return state | {TERRAIN: slope_beneath(state[QPOS], slope)}

@@ -32,7 +32,11 @@ class DoublePendulumPassive(Task):
         self.planes = torch.stack([evaluation_ground(number) for number in numbers])
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """Joint 1 in +-pi; joint 2 such that the second link points up; +-2 rad/s."""
+        """Joint 1 within pi; joint 2 such that the second link points up; within 2 rad/s.
+
+        ``qpos`` and ``qvel (*batch, 2)``, rad and rad/s; ``terrain (*batch, 4)``: the
+        plane's unit normal and its offset, m.
+        """
         first = torch.pi * (2.0 * u[..., 0] - 1.0)
         second = wrap_angle(torch.pi * u[..., 1] - first)
         speed = MAX_START_SPEED * (2.0 * u[..., 2:4] - 1.0)
@@ -44,13 +48,13 @@ class DoublePendulumPassive(Task):
         }
 
     def observation(self, state: State) -> Tensor:
-        """Sines, cosines and velocities of both joints."""
+        """Sines, cosines and velocities (rad/s) of both joints, ``(*batch, 6)``."""
         return torch.cat((state[QPOS].sin(), state[QPOS].cos(), state[QVEL]), -1)
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Zero."""
+        """Zero, ``(*batch,)``."""
         return torch.zeros_like(next_state[QVEL][..., 0])
 
     def terminated(self, next_state: State) -> Tensor:
-        """Never."""
+        """Never, ``(*batch,)``."""
         return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)

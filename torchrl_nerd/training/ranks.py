@@ -65,17 +65,26 @@ def expect_shares(**rows: int) -> None:
 
 
 @torch.no_grad()
-def average_gradients(parameters: Iterable[Tensor]) -> None:
-    """Replace every gradient by its mean over the ranks, in one message."""
+def average_gradients(parameters: Iterable[Tensor], loss: Tensor) -> Tensor:
+    """Replace every gradient by its mean over the ranks, in one message with the loss.
+
+    Args:
+        parameters: of any shapes, the same ones on every rank.
+        loss: of this rank's share, ``()``.
+
+    Returns:
+        The mean loss, that of the whole batch where shares are equal, ``()``.
+    """
     if world() == 1:
-        return
+        return loss.detach()
     gradients = [p.grad for p in parameters if p.grad is not None]
-    flat = torch.cat([gradient.flatten() for gradient in gradients])
+    flat = torch.cat([x.flatten() for x in (loss.detach(), *gradients)])
     distributed.all_reduce(flat)
     flat /= world()
-    parts = flat.split([gradient.numel() for gradient in gradients])
+    mean, *parts = flat.split([1, *(gradient.numel() for gradient in gradients)])
     for gradient, part in zip(gradients, parts, strict=True):
         gradient.copy_(part.view_as(gradient))
+    return mean.squeeze(0)
 
 
 def merge_stats(mine: Stats) -> Stats:

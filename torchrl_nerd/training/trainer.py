@@ -163,7 +163,7 @@ class Trainer:
         return TrainingLog(self.folder, self.step, logger)
 
     def update(self) -> Tensor:
-        """One update; its batch depends on seed and step alone."""
+        """One update and its loss, ``()``; the batch depends on seed and step alone."""
         config = self.config
         generator = Generator().manual_seed((config.seed << 32) + self.step)
         rate = self._rate()
@@ -187,7 +187,7 @@ class Trainer:
                 loss = rollout_loss(self.model, *mine, config.softening)
         loss.backward()
         parameters = list(self.model.network.parameters())
-        ranks.average_gradients(parameters)
+        loss = ranks.average_gradients(parameters, loss)
         norm = nn.utils.clip_grad_norm_(parameters, config.clip)
         if norm.isfinite():
             for optimizer in self.optimizers.values():
@@ -196,7 +196,7 @@ class Trainer:
         with torch.no_grad():
             for name, weight in self.model.network.named_parameters():
                 self.average[name].lerp_(weight, 1.0 - decay)
-        return loss.detach()
+        return loss
 
     def _batch(self, generator: Generator) -> tuple[Tensor, Tensor]:
         """Sequences, or as many states from all over the data.
@@ -330,7 +330,7 @@ class Trainer:
 
 
 def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
-    """Weights of linear layers, for Muon, and everything else."""
+    """Weights ``(out, in)`` of linear layers, for Muon, and everything else."""
     matrices, others = [], []
     for name, weight in network.named_parameters():
         is_matrix = weight.ndim == 2 and "offset_bias" not in name

@@ -1,0 +1,47 @@
+"""What is measured of a policy once it has learned: a table, figures, one episode."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.envs.actor import Actor
+from torchrl_nerd.evaluation.plots import plot_states
+from torchrl_nerd.evaluation.policy_transfer import (
+    ReturnSummary,
+    hardest_episode,
+    transfer,
+    transfer_table,
+)
+from torchrl_nerd.files import write_json
+from torchrl_nerd.tasks import make_task
+
+
+def report_transfer(
+    task: str, actor: Actor, learned_in: str, episodes: int, seed: int, folder: Path
+) -> dict[str, ReturnSummary]:
+    """Print returns and gaps in every dynamics; write them and one episode.
+
+    Args:
+        task: its id.
+        actor: any TorchRL policy.
+        learned_in: the dynamics that the policy has met; measured beside the shipped
+            model, MuJoCo and dm_control.
+        episodes: in each, see `transfer`.
+        seed: of the starts.
+        folder: gets ``returns.json`` and ``episode.png``, see `hardest_episode`.
+
+    Returns:
+        Summaries by name of the dynamics.
+
+    Raises:
+        ValueError: see `transfer`, or a folder that cannot be written.
+    """
+    scene = make_task(task).scene
+    learned = ("nerd",) if scene.name in shipped_models() else ()
+    everywhere = (learned_in, *learned, "mujoco", "dm_control")
+    returns = transfer(task, actor, everywhere, episodes, seed=seed)
+    print(transfer_table(returns))
+    write_json(folder / "returns.json", {k: asdict(v) for k, v in returns.items()})
+    shown = hardest_episode(task, actor, everywhere[:3], seed=seed)
+    plot_states(shown, scene, folder / "episode.png")
+    return returns
