@@ -82,5 +82,5 @@ def test_stored_steps_that_are_none_are_refused(scene, junk, generator, tmp_path
 def test_the_doctor_finds_all_well(capsys):
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
-    for name in (*shipped_models(), "mujoco", "C++ compiler"):
+    for name in (*shipped_models(), "mujoco", "C++ compiler", "OpenGL"):
         assert name in shown

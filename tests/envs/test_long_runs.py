@@ -16,7 +16,7 @@ from torchrl_nerd.tasks import TASKS, make_task
 
 TASK = next(iter(TASKS))
 ROWS, HORIZON = 4, 5
-WARM_UP = 20  # steps until caches and pools are as large as they get
+WARM_UP = 100  # steps until caches and pools are as large as they get
 GROWTH = 2 * 2**20  # bytes, of all the steps
 MANY = 1024
 DAY = ceil(

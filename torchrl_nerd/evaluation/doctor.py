@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
+from torchrl_nerd.evaluation.render.opengl import find_gl
 
 PACKAGES = (
     *("torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium"),
@@ -51,6 +52,7 @@ def machine() -> dict[str, str]:
         "CUDA devices": cuda,
         "C++ compiler": compiler,
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
+        "OpenGL": find_gl() or "none: films are drawn without",
         "display": os.environ.get("DISPLAY", "none"),
     }
 
