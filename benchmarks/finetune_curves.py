@@ -27,7 +27,7 @@ def plot_curves(curves: dict[str, Curve], path: Path) -> None:
         for number, (name, curve) in enumerate(curves.items()):
             epochs = [point["epoch"] for point in curve]
             errors = [point[error] for point in curve]
-            style = f"{STYLES[number]}."
+            style = f".{STYLES[number]}"
             panel.plot(epochs, errors, style, color=COLORS[number], label=name)
         panel.set(ylabel=label, yscale="log")
     panels[0].legend(frameon=False)
