@@ -25,9 +25,10 @@ def plot_curves(curves: dict[str, Curve], path: Path) -> None:
     figure, panels = make_figure(len(ERRORS), height=4.5)
     for panel, (error, label) in zip(panels, ERRORS.items(), strict=True):
         for number, (name, curve) in enumerate(curves.items()):
-            look = {"color": COLORS[number], "ls": STYLES[number], "label": name}
             epochs = [point["epoch"] for point in curve]
-            panel.plot(epochs, [point[error] for point in curve], **look, marker=".")
+            errors = [point[error] for point in curve]
+            style = f".{STYLES[number]}"
+            panel.plot(epochs, errors, style, color=COLORS[number], label=name)
         panel.set(ylabel=label, yscale="log")
     panels[0].legend(frameon=False)
     panels[-1].set_xlabel("epochs")

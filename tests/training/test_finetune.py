@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDict
 
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.modules.pose_encoder import PoseEncoder
 from torchrl_nerd.settings import SettingError
@@ -70,7 +73,12 @@ def test_only_what_was_asked_for_changes(model, tosses, update, generator):
             weight += 0.01 * torch.randn(weight.shape, generator=generator)
     run = tuner(model, tosses, update=update, rank=2)
     run._update(run._batch(run.starts[:64], 4, generator))
+    run._frozen()  # a copy: training goes on
+    run._update(run._batch(run.starts[:64], 4, generator))
     after = run._frozen()
+    state = TensorDict({"qpos": tosses.qpos[:9], "qvel": tosses.qvel[:9]}, [9])
+    steps = [open_loop(NeRDDynamics(x.eval()), state, 1) for x in (run.model, after)]
+    torch.testing.assert_close(*steps)
     for name, old in model.network.named_parameters():
         change = dict(after.network.named_parameters())[name] - old
         if update == "head":

@@ -32,7 +32,14 @@ def add_low_rank(network: nn.Module, rank: int) -> None:
 
 
 def merge_low_rank(network: nn.Module) -> None:
-    """Add all changes to the weights and take them away, in place."""
+    """Add all changes to the weights and take them away, in place.
+
+    Torch's own removal takes ``weight`` from the layer's class, which copies share: a copy
+    could not be merged without breaking the layer that it is of.
+    """
     for module in list(network.modules()):
         if isinstance(module, nn.Linear) and parametrize.is_parametrized(module):
-            parametrize.remove_parametrizations(module, "weight")
+            weight = nn.Parameter(module.weight.detach().clone())
+            del module.parametrizations
+            module.__class__ = type(module).__bases__[0]
+            module.weight = weight
