@@ -185,6 +185,15 @@ def test_a_folder_that_cannot_be_written_is_refused(command, tmp_path, capsys):
     assert sorted(tmp_path.iterdir()) == [place]
 
 
+def test_control_c_is_one_sentence(monkeypatch, capsys):
+    def stop(command) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(COMMANDS["doctor"], "run", stop)
+    assert main(["doctor"]) == 130
+    assert capsys.readouterr().err.startswith("nerd: interrupted")
+
+
 def test_no_traceback_reaches_the_terminal():
     command = [sys.executable, "-m", "torchrl_nerd.cli", "data", "unicorn"]
     done = subprocess.run(command, capture_output=True, text=True)

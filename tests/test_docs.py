@@ -1,5 +1,6 @@
 """What the documentation says exists: links, commands, names, examples, docstrings."""
 
+import ast
 import doctest
 import importlib
 import inspect
@@ -35,13 +36,26 @@ PACKAGES = [
     "torchrl_nerd",
     *(f"torchrl_nerd.{m.name}" for m in pkgutil.iter_modules(torchrl_nerd.__path__)),
 ]
-WITH_EXAMPLES = [
-    path
-    for path in Path(torchrl_nerd.__file__).parent.rglob("*.py")
-    if ">>> " in path.read_text()
-]
+SOURCES = sorted(Path(torchrl_nerd.__file__).parent.rglob("*.py"))
+WITH_EXAMPLES = [path for path in SOURCES if ">>> " in path.read_text()]
 SHARED = {"load_scene": load_scene, "torch": torch, "TensorDict": TensorDict}
 """What examples take for granted."""
+
+BUDGETS = {
+    "data": "--trajectories 300 --steps 20 --quiet",
+    "train": "--network mlp --steps 2 --rollout-steps 1 --rows 16 --length 2 "
+    "--rollout-rows 2 --rollout-length 2 --quiet",
+    "eval": "--rows 2 --quiet",
+    "finetune": "--epochs 1 --quiet",
+    "transfer": "--episodes 2 --quiet",
+    "play": "--steps 3 --draw drawing --quiet",
+    "plot": "--rows 2 --steps 3",
+    "explain": "--rows 64 --no-timing",
+    "bench": "--batches 1 --rows 2 --rounds 1 --steps 2 --no-compile --quiet",
+    "stability": "--cases batching --quiet",
+    "doctor": "--quiet",
+}
+"""What commands of the pages get instead of, or beside, their own options."""
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 
@@ -75,13 +89,18 @@ def test_every_relative_link_leads_somewhere(page):
             assert anchor in anchors(target), f"{page.name}: {link}"
 
 
+def commands(page: Path) -> list[list[str]]:
+    """Words of every line of a page's shell blocks."""
+    lines = "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
+    return [shlex.split(line, comments=True) for line in lines]
+
+
 @each_page
 def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
     """Dry: of what it reads, the recorded tosses and policies alone must be there."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    lines = "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
-    for words in (shlex.split(line, comments=True) for line in lines):
+    for words in commands(page):
         if words[:1] != ["nerd"]:
             continue
         for name in (word for word in words if word.endswith(".npz")):
@@ -94,6 +113,47 @@ def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
                 sizes = [task.observation_size, task.controller.num_actions]
                 save_policy(Policy(sizes), Path(folder), {"task": name})
         assert main([*words[1:], "--dry-run"]) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        "docs/start.md",
+        pytest.param("docs/howto/robot.md", marks=pytest.mark.slow),
+        pytest.param("README.md", marks=pytest.mark.slow),
+    ],
+)
+def test_a_new_users_commands_work_one_after_the_other(
+    page, tmp_path, monkeypatch, capsys
+):
+    """From an empty folder, with tiny budgets."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    copyfile(EXCERPT, "cube_tosses.npz")
+    ran = 0
+    for words in commands(ROOT / page):
+        if words == ["make", "demo"]:
+            ppo = importlib.import_module("ppo")
+            sizes = {"num_envs": 8, "horizon": 4, "total_frames": 32}
+            ppo.main(ppo.Run(episodes=2, **sizes))
+        elif words[:1] == ["nerd"]:
+            assert main(within_budget(words[1:])) == 0, capsys.readouterr().err
+            ran += 1
+    assert ran > 4
+
+
+def within_budget(words: list[str]) -> list[str]:
+    """A command with its budget in place of its own numbers."""
+    budget, command = BUDGETS[words[0]].split(), list(words)
+    while budget:
+        option, value = budget.pop(0), []
+        if budget and not budget[0].startswith("--"):
+            value = [budget.pop(0)]
+        if option in command:
+            command[command.index(option) + 1] = value[0]
+        else:
+            command += [option, *value]
+    return command
 
 
 @each_page
@@ -142,6 +202,45 @@ def test_every_public_name_says_what_it_is(name):
         value = getattr(module, public)
         if inspect.isclass(value) or inspect.isfunction(value):
             assert inspect.getdoc(value), f"{name}.{public}"
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_public_name_is_in_the_reference(name):
+    pages = "".join(p.read_text() for p in (ROOT / "docs" / "reference").glob("*.md"))
+    shown = re.findall(r"^::: ([\w.]+)$", pages, re.M)
+    module = importlib.import_module(name)
+    for public in getattr(module, "__all__", []):
+        value = getattr(module, public)
+        home = getattr(value, "__module__", name)
+        assert any(
+            part in (f"{name}.{public}", f"{home}.{public}")
+            or getattr(sys.modules.get(part), public, None) is value
+            for part in shown
+        ), f"{name}.{public}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.stem)
+def test_what_raises_says_so(path):
+    """In the docstring of the function, or of the class for its constructor."""
+
+    def look(body: list[ast.stmt], about: str) -> None:
+        for node in body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                look(node.body, ast.get_docstring(node) or "")
+            elif isinstance(node, ast.FunctionDef):
+                is_constructor = node.name == "__init__"
+                if node.name.startswith("_") and not is_constructor:
+                    continue
+                said = about if is_constructor else ast.get_docstring(node) or ""
+                raises = any(
+                    isinstance(part, ast.Raise)
+                    and "NotImplemented" not in ast.dump(part)
+                    for part in ast.walk(node)
+                )
+                known = re.search(r"Raises:|[Rr]efuse|[Ee]rror|raises", said)
+                assert known or not raises, f"{path.name}: {node.name}"
+
+    look(ast.parse(path.read_text()).body, "")
 
 
 @pytest.mark.parametrize("path", WITH_EXAMPLES, ids=lambda p: p.stem)

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from shutil import copyfile
 from zipfile import ZipFile
 
 import pytest
@@ -87,3 +88,24 @@ def test_package_works_from_the_wheel_alone(wheel, tmp_path):
     path, nq = result.stdout.split()
     assert Path(path) == tmp_path / "torchrl_nerd" / "__init__.py"
     assert nq == "2"
+
+
+def test_a_second_make_installs_nothing_until_the_pins_change(tmp_path):
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        copyfile(ROOT / name, tmp_path / name)
+
+    def plan() -> str:
+        command = ["make", "-n", "demo"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    first = plan()
+    assert first.count("pip install") == 3
+    stamp = tmp_path / re.findall(r"touch (\S+)", first)[0]
+    stamp.parent.mkdir()
+    stamp.touch()
+    assert plan() == ".venv/bin/python examples/ppo.py\n"
+    with open(tmp_path / "constraints.txt", "a") as file:
+        file.write("# newer\n")
+    assert plan().count("pip install") == 3

@@ -43,6 +43,9 @@ COMMANDS: dict[str, type[Command]] = {
 }
 
 
+INTERRUPTED = 130  # what shells say of a process that Ctrl-C ended
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; bad input is one sentence on stderr and exit status 2."""
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -61,11 +64,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         figures = command.run()
         if command.record is not None:
-            how = {"command": argv[0], "version": __version__}
+            how: dict[str, Any] = {"command": argv[0], "version": __version__}
             how["configuration"] = command.configuration()
-            write_json(command.record, {**how, **figures})
+            write_json(command.record, how | figures)
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
-        return _fail(str(error).splitlines()[0])
+        return _fail((str(error) or repr(error)).splitlines()[0])
+    except KeyboardInterrupt:  # Ctrl-C
+        return _fail(
+            "interrupted; data and training go on when asked again", INTERRUPTED
+        )
     return 0
 
 
@@ -106,6 +113,6 @@ def _default(kind: type[Command], args: list[str]) -> Any:
     return Train(scene, config=recipe.train)
 
 
-def _fail(sentence: str) -> int:
+def _fail(sentence: str, status: int = 2) -> int:
     print(f"nerd: {sentence}", file=sys.stderr)
-    return 2
+    return status
