@@ -54,6 +54,10 @@ def test_nothing_is_said_of_a_missing_display(start):
     assert "GLFW" not in start.stderr
 
 
+def test_no_warning_is_our_own(start):
+    assert str(PACKAGE) not in start.stderr
+
+
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Wheel and source archive of this tree."""
