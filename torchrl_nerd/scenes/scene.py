@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Generator
 
-from torchrl_nerd.geometry.base import Base, base_pose, mount_pose
+from torchrl_nerd.geometry.base import Base, BasePose, mount_pose
 from torchrl_nerd.geometry.frames import quat_normalize
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
@@ -338,12 +338,21 @@ class Scene:
         points, _ = self.point_kinematics.to(qpos.device)(qpos, still)
         ground = self.terrain_distance.to(qpos.device)
         distance, normal = ground(points, terrain, *self.base_pose(qpos))
-        return distance - torch.as_tensor(self.contacts.radii).to(qpos), normal
+        return distance - self._radii.to(qpos), normal
 
     def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
-        mount = (torch.as_tensor(x).to(qpos) for x in self.mount)
-        return base_pose(self.base, qpos, *mount)
+        position, rotation = self._pose.to(qpos.device)(qpos)
+        return position.to(qpos), rotation.to(qpos)
+
+    # constants as tensors that stay: compiled code would make them anew of arrays
+    @cached_property
+    def _pose(self) -> BasePose:
+        return BasePose(self.base, self.mount)
+
+    @cached_property
+    def _radii(self) -> torch.Tensor:
+        return torch.as_tensor(self.contacts.radii)
 
     @cached_property
     def point_kinematics(self) -> PointKinematics:
