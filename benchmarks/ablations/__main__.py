@@ -36,7 +36,7 @@ class Options:
     """Of weights and batches; the data are the same."""
     trajectories: int = 3_000
     """Of the data, of 100 transitions each."""
-    updates: int = 1_000
+    updates: int = 700
     """Of 1,024 tokens each."""
     rows: int = 128
     """Trajectories of each test: seven grounds of the pendulum, the Ant's passive one."""
@@ -44,7 +44,7 @@ class Options:
     """Of their starts."""
     out: Path = Path("runs/ablations")
     figures: Path | None = None
-    """Write tables, figures and pictures to this folder, too."""
+    """Folder of figures and pictures; beside the tables by default."""
 
 
 def main(options: Options) -> dict[str, list[dict[str, Any]]]:
@@ -75,10 +75,9 @@ def report(scene: str, runs: list[dict[str, Any]], options: Options) -> None:
     rows = rows_of(runs)
     lines = list(markdown(rows, units))
     print("\n".join(lines), flush=True)
-    folder = options.figures or options.out
+    name, folder = f"ablations_{scene}", options.figures or options.out
     folder.mkdir(parents=True, exist_ok=True)
-    name = f"ablations_{scene}"
-    (folder / f"{name}.md").write_text("\n".join(lines) + "\n")
+    (options.out / f"{name}.md").write_text("\n".join(lines) + "\n")
     content = {"threads": torch.get_num_threads(), "runs": runs}
     write_json(folder / f"{name}.json", content | {"rows": [asdict(r) for r in rows]})
     plot_ratios(rows, folder / f"{name}.png")

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from tensordict import TensorDict
 from torch import Tensor
@@ -71,7 +71,7 @@ class Bed:
             initial_states(source, budget.rows, budget.test_seed)
             for source in protocol.cases.values()
         ]
-        self.start = TensorDict.cat(cases)
+        self.start = cast(TensorDict, TensorDict.cat(cases))
         self.truth = self.paths(MujocoDynamics(scene))
 
     def paths(self, dynamics: Dynamics) -> Tensor:

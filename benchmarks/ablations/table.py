@@ -68,12 +68,8 @@ def rows_of(found: Sequence[Figures]) -> list[Row]:
         base = [run for run in by_name[BASE] if run["seed"] in seeds]
         errors = {
             case: {
-                quantity: cell_of(
-                    *([_at(r, case, quantity) for r in rs] for rs in pair)
-                )
-                for quantity in quantities
+                quantity: cell_of(runs, base, case, quantity) for quantity in quantities
             }
-            for pair in [(runs, base)]
             for case, quantities in runs[0]["errors"].items()
         }
         first = runs[0]
@@ -83,21 +79,20 @@ def rows_of(found: Sequence[Figures]) -> list[Row]:
     return rows
 
 
-def _at(run: Figures, case: str, quantity: str) -> Figures:
-    return run["errors"][case][quantity]
+def cell_of(
+    runs: Sequence[Figures], base: Sequence[Figures], case: str, quantity: str
+) -> Cell:
+    """One quantity of one test, of a variant's seeds and of the base's same ones."""
 
+    def all_of(runs: Sequence[Figures], kind: str) -> list[float]:
+        found = (run["errors"][case][quantity][kind] for run in runs)
+        return [inf if x is None else x for x in found]  # null: it was not finite
 
-def cell_of(runs: Sequence[Figures], base: Sequence[Figures]) -> Cell:
-    """Of one quantity's summaries of all seeds, and base's of the same seeds."""
-    means = _all(runs, "mean")
+    means = all_of(runs, "mean")
     spread = stdev(means) if len(means) > 1 and inf not in means else 0.0
-    rest = (mean(_all(runs, kind)) for kind in ("final", "p95"))
-    return Cell(mean(means), spread, *rest, mean(means) / mean(_all(base, "mean")))
-
-
-def _all(runs: Sequence[Figures], kind: str) -> list[float]:
-    """Of every seed; what is not finite was written as null."""
-    return [inf if run[kind] is None else run[kind] for run in runs]
+    final, p95 = mean(all_of(runs, "final")), mean(all_of(runs, "p95"))
+    ratio = mean(means) / mean(all_of(base, "mean"))
+    return Cell(mean(means), spread, final, p95, ratio)
 
 
 def markdown(rows: Sequence[Row], units: Mapping[str, str]) -> Iterator[str]:

@@ -17,6 +17,9 @@ from .variants import Variant
 
 TOKENS = 1024  # per update
 LENGTH = 32  # of a sequence: more than the longest history tried
+LR = 0.03  # of Muon; larger than for a whole training, since this one is short
+LR_OTHER = 0.003  # of AdamW beside it
+LR_ALONE = 0.02  # of AdamW where all is its own; both are the best on validation starts
 SOFTENING: Mapping[str, float] = {"double_pendulum": 1.0, "ant": 0.02}
 """Of the loss, as for each scene's network alone (see `make model-SCENE-mlp`)."""
 
@@ -51,6 +54,8 @@ class VariantTrainer(Trainer):
             rollout_steps=0,
             rows=TOKENS // length,
             length=length,
+            lr=LR,
+            lr_other=LR_OTHER if variant.has_muon else LR_ALONE,
             softening=SOFTENING[scene.name],
             seed=seed,
         )
