@@ -38,6 +38,7 @@ def plot_ratios(rows: Sequence[Row], path: Path) -> None:
                 fontsize=7,
             )
         axes.axvline(1.0, color="0.3")
+        axes.set_axisbelow(True)
         axes.invert_yaxis()
         axes.margins(x=0.12)
         axes.set(xscale="log", xlabel=f"{case}: mean error in the base's")
