@@ -100,6 +100,8 @@ class NeRD(nn.Module):
         config: size and kind of the network.
         stats: statistics of raw tokens and targets, from `SceneTokens`; zero mean and
             unit variance where not given (a model whose weights are yet to be loaded).
+        tokens: what it sees of a state; the scene's own features where not given.
+        state_delta: what it predicts; see `StateDelta`.
     """
 
     has_simulator = False  # within, whose change the network is shown, see `foresee`
@@ -110,11 +112,13 @@ class NeRD(nn.Module):
         scene: Scene,
         config: Config,
         stats: Mapping[NestedKey, Stats] | None = None,
+        tokens: "SceneTokens | None" = None,
+        state_delta: StateDelta | None = None,
     ) -> None:
         super().__init__()
         self.scene, self.config = scene, config
-        self.tokens = SceneTokens(scene)
-        self.state_delta = StateDelta(scene)
+        self.tokens = SceneTokens(scene) if tokens is None else tokens
+        self.state_delta = StateDelta(scene) if state_delta is None else state_delta
         num_inputs, num_outputs = self.tokens.size, self.state_delta.size
         self.normalize = Normalize(
             stats or {TOKEN: unit_stats(num_inputs), TARGET: unit_stats(num_outputs)}

@@ -167,8 +167,14 @@ def raw_tokens(
 
 
 def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
+    """Exact statistics of a scene's own tokens and targets over a data set."""
+    return stats_of(SceneTokens(scene), StateDelta(scene), data)
+
+
+def stats_of(
+    tokens: SceneTokens, state_delta: StateDelta, data: TensorDict
+) -> dict[NestedKey, Stats]:
     """Exact statistics of tokens and targets over a data set, each rank's part of it."""
-    tokens, state_delta = SceneTokens(scene), StateDelta(scene)
     size = min(PART, -(-len(data) // ranks.world()))
     mine = data.split(size)[ranks.rank() :: ranks.world()]
     parts = [raw_tokens(tokens, state_delta, part) for part in mine]

@@ -98,7 +98,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         symmetry = Symmetry.of(scene, data) if config.use_symmetry else None
         if start is None:
-            model = fresh_model(scene, data, config.network, symmetry)
+            model = self.make_model(data, symmetry)
         else:
             model = begin_from(start, scene, config.network, symmetry)
         if config.flies:
@@ -110,13 +110,7 @@ class Trainer:
         cover(self.model, self.sequences.data, samples)
         if start is not None:
             self.model.coverage.widen(start.coverage)
-        matrices, others = split_parameters(self.model.network)
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "muon": Muon(matrices, lr=config.lr),
-            "adamw": torch.optim.AdamW(
-                others, lr=config.lr_other, betas=(0.9, 0.95), weight_decay=0.0
-            ),
-        }
+        self.optimizers = self.make_optimizers()
         self.peaks = {"muon": config.lr, "adamw": config.lr_other}
         weights = dict(self.model.network.named_parameters())
         self.average = {name: w.detach().clone() for name, w in weights.items()}
@@ -124,6 +118,18 @@ class Trainer:
         self.errors: dict[int, dict[str, ErrorSummary]] = {}  # of the last validation
         if (self.folder / STATE).exists():
             self._resume()
+
+    def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
+        """What is trained, where there is no start: the configured network, fresh."""
+        return fresh_model(self.scene, data, self.config.network, symmetry)
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Muon for the weights of linear layers, AdamW for everything else."""
+        matrices, others = split_parameters(self.model.network)
+        return {
+            "muon": Muon(matrices, lr=self.config.lr),
+            "adamw": adamw(others, self.config.lr_other),
+        }
 
     def run(self, until: int | None = None) -> NeRD:
         """Train to the end, or to update ``until``; returns the averaged model."""
@@ -327,6 +333,11 @@ class Trainer:
             )
         self.seconds = seconds
         unpack(tensors, *parts)
+
+
+def adamw(parameters: list[Tensor], lr: float) -> torch.optim.AdamW:
+    """AdamW as it is used here: a short memory of squares, no weight decay."""
+    return torch.optim.AdamW(parameters, lr=lr, betas=(0.9, 0.95), weight_decay=0.0)
 
 
 def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
