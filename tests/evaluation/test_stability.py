@@ -155,9 +155,8 @@ def test_the_command_writes_table_json_and_plot(tmp_path, capsys):
     assert main(["stability", *arguments, "--json", str(out), "--plot", str(plot)]) == 0
     shown = capsys.readouterr().out
     assert "| history |" in shown and "| batching |" in shown
-    assert set(json.loads(out.read_text())) == {
-        *("scene", "seed", "scale", "history", "batching")
-    }
+    named = {"scene", "seed", "scale", "history", "batching"}
+    assert named <= set(json.loads(out.read_text()))
     assert plot.stat().st_size > 1000
 
 

@@ -1,7 +1,6 @@
 """A row reset, or put elsewhere, in mid-flight is as new."""
 
 import copy
-import pickle
 from typing import cast
 
 import torch
@@ -34,7 +33,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     if TERRAIN in start.keys():
         mixed[TERRAIN] = torch.where(rows[:, None], other[TERRAIN], start[TERRAIN])
     dynamics.reset(mixed, rows)
-    twin = pickle.loads(pickle.dumps(dynamics))  # as saved to a file and read again
+    twin = copy.deepcopy(dynamics)
     apart = DynamicsWorld(copy.deepcopy(dynamics))
     path = cast(TensorDict, apart.roll(mixed, STEPS, torque))
     after, again = (_along(d, path, mixed, torque) for d in (dynamics, twin))
