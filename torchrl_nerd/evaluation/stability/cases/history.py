@@ -1,6 +1,7 @@
 """A row reset, or put elsewhere, in mid-flight is as new."""
 
 import copy
+from typing import cast
 
 import torch
 from tensordict import TensorDict
