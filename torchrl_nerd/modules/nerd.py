@@ -195,11 +195,12 @@ class NeRD(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Next ``qpos`` and ``qvel`` from normalised outputs ``(*batch, D)``."""
         change = output.to(qpos.dtype)
-        if not self.has_simulator:  # which knows harder impacts than the data hold
-            change = self.coverage.clamp_target(change)
-        delta = self.normalize.denormalize(TARGET, change)
-        if self.has_simulator:
+        if self.has_simulator:  # which knows harder impacts than the data hold
+            delta = self.normalize.denormalize(TARGET, change)
             delta = self.coverage.clamp_change(delta, self.scene.control_step)
+        else:
+            change = self.coverage.clamp_target(change)
+            delta = self.normalize.denormalize(TARGET, change)
         limit = self.coverage.limit_speed
         after = self.state_delta.integrate(qpos, qvel, delta, limit)
         return self.coverage.stay((qpos, qvel), self.coverage.stop_joints(*after))
