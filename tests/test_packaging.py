@@ -95,7 +95,8 @@ def test_a_second_make_installs_nothing_until_the_pins_change(tmp_path):
         copyfile(ROOT / name, tmp_path / name)
 
     def plan() -> str:
-        command = ["make", "-n", "demo"]
+        # quiet: make says where it is when another make runs the tests
+        command = ["make", "--no-print-directory", "-n", "demo"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return done.stdout
