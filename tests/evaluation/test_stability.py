@@ -1,6 +1,7 @@
 """Every hard case runs over every robot, and MuJoCo keeps the lines made for it."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_nerd.cli.main import main
+from torchrl_nerd.cli.main import INTERRUPTED, main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.stability.case import Case
 from torchrl_nerd.evaluation.stability.cases import CASES
@@ -158,6 +159,23 @@ def test_the_command_writes_table_json_and_plot(tmp_path, capsys):
     named = {"scene", "seed", "scale", "history", "batching"}
     assert named <= set(json.loads(out.read_text()))
     assert plot.stat().st_size > 1000
+
+
+def test_figures_outlive_an_interruption(tmp_path, monkeypatch):
+    out, run = tmp_path / "s.json", CASES["batching"].run
+
+    def interrupted(*arguments):
+        assert "history" in json.loads(out.read_text())
+        assert run(*arguments)
+        raise KeyboardInterrupt
+
+    broken = replace(CASES["batching"], run=interrupted)
+    monkeypatch.setitem(CASES, "batching", broken)
+    arguments = ["cartpole", "--cases", "history", "batching", "--scale", "0.01"]
+    assert main(["stability", *arguments, "--json", str(out)]) == INTERRUPTED
+    written = json.loads(out.read_text())
+    assert written["configuration"]["scene"] == written["scene"] == "cartpole"
+    assert "history" in written and "batching" not in written
 
 
 def test_bad_settings_are_named(capsys):

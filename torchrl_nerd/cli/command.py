@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_nerd import __version__
+from torchrl_nerd.files import write_json
 from torchrl_nerd.settings import expect_device
 
 
@@ -37,6 +39,13 @@ class Command(ABC):
     def configuration(self) -> dict[str, Any]:
         """Every option and its value, with which `run` does the same again."""
         return {k: v for k, v in asdict(self).items() if k not in ("json", "dry_run")}
+
+    def keep(self, figures: dict[str, Any]) -> None:
+        """Write figures and settings to `record`, where that is asked for."""
+        if self.record is not None:
+            how: dict[str, Any] = {"command": type(self).__name__.lower()}
+            how |= {"version": __version__, "configuration": self.configuration()}
+            write_json(self.record, how | figures)
 
     def plan(self) -> list[str]:
         """What `run` would do, in sentences; bad input is refused as there."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import tyro
 
-from torchrl_nerd import __version__
 from torchrl_nerd.cli.bench import Bench
 from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.data import Data
@@ -22,7 +21,6 @@ from torchrl_nerd.cli.replay import Replay
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
-from torchrl_nerd.files import write_json
 from torchrl_nerd.scenes import is_import
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.recipes import RECIPES, recipe_of
@@ -62,11 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.dry_run:
             print("\n".join((*command.plan(), *command.settings())))
             return 0
-        figures = command.run()
-        if command.record is not None:
-            how: dict[str, Any] = {"command": argv[0], "version": __version__}
-            how["configuration"] = command.configuration()
-            write_json(command.record, how | figures)
+        command.keep(command.run())
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail((str(error) or repr(error)).splitlines()[0])
     except KeyboardInterrupt:  # Ctrl-C

@@ -67,15 +67,17 @@ class Stability(DeviceCommand):
         truth = DynamicsWorld(MujocoDynamics(scene))
         learned = DynamicsWorld(NeRDDynamics(model, compile=self.compile))
         results, count = [], sum(case.applies(scene) for case in cases)
+        figures: dict[str, Any] = {"scene": self.scene, "seed": self.seed}
+        figures["scale"] = self.scale
         found = run_cases(truth, learned, cases, self.seed, self.scale)
         for result in tqdm(found, "cases", count, leave=False, disable=self.quiet):
             verdict = "met" if result.passes else "NOT MET"
             tqdm.write(f"{result.case:<18}{verdict:<9}{result.seconds:>7} s")
             results.append(result)
+            figures |= as_json([result])
+            self.keep(figures)  # hours of long cases outlive an interruption
         print()
         print(as_table(results))
         if self.plot is not None:
             plot_results(results, self.plot, f"{self.scene}: learned dynamics")
-        return {"scene": self.scene, "seed": self.seed, "scale": self.scale} | as_json(
-            results
-        )
+        return figures
