@@ -112,9 +112,12 @@ def test_how_far_beyond_a_limit_it_begins_or_ends():
     )
     speed = 0.1 / sliding.control_step
     qpos = torch.tensor([[0.0], [1.95], [2.05], [-0.95], [-1.3], [1.5]]).double()
-    qvel = speed * torch.tensor([[1.0], [1.0], [-1.0], [-1.0], [-1.0], [1.0]]).double()
-    *_, beyond = FreeStep(sliding)(qpos, qvel, qpos[:, :0])
-    want = torch.tensor([[0.0], [0.05], [0.05], [0.05], [0.4], [0.0]]).double()
+    qvel = speed * torch.tensor([[1.0], [1.0], [-1.0], [-1.0], [1.0], [1.0]]).double()
+    after, *_, beyond = FreeStep(sliding)(qpos, qvel, qpos[:, :0])
+    assert 2.0 < after[1] < 2.05 and -1.05 < after[3] < -1.0  # the end pushes
+    ends = torch.stack((after[1] - 2.0, -1.0 - after[3]))
+    want = torch.tensor([[0.0], [0.0], [0.05], [0.0], [0.3], [0.0]]).double()
+    want[[1, 3]] = ends
     torch.testing.assert_close(beyond, want)
 
 

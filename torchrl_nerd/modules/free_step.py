@@ -1,9 +1,10 @@
-"""A control step during which nothing touches a robot: two looks at its free motion.
+"""A control step during which nothing touches a robot: two looks at its motion.
 
 MuJoCo's semi-implicit Euler moves on by the accelerations at the starts of its n substeps.
 Their mean is, to second order, the acceleration at the mean of those times, (h - h/n) / 2.
 So the first look, at the start, tells the state there, and the second one the mean: a
-midpoint rule that shares the error of the substeps in place of adding its own.
+midpoint rule that shares the error of the substeps in place of adding its own. What pushes
+at the ends of joints changes within a substep, and is found anew in each.
 """
 
 import mujoco
@@ -13,10 +14,12 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import BasePose
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.free_motion import FreeMotion
+from torchrl_nerd.geometry.elimination import inverted
+from torchrl_nerd.geometry.free_motion import FreeMotion, rows_last
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.modules.joint_stops import JointStops
 from torchrl_nerd.scenes.contact_points import own_contacts
 from torchrl_nerd.scenes.scene import Scene
 
@@ -24,7 +27,10 @@ EXACT = (int(mujoco.mjtIntegrator.mjINT_RK4),)  # no first-order error of its su
 
 
 class FreeStep(nn.Module):
-    """The next state under given torques, if ground and limits do not push.
+    """The next state under given torques, if no ground pushes.
+
+    Limits push joints of a robot without a free base, see `JointStops`; those of one with
+    it are left out.
 
     | buffer | meaning |
     |---|---|
@@ -58,6 +64,10 @@ class FreeStep(nn.Module):
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
         self.pose, self.layout = BasePose(scene.base, scene.mount), scene.layout
         is_limited = model.jnt_limited[axes.joints] != 0
+        self.substeps = round(self.period / model.opt.timestep)
+        self.stops = None
+        if is_limited.any() and not scene.base.is_floating:
+            self.stops = JointStops(model, axes)
         low, high = model.jnt_range[axes.joints].T
         margin = model.jnt_margin[axes.joints]
         low = np.where(is_limited, low + margin, -np.inf)
@@ -75,19 +85,17 @@ class FreeStep(nn.Module):
 
         Returns:
             The next ``qpos`` and ``qvel``; by how much the second look changed velocities,
-            ``(*batch, nv)``; how far the step begins or ends beyond a limit, which it does
-            not see, ``(*batch, 1)``, m or rad.
+            ``(*batch, nv)``; how far the step begins or ends beyond a limit,
+            ``(*batch, 1)``, m or rad.
         """
         ahead = 0.5 * (self.period - self.lag)
-        start = self._acceleration(qpos, qvel, joint_torque, 2.0 * ahead)
-        speed = qvel + ahead * start
-        moved = ahead * (qvel + 0.5 * (ahead + self.lag) * start)
-        place = integrate_pos(self.layout, qpos, moved)
-        gain = self._acceleration(place, speed, joint_torque, 2.0 * self.lag)
-        gain = self.period * gain
-        moved = self.period * (qvel + 0.5 * gain) + 0.5 * self.lag * gain
-        after = integrate_pos(self.layout, qpos, moved)
-        return after, qvel + gain, gain - self.period * start, self._beyond(qpos, after)
+        state, steps = (qpos, qvel), self.substeps
+        start = self._look(*state, joint_torque, 2.0 * ahead)
+        middle = self._move(*state, start, ahead, steps // 2)
+        look = self._look(*middle, joint_torque, 2.0 * self.lag)
+        after, velocity = self._move(*state, look, self.period, steps)
+        changed = self.period * (look[0] - start[0])
+        return after, velocity, changed, self._beyond(qpos, after)
 
     def is_within(self, qpos: Tensor) -> Tensor:
         """Whether no joint is beyond a limit, ``(*batch,)``."""
@@ -101,14 +109,41 @@ class FreeStep(nn.Module):
         none = torch.zeros_like(before[..., :1])  # a robot may have no joints
         return torch.cat((none, below, above), -1).amax(-1, keepdim=True)
 
-    def _acceleration(
+    def _look(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, period: Tensor
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor | None]:
+        """The free acceleration ``(*batch, nv)``; what turns forces into more of it.
+
+        That is the mass matrix's inverse, ``(nv, nv, N)``, where limits may push.
+        """
         points, _ = self.kinematics(qpos, qvel)
         count = points.shape[-2] - self.num_places
         places, corners = points.split((self.num_places, count), -2)
         _, rotation = self.pose(qpos)
-        return self.motion(qpos, qvel, joint_torque, rotation, corners, places, period)
+        seen = qpos, qvel, joint_torque, rotation, corners, places, period
+        if self.stops is None:
+            return self.motion(*seen), None
+        inverse, acceleration = inverted(*self.motion.equation(*seen))
+        return acceleration.movedim(0, -1).reshape(qvel.shape), inverse
+
+    def _move(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        look: tuple[Tensor, Tensor | None],
+        period: float | Tensor,
+        steps: int,
+    ) -> tuple[Tensor, Tensor]:
+        """The state a time later, of what was seen at one look."""
+        acceleration, inverse = look
+        if self.stops is None or inverse is None:
+            moved = period * (qvel + 0.5 * (period + self.lag) * acceleration)
+            place = integrate_pos(self.layout, qpos, moved)
+            return place, qvel + period * acceleration
+        rows = [rows_last(x, 1) for x in (qpos, qvel, acceleration)]
+        state = self.stops(*rows, inverse, period, steps, self.lag)
+        place, speed = (x.movedim(0, -1).reshape(qpos.shape) for x in state)
+        return place, speed
 
 
 def untold_pushes(scene: Scene) -> dict[str, bool]:
