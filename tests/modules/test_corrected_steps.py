@@ -99,6 +99,42 @@ def test_changes_are_bounded_by_speed_and_not_by_the_data(scene, network, genera
 
 
 @each_stepped
+@pytest.mark.parametrize("times", [1e3, 1e6, 1e30, 1e200])
+def test_torques_that_overflow_the_step_leave_it_finite(
+    scene, network, times, generator
+):
+    model, rows = (
+        lively(scene, network, generator),
+        random_transitions(scene, 8, generator),
+    )
+    cover(model, little_data(scene))
+    rows[JOINT_TORQUE] *= times
+    rows[QVEL] *= 10.0
+    after = step(model, rows)
+    sizes = model.coverage.sizes(after[QVEL])
+    assert after[QPOS].isfinite().all()
+    assert (sizes <= model.coverage.speed * (1.0 + 1e-9)).all()
+
+
+@each_stepped
+@pytest.mark.parametrize("key", [QPOS, QVEL, JOINT_TORQUE])
+def test_what_is_no_number_stays_none(scene, network, key, generator):
+    """And shows in the next state: nothing hides a fault."""
+    model, rows = (
+        lively(scene, network, generator),
+        random_transitions(scene, 8, generator),
+    )
+    cover(model, little_data(scene))
+    for column in range(rows[key].shape[-1]):
+        broken = rows.clone()
+        broken[key][0, column] = torch.nan
+        after = step(model, broken)
+        state = torch.cat((after[QPOS], after[QVEL]), -1)
+        assert not state[0].isfinite().all()
+        assert state[1:].isfinite().all()
+
+
+@each_stepped
 @pytest.mark.parametrize("inference", ["streaming", "window"])
 def test_it_comes_back_from_disk(scene, network, inference, generator, tmp_path):
     model = lively(scene, network, generator)

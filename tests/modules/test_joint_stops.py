@@ -88,7 +88,7 @@ def test_a_control_step_is_near_that_of_mujoco(scene, generator):
         (x - want)[is_pushed].norm(dim=-1) for x in (step(scene, rows)[1], free)
     )
     assert error.median() < 0.1 * left_out.median()
-    assert error.median() < 0.05 * (want - rows[QVEL])[is_pushed].norm(dim=-1).median()
+    assert error.median() < 0.15 * (want - rows[QVEL])[is_pushed].norm(dim=-1).median()
 
 
 def test_no_end_pulls():

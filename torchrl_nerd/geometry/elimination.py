@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 FEW = 8  # unknowns or columns; fourteen would take minutes to compile
+FEWER = 6  # unknowns of an inverse; so would seven
 
 
 def times(matrix: Tensor, rows: Tensor) -> Tensor:
@@ -54,7 +55,7 @@ def inverted(
 ) -> tuple[Tensor, Tensor]:
     """Inverses ``(n, n, N)`` of positive definite matrices, and times ``right (n, N)``."""
     is_compiling = torch.compiler.is_compiling()
-    if is_compiling and len(matrix) <= FEW:
+    if is_compiling and len(matrix) <= FEWER:
         return _inverse(matrix), solve(matrix, right)
     if is_compiling and limbs is not None:
         inverse = _inverse_by_limbs(matrix, limbs)

@@ -4,7 +4,7 @@ MuJoCo's semi-implicit Euler moves on by the accelerations at the starts of its 
 Their mean is, to second order, the acceleration at the mean of those times, (h - h/n) / 2.
 So the first look, at the start, tells the state there, and the second one the mean: a
 midpoint rule that shares the error of the substeps in place of adding its own. What pushes
-at the ends of joints changes within a substep, and is found anew in each.
+at the ends of joints changes faster, and is found anew a few times.
 """
 
 import mujoco
@@ -64,10 +64,10 @@ class FreeStep(nn.Module):
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
         self.pose, self.layout = BasePose(scene.base, scene.mount), scene.layout
         is_limited = model.jnt_limited[axes.joints] != 0
-        self.substeps = round(self.period / model.opt.timestep)
-        self.stops = None
+        self.stops, self.parts = None, 1
         if is_limited.any() and not scene.base.is_floating:
             self.stops = JointStops(model, axes)
+            self.parts = self.stops.parts(self.period)
         low, high = model.jnt_range[axes.joints].T
         margin = model.jnt_margin[axes.joints]
         low = np.where(is_limited, low + margin, -np.inf)
@@ -89,11 +89,11 @@ class FreeStep(nn.Module):
             ``(*batch, 1)``, m or rad.
         """
         ahead = 0.5 * (self.period - self.lag)
-        state, steps = (qpos, qvel), self.substeps
+        state, parts = (qpos, qvel), self.parts
         start = self._look(*state, joint_torque, 2.0 * ahead)
-        middle = self._move(*state, start, ahead, steps // 2)
+        middle = self._move(*state, start, ahead, parts // 2)
         look = self._look(*middle, joint_torque, 2.0 * self.lag)
-        after, velocity = self._move(*state, look, self.period, steps)
+        after, velocity = self._move(*state, look, self.period, parts)
         changed = self.period * (look[0] - start[0])
         return after, velocity, changed, self._beyond(qpos, after)
 
@@ -132,7 +132,7 @@ class FreeStep(nn.Module):
         qvel: Tensor,
         look: tuple[Tensor, Tensor | None],
         period: float | Tensor,
-        steps: int,
+        parts: int,
     ) -> tuple[Tensor, Tensor]:
         """The state a time later, of what was seen at one look."""
         acceleration, inverse = look
@@ -141,7 +141,7 @@ class FreeStep(nn.Module):
             place = integrate_pos(self.layout, qpos, moved)
             return place, qvel + period * acceleration
         rows = [rows_last(x, 1) for x in (qpos, qvel, acceleration)]
-        state = self.stops(*rows, inverse, period, steps, self.lag)
+        state = self.stops(*rows, inverse, period, parts, self.lag)
         place, speed = (x.movedim(0, -1).reshape(qpos.shape) for x in state)
         return place, speed
 

@@ -1,4 +1,4 @@
-"""MuJoCo's soft ends of hinges and slides, substep by substep, in torch.
+"""MuJoCo's soft ends of hinges and slides, in torch.
 
 A joint beyond its end is asked to come back, with an acceleration like a spring's and a
 damper's. The harder an end (its impedance), the nearer it gets to that, and no end ever
@@ -8,6 +8,8 @@ Sources: https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters
 Baker et al., "Multigrid smoothers for ultraparallel computing", 2011 (l1-Jacobi).
 """
 
+from math import ceil
+
 import mujoco
 import numpy as np
 import torch
@@ -16,7 +18,8 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
 
-SWEEPS = 3  # each substep starts from the forces of the last one
+SWEEPS = 3  # each part of a step starts from the forces of the last one
+FAST = 1.0 / 3.0  # of its speed an end may take from a joint in one part
 TINY = mujoco.mjMINVAL
 SOFTEST, HARDEST = mujoco.mjMINIMP, mujoco.mjMAXIMP
 
@@ -35,6 +38,7 @@ class JointStops(nn.Module):
 
     ends: Tensor
     impedance: Tensor
+    power: Tensor
     law: Tensor
 
     def __init__(self, model: mujoco.MjModel, axes: JointAxes) -> None:
@@ -45,13 +49,22 @@ class JointStops(nn.Module):
         margin = model.jnt_margin[ids]
         solimp = model.jnt_solimp[ids]
         springs = _springs(model, model.jnt_solref[ids], solimp[:, 1])
+        self.quickest, self.substep = float(springs[1].max()), model.opt.timestep
         law = *springs, model.dof_invweight0[model.jnt_dofadr[ids]]
+        impedance, power = _impedance(solimp)
+        # a number where joints agree: a square takes no time, a power most of the step's
+        self.even_power = float(power[0]) if (power == power[0]).all() else None
         keep_constants(
             self,
             ends=np.stack((low + margin, high - margin))[..., None],
-            impedance=_impedance(solimp)[..., None],
+            impedance=impedance[..., None],
+            power=power[:, None],
             law=np.stack(law)[..., None],
         )
+
+    def parts(self, period: float) -> int:
+        """Into how many parts to cut that time, s: no more than MuJoCo does."""
+        return min(ceil(period * self.quickest / FAST), round(period / self.substep))
 
     def forward(
         self,
@@ -60,7 +73,7 @@ class JointStops(nn.Module):
         acceleration: Tensor,
         inverse: Tensor,
         period: float | Tensor,
-        steps: int,
+        parts: int,
         lag: float | Tensor,
     ) -> tuple[Tensor, Tensor]:
         """``qpos`` and ``qvel``, ``(J, N)``, after a time.
@@ -71,13 +84,13 @@ class JointStops(nn.Module):
             acceleration: without the limits, ``(J, N)``, held.
             inverse: of the mass matrix, ``(J, J, N)``, held.
             period: that time, s.
-            steps: its equal parts, in each of which the limits push anew.
+            parts: how many, equal, in each of which the limits push anew.
             lag: s by which positions run ahead of the mean of old and new velocities, a
                 substep of semi-implicit Euler.
         """
-        length, force = period / max(steps, 1), torch.zeros_like(qpos[self.joints])
+        length, force = period / max(parts, 1), torch.zeros_like(qpos[self.joints])
         own = inverse[self.joints][:, self.joints]
-        for _ in range(steps):
+        for _ in range(parts):
             place, speed = qpos[self.joints], qvel[self.joints]
             force, side = self._push(
                 place, speed, acceleration[self.joints], own, force
@@ -109,21 +122,25 @@ class JointStops(nn.Module):
 
     def _hardness(self, depth: Tensor) -> Tensor:
         """MuJoCo's impedance, 0 to 1, that far beyond an end."""
-        least, most, width, middle, power = self.impedance
+        least, rise, width, middle, early, late = self.impedance
         x = (depth / width).clamp(0.0, 1.0)
-        rising = x.pow(power) / middle.pow(power - 1.0)
-        bending = 1.0 - (1.0 - x).pow(power) / (1.0 - middle).pow(power - 1.0)
-        return least + (most - least) * torch.where(x < middle, rising, bending)
+        power = self.power if self.even_power is None else self.even_power
+        bent = torch.where(
+            x < middle, early * x**power, 1.0 - late * (1.0 - x) ** power
+        )
+        return least + rise * bent
 
 
-def _impedance(solimp: np.ndarray) -> np.ndarray:
-    """Least and most, width, middle and power, ``(5, L)``, as MuJoCo takes them."""
+def _impedance(solimp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least, rise, width, middle and two scales, ``(6, L)``, and the power, ``(L,)``."""
     least, most, width, middle, power = solimp.T
     least, most, middle = (x.clip(SOFTEST, HARDEST) for x in (least, most, middle))
     is_even = width <= TINY
     mean = 0.5 * (least + most)
     least, most = (np.where(is_even, mean, x) for x in (least, most))
-    return np.stack((least, most, width.clip(TINY), middle, power.clip(1.0)))
+    power = power.clip(1.0)
+    scales = middle ** (1.0 - power), (1.0 - middle) ** (1.0 - power)
+    return np.stack((least, most - least, width.clip(TINY), middle, *scales)), power
 
 
 def _springs(

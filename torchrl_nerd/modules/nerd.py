@@ -48,6 +48,9 @@ STEPS: dict[str, NetworkConfig] = {
 `GroundedNeRD`, for robots on springs."""
 
 TOKEN, TARGET = "token", "target"
+LARGEST = (
+    1e6  # of what a simulator within foresees, normalised: a float's square holds it
+)
 
 
 def network_config(name: str) -> NetworkConfig:
@@ -166,6 +169,8 @@ class NeRD(nn.Module):
         if not self.has_simulator:
             return token
         change = self.foresee(qpos, qvel, joint_torque, terrain)
+        # torques a thousandfold overflow it; what is no number in a state is one in a token
+        change = change.nan_to_num(0.0).clamp(-LARGEST, LARGEST)
         exact = torch.promote_types(self.dtype, torch.float32)
         return torch.cat((token.to(exact), change.to(exact)), -1)
 
