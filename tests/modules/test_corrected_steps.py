@@ -103,10 +103,8 @@ def test_changes_are_bounded_by_speed_and_not_by_the_data(scene, network, genera
 def test_torques_that_overflow_the_step_leave_it_finite(
     scene, network, times, generator
 ):
-    model, rows = (
-        lively(scene, network, generator),
-        random_transitions(scene, 8, generator),
-    )
+    model = lively(scene, network, generator)
+    rows = random_transitions(scene, 8, generator)
     cover(model, little_data(scene))
     rows[JOINT_TORQUE] *= times
     rows[QVEL] *= 10.0
@@ -120,10 +118,8 @@ def test_torques_that_overflow_the_step_leave_it_finite(
 @pytest.mark.parametrize("key", [QPOS, QVEL, JOINT_TORQUE])
 def test_what_is_no_number_stays_none(scene, network, key, generator):
     """And shows in the next state: nothing hides a fault."""
-    model, rows = (
-        lively(scene, network, generator),
-        random_transitions(scene, 8, generator),
-    )
+    model = lively(scene, network, generator)
+    rows = random_transitions(scene, 8, generator)
     cover(model, little_data(scene))
     for column in range(rows[key].shape[-1]):
         broken = rows.clone()

@@ -48,9 +48,7 @@ STEPS: dict[str, NetworkConfig] = {
 `GroundedNeRD`, for robots on springs."""
 
 TOKEN, TARGET = "token", "target"
-LARGEST = (
-    1e6  # of what a simulator within foresees, normalised: a float's square holds it
-)
+LARGEST = 1e6  # of what a simulator within foresees, normalised
 
 
 def network_config(name: str) -> NetworkConfig:

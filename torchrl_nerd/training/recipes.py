@@ -71,6 +71,13 @@ def _grounded(task: str, trajectories: int, steps: int, **others: Any) -> Recipe
     return replace(made, exports="last")
 
 
+def _free(task: str) -> Recipe:
+    """A step along the free motion and its correction, for arms."""
+    return _mlp(
+        task, 12_000, "free", 6_000, 500, softening=0.0001, validate_every=1_000
+    )
+
+
 RECIPES: dict[str, Recipe] = {
     "cartpole": Recipe(
         DataConfig(trajectories=20_000, steps=100),
@@ -84,26 +91,9 @@ RECIPES: dict[str, Recipe] = {
     "anymal": _grounded(
         "anymal/forward", 15_000, 20_000, validate_every=4_000, bf16_share=0.8
     ),
-    "franka": _mlp(
-        "franka/reach_torque",
-        12_000,
-        "free",
-        6_000,
-        500,
-        softening=0.0001,
-        validate_every=1_000,
-    ),
+    "franka": _free("franka/reach_torque"),
     "franka_gravity": replace(
-        _mlp(
-            "franka_gravity/reach_torque",
-            12_000,
-            "free",
-            6_000,
-            500,
-            softening=0.0001,
-            validate_every=1_000,
-        ),
-        strategy="correlated",
+        _free("franka_gravity/reach_torque"), strategy="correlated"
     ),
     "cube": replace(_grounded("cube/toss", 8_000, 10_000), strategy="resting"),
     "cube_real": _grounded("cube_real/toss", 8_000, 10_000),
