@@ -6,6 +6,7 @@ from safetensors.torch import load_file, save_file
 
 from torchrl_nerd.checkpoint import WEIGHTS, load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.coverage import Coverage
 from torchrl_nerd.training.sequences import cover, normalised
 
@@ -18,7 +19,7 @@ def test_training_data_are_left_as_they_are(scene, generator):
     assert torch.equal(model.coverage.clamp_token(tokens), tokens)
     assert torch.equal(model.coverage.clamp_target(targets), targets)
     qvel = data["next", "qvel"]
-    assert torch.equal(model.coverage.limit_speed(qvel), qvel)
+    assert torch.equal(model.coverage.limit_motion(qvel), qvel)
     qpos = data["next", "qpos"]
     for kept, given in zip(
         model.coverage.stop_joints(qpos, qvel), (qpos, qvel), strict=True
@@ -33,7 +34,7 @@ def test_one_training_state_in_a_hundred_is_called_unfamiliar(scene, generator):
     assert 0.005 < share < 0.015
 
 
-def test_whatever_comes_in_speeds_stay_bounded(scene, generator):
+def test_whatever_comes_in_speeds_and_motions_stay_bounded(scene, generator):
     model = random_model(scene, generator)
     state, torques, terrain = random_drive(scene, ROWS, 20, generator)
     wild = 10.0 ** (6.0 * torch.rand(ROWS, 1, generator=generator).double())
@@ -42,9 +43,12 @@ def test_whatever_comes_in_speeds_stay_bounded(scene, generator):
     for inference in LEARNED:
         dynamics, now = NeRDDynamics(model, inference), state
         for torque in wild * torques:
-            now = dynamics.step(now, torque, terrain)
+            before, now = now, dynamics.step(now, torque, terrain)
             assert now["qpos"].isfinite().all()
             assert (model.coverage.sizes(now["qvel"]) <= limit).all()
+            moved = differentiate_pos(scene.layout, before["qpos"], now["qpos"])
+            farthest = scene.control_step * limit + 1e-6
+            assert (model.coverage.sizes(moved) <= farthest).all()
 
 
 def test_widened_bounds_hold_both_and_trust_stays(scene, generator):

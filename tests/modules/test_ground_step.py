@@ -30,15 +30,15 @@ each_looks = pytest.mark.parametrize("looks", [1, 2, 3])
 coarse_looks = pytest.mark.parametrize("looks", [1, 2])
 
 
-def moved(scene, rows, looks=2, stride=1, **how):
+def moved(scene, rows, looks=2, stride=1, parts=1, **how):
     """The step's next state of ``rows``."""
     inputs = rows[QPOS], rows[QVEL], rows[JOINT_TORQUE], rows.get(TERRAIN, None)
-    return GroundStep(scene, looks, stride)(*inputs, **how)
+    return GroundStep(scene, looks, stride, parts)(*inputs, **how)
 
 
-def errors(scene, rows, looks=2):
+def errors(scene, rows, looks=2, parts=1):
     """Error of velocities and places, over the true change of velocity, of each row."""
-    qpos, qvel, _ = moved(scene, rows, looks)
+    qpos, qvel, _ = moved(scene, rows, looks, parts=parts)
     truth = rows["next"]
     size = (truth[QVEL] - rows[QVEL]).norm(dim=-1).clamp_min(1e-6)
     fast = (qvel - truth[QVEL]).norm(dim=-1) / size
@@ -106,6 +106,14 @@ def test_a_second_look_sees_more(scene, generator):
 
 
 @each_grounded
+def test_looks_in_every_part_see_more_still(scene, generator):
+    rows = touching(scene, generator)
+    parts = next(k for k in (2, 5) if scene.substeps % k == 0)
+    (whole, _), (halves, _) = (errors(scene, rows, 2, n) for n in (1, parts))
+    assert halves.median() < whole.median()
+
+
+@each_grounded
 def test_a_third_look_sees_what_the_finer_teacher_does(scene, generator):
     rows = touching(scene, generator, looks=3)
     (twice, _), (thrice, _) = (errors(scene, rows, looks) for looks in (2, 3))
@@ -121,6 +129,22 @@ def test_substeps_at_once_are_longer_substeps(scene, looks, generator):
     pairs = moved(scene, rows, looks, stride), moved(longer, rows, looks)
     for one, other in zip(*pairs, strict=True):
         torch.testing.assert_close(one, other)
+
+
+@each_grounded
+@each_looks
+def test_parts_are_shorter_control_steps(scene, looks, generator):
+    rows = touching(scene, generator, looks)
+    parts = next(k for k in (2, 5) if scene.substeps % k == 0)
+    shorter = replace(scene, substeps=scene.substeps // parts)
+    now, wrong = rows, []
+    for _ in range(parts):
+        qpos, qvel, off = moved(shorter, now, looks)
+        now = rows.clone().update({QPOS: qpos, QVEL: qvel})
+        wrong.append(off)
+    expected = qpos, qvel, torch.cat(wrong, -1)
+    for one, other in zip(expected, moved(scene, rows, looks, 1, parts), strict=True):
+        torch.testing.assert_close(other, one)
 
 
 @each_grounded
@@ -219,6 +243,13 @@ def test_what_it_does_not_know_is_refused(scene, sentence):
 def test_nobody_looks_four_times():
     with pytest.raises(ValueError, match="expected one look, two or three, got 4"):
         GroundStep(GROUNDED[0], looks=4)
+
+
+@pytest.mark.parametrize("parts", [0, 3])
+def test_parts_of_unlike_lengths_are_refused(parts):
+    sentence = f"expected parts of equal numbers of substeps, got {parts} of 16"
+    with pytest.raises(ValueError, match=sentence):
+        GroundStep(load_scene("ant"), parts=parts)
 
 
 def test_so_are_contacts_and_limits_of_another_law():

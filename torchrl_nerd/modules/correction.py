@@ -39,6 +39,7 @@ class GroundedConfig(CorrectionConfig):
 
     looks: int = 2
     stride: int = 1
+    parts: int = 1
 
 
 class Correction(nn.Module):

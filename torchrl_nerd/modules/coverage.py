@@ -2,11 +2,12 @@
 
 A network says something of any input, far from its training data too. Here inputs are
 taken back to the box that the data filled, changes of the state stay within the largest
-ones seen, speeds within twice the largest, and joints stop where the data end beyond
-their limits: nothing inside the box is touched, and whatever is outside stays finite and
-bounded. A simulator within a model knows harder impacts than any seen: its changes stay
-within what the bound on speeds leaves. What is as good as still stays where it is. How
-far an input lies outside is a number that can be looked at, see `Coverage.distance`.
+ones seen, speeds within twice the largest, motions within what those lead to, and joints
+stop where the data end beyond their limits: nothing inside the box is touched, and
+whatever is outside stays finite and bounded. A simulator within a model knows harder
+impacts than any seen: its changes stay within what the bound on speeds leaves. What is as
+good as still stays where it is. How far an input lies outside is a number that can be
+looked at, see `Coverage.distance`.
 """
 
 import torch
@@ -139,9 +140,15 @@ class Coverage(nn.Module):
         largest = torch.cat((2.0 * self.speed, step * self.speed))
         return change.clamp(-largest, largest)
 
-    def limit_speed(self, qvel: Tensor) -> Tensor:
-        """Velocities ``(*batch, nv)``, slowed to the limit where they are beyond it."""
-        return qvel * (self.speed / torch.maximum(self.sizes(qvel), self.speed))
+    def limit_motion(self, motion: Tensor, time: float = 1.0) -> Tensor:
+        """Motions ``(*batch, nv)``, no farther than the largest speed leads.
+
+        Args:
+            motion: velocities, or tangents of positions.
+            time: s, that it takes.
+        """
+        farthest = time * self.speed
+        return motion * (farthest / torch.maximum(self.sizes(motion), farthest))
 
     def stop_joints(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """The state with limited joints no farther than any went, and none going on.

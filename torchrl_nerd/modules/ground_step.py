@@ -8,7 +8,10 @@ substeps, where a first march through half of them ends. Then all substeps are m
 MuJoCo makes them, with points whose levers and free accelerations change along the line
 through both looks, and the mass matrix of the second one.
 
-Where that is too dear, one look has to do, at the mean time of the substeps, to where the
+Where a robot whirls its limbs about within a control step, that is made in parts, each
+with looks of its own.
+
+Where two looks are too dear, one has to do, at the mean time of the substeps, to where the
 velocity of the start leads, and some substeps at once.
 
 Where Euler's substeps are not exact enough, there is the finer teacher, and three looks: at
@@ -62,16 +65,20 @@ class GroundStep(nn.Module):
         looks: one or two; three for the state that the finer teacher leads to, see
             `Scene.fine`.
         stride: how many of MuJoCo's substeps are made as one.
+        parts: of a control step, which are made one after the other.
 
     Raises:
-        ValueError: in one sentence, another robot, or another number of looks.
+        ValueError: in one sentence, another robot, another number of looks, or substeps
+            that cannot be shared out among the parts.
     """
 
     limited: Tensor
     limited_places: Tensor
     reaches: Tensor
 
-    def __init__(self, scene: Scene, looks: int = 2, stride: int = 1) -> None:
+    def __init__(
+        self, scene: Scene, looks: int = 2, stride: int = 1, parts: int = 1
+    ) -> None:
         super().__init__()
         model = scene.model
         if looks not in (1, 2, 3):
@@ -85,8 +92,13 @@ class GroundStep(nn.Module):
                 f"'{scene.name}' (a finer teacher takes three looks: grounded-fine)"
             )
         own = (scene.fine if is_fine else scene).substeps
-        self.substeps = max(1, own // stride)
-        self.step_size = scene.control_step / self.substeps
+        substeps = max(1, own // stride)
+        if parts < 1 or substeps % parts:
+            raise ValueError(
+                f"expected parts of equal numbers of substeps, got {parts} of {substeps}"
+            )
+        self.parts, self.substeps = parts, substeps // parts  # of each part
+        self.step_size = scene.control_step / substeps
         # when in a substep it is pushed, of its whole: Euler's velocities lead its places
         self.at = 0.5 if is_fine else 0.0
         mean, third = 0.5 * (self.substeps - 1) + self.at, self.substeps / 3
@@ -116,7 +128,7 @@ class GroundStep(nn.Module):
         terrain: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The next state, and by how much the velocity at the last look was wrong.
+        """The next state, and by how much the velocities at last looks were wrong.
 
         Args:
             qpos: ``(*batch, nq)``.
@@ -126,13 +138,29 @@ class GroundStep(nn.Module):
             dtype: of the springs; all else is float64.
 
         Returns:
-            The next ``qpos`` and ``qvel``, and the velocity that the substeps have at the
-            time of the last look less the one that it was taken with, ``(*batch, nv)``, a
-            floating base's in its own axes there.
+            The next ``qpos`` and ``qvel``, and the velocities that the substeps have at the
+            time of every part's last look less those that it was taken with, ``(*batch,
+            parts * nv)``, a floating base's in its own axes there.
         """
         batch, state = qpos.shape[:-1], (qpos, qvel, joint_torque)
         qpos, qvel, joint_torque = (x.flatten(0, -2) for x in state)
         ground = None if terrain is None else terrain.flatten(0, -2)
+        wrong = []
+        for _ in range(self.parts):
+            qpos, qvel, off = self._part(qpos, qvel, joint_torque, ground, dtype)
+            wrong.append(off)
+        found = qpos, qvel, torch.cat(wrong, -1)
+        return tuple(x.unflatten(0, batch) for x in found)  # pyright: ignore
+
+    def _part(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        ground: Tensor | None,
+        dtype: torch.dtype,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What `forward` returns, of one part and rows ``N``."""
         given = joint_torque, ground, dtype
         joints = qpos.mT[self.limited_places].to(dtype)
         began, ended = self.times[0], self.times[-1]
@@ -154,8 +182,7 @@ class GroundStep(nn.Module):
         marches = self._march(*line, qvel, joints, self.substeps)
         guess = self._turned(guess.mT, look.rotation.mT)
         wrong = (_reached(marches, ended).speed - guess).mT
-        found = *self._moved(qpos, marches[-1], look.rotation), wrong
-        return tuple(x.unflatten(0, batch) for x in found)  # pyright: ignore
+        return *self._moved(qpos, marches[-1], look.rotation), wrong
 
     def _moved(
         self, qpos: Tensor, march: _March, rotation: Tensor

@@ -3,7 +3,7 @@
 The ground and the limits of the paper's robots are explicit springs, and between two looks
 at a robot little changes but what they push with. A network that has to find all that out
 errs by a tenth of a step, `GroundStep` by a hundredth. So the network is left with the
-rest, and has the more say the more wrong the last look's velocity was.
+rest, and has the more say the more wrong the last looks' velocities were.
 """
 
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ from torchrl_nerd.transforms import Stats
 class GroundedNeRD(NeRD):
     """A `GroundStep` and its learned correction; otherwise a `NeRD` like any other.
 
-    After the features the token holds by how much the velocity at the last look was wrong,
-    then the change of the state that the step foresees, normalised as targets are, and its
-    doubt, 0 to 1: the root mean square of what was wrong.
+    After the features the token holds by how much the velocities at the last look of every
+    part were wrong, then the change of the state that the step foresees, normalised as
+    targets are, and its doubt, 0 to 1: the root mean square of what was wrong.
 
     Args:
         scene: of a robot that `GroundStep` can move.
@@ -35,6 +35,7 @@ class GroundedNeRD(NeRD):
         ValueError: another robot.
     """
 
+    config: GroundedConfig
     has_simulator = True
     has_short_loops = True
 
@@ -45,14 +46,14 @@ class GroundedNeRD(NeRD):
         stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
         # refuses before anything is built
-        step = GroundStep(scene, config.looks, config.stride)
+        step = GroundStep(scene, config.looks, config.stride, config.parts)
         super().__init__(scene, config, stats)
         self.ground_step = step
 
     @property
     def num_hints(self) -> int:
-        """What was wrong at the last look."""
-        return self.scene.layout.nv
+        """What was wrong at the last looks."""
+        return self.config.parts * self.scene.layout.nv
 
     def foresee(
         self,
@@ -61,11 +62,12 @@ class GroundedNeRD(NeRD):
         joint_torque: Tensor,
         terrain: Tensor | None = None,
     ) -> Tensor:
-        """What was wrong at the last look, the step's change, its doubt, ``(rows, K)``."""
+        """What was wrong at last looks, the step's change, its doubt, ``(rows, K)``."""
         exact = torch.promote_types(self.dtype, torch.float32)
         *after, wrong = self.ground_step(qpos, qvel, joint_torque, terrain, exact)
         change = self.state_delta.delta(qpos, qvel, *after)
         change = self.normalize.normalize(TARGET, change)
-        wrong = wrong / self.normalize.std(TARGET)[: self.num_hints]
+        scale = self.normalize.std(TARGET)[: self.scene.layout.nv]
+        wrong = wrong / scale.repeat(self.config.parts)
         doubt = wrong.square().mean(-1, keepdim=True).sqrt().clamp_max(1.0)
         return torch.cat((wrong, change, doubt), -1)

@@ -40,6 +40,7 @@ NETWORKS: dict[str, NetworkConfig] = {
 STEPS: dict[str, NetworkConfig] = {
     "free": FreeConfig(),
     "grounded": GroundedConfig(),
+    "grounded-halves": GroundedConfig(parts=2),
     "grounded-small": GroundedConfig(depth=1, width=16, looks=1),
     "grounded-fast": GroundedConfig(looks=1, stride=2),
     "grounded-fine": GroundedConfig(looks=3),
@@ -204,7 +205,7 @@ class NeRD(nn.Module):
         else:
             change = self.coverage.clamp_target(change)
             delta = self.normalize.denormalize(TARGET, change)
-        limit = self.coverage.limit_speed
+        limit = self.coverage.limit_motion
         after = self.state_delta.integrate(qpos, qvel, delta, limit)
         return self.coverage.stay((qpos, qvel), self.coverage.stop_joints(*after))
 

@@ -79,7 +79,7 @@ class StateDelta(Transform):
         qpos: Tensor,
         qvel: Tensor,
         delta: Tensor,
-        limit: Callable[[Tensor], Tensor] | None = None,
+        limit: Callable[[Tensor, float], Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The next ``qpos`` and ``qvel``: exact inverse of `delta`.
 
@@ -87,14 +87,16 @@ class StateDelta(Transform):
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
             delta: ``(*batch, 2 nv)``.
-            limit: what keeps the next velocities ``(*batch, nv)`` within bounds, and the
-                positions with them.
+            limit: what keeps a motion ``(*batch, nv)`` over so many seconds within
+                bounds: the next velocities, over one, and how far positions move.
         """
         change, residual = delta.split(self.layout.nv, -1)
         if self.base.is_floating:
             change, residual = (self._turn(qpos, x, rotate) for x in (change, residual))
-        after = qvel + change if limit is None else limit(qvel + change)
+        after = qvel + change if limit is None else limit(qvel + change, 1.0)
         moved = 0.5 * self.step_size * (qvel + after) + residual
+        if limit is not None:
+            moved = limit(moved, self.step_size)
         for _, v in self.layout.rotations:
             turn = quat_exp(moved[..., v : v + 3])
             after = _replace(after, v, rotate_inverse(turn, after[..., v : v + 3]))
