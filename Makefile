@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant model-anymal model-ant-mlp model-anymal-mlp model-double_pendulum-mlp format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check model-anymal model-ant-mlp model-anymal-mlp model-double_pendulum-mlp format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -79,23 +79,6 @@ model-anymal: $(STAMP) ## ANYmal: learned, tried by two policies, learned anew w
 	$(NERD) train anymal --out runs/anymal \
 		--data datasets/anymal datasets/anymal_forward datasets/anymal_sideways
 	cp runs/anymal/last/* $(PRETRAINED)/anymal/
-
-model-ant: $(STAMP) ## the Ant: learned, tried by two policies, learned anew with what these do
-	$(NERD) data ant --trajectories 20000 --out datasets/ant
-	$(NERD) train ant --data datasets/ant --out runs/ant_random
-	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant_random/last --seed 1 \
-		--out runs/ppo_run --horizon 16 --minibatch 8192 --lr 1e-3 \
-		--total-frames 8000000 --episodes 512 --compile
-	$(PY) examples/ppo.py --task ant/spin_track --dynamics runs/ant_random/last \
-		--out runs/ppo_track --horizon 16 --minibatch 8192 --lr 1e-3 \
-		--total-frames 24000000 --episodes 512 --compile
-	$(NERD) data ant --policy runs/ppo_run --trajectories 2500 --seed 11 \
-		--out datasets/ant_run
-	$(NERD) data ant --policy runs/ppo_track --trajectories 2500 --seed 11 \
-		--out datasets/ant_track
-	$(NERD) train ant --data datasets/ant datasets/ant_run datasets/ant_track \
-		--out runs/ant
-	cp runs/ant/last/* $(PRETRAINED)/ant/
 
 model-ant-mlp: $(STAMP) ## the Ant's network alone: learned, tried by a policy, learned on
 	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp

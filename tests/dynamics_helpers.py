@@ -72,6 +72,7 @@ STEPPED = [
     (scene, name)
     for name, config in STEPS.items()
     for scene in (FREE if isinstance(config, FreeConfig) else GROUNDED)
+    if scene.substeps % getattr(config, "parts", 1) == 0
 ]
 each_free = pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.name)
 each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)

@@ -115,11 +115,12 @@ def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
     return folder
 
 
-def load_checkpoint(folder: Path, scene: Scene | None = None) -> NeRD:
+def load_checkpoint(folder: str | Path, scene: Scene | None = None) -> NeRD:
     """A model from a folder; warns where this machine does not repeat its steps.
 
     See `read_checkpoint`.
     """
+    folder = Path(folder)
     model, check = read_checkpoint(folder, scene)
     if check is not None:
         warn_of_differences(check, folder)

@@ -37,7 +37,7 @@ def test_it_comes_back_from_disk(real_cube, tosses, generator, tmp_path):
     model = from_scratch(real_cube, tosses, "residual", seed=1)
     scramble(model, generator)
     save_checkpoint(model, tmp_path, make_card(model))
-    loaded = load_checkpoint(tmp_path)
+    loaded = load_checkpoint(str(tmp_path))
     start = starts(tosses, generator)
     paths = [open_loop(NeRDDynamics(m), start, 5) for m in (model, loaded)]
     assert torch.equal(*paths)

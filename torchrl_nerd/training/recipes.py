@@ -61,13 +61,15 @@ def _mlp(
     return Recipe(DataConfig(trajectories=trajectories, steps=100), train, task)
 
 
-def _grounded(task: str, trajectories: int, steps: int, **others: Any) -> Recipe:
+def _grounded(
+    task: str, trajectories: int, steps: int, network: str = "grounded", **others: Any
+) -> Recipe:
     """A step along springs and its correction; its last checkpoint is the model.
 
     Passive starts, which validate, tell little of what it is worth under torque.
     """
     others = {"validate_every": 5_000, **others}
-    made = _mlp(task, trajectories, "grounded", steps, 0, softening=0.02, **others)
+    made = _mlp(task, trajectories, network, steps, 0, softening=0.02, **others)
     return replace(made, exports="last")
 
 
@@ -87,7 +89,14 @@ RECIPES: dict[str, Recipe] = {
     "double_pendulum": replace(
         _grounded("double_pendulum/passive", 30_000, 20_000), strategy="level"
     ),
-    "ant": _grounded("ant/run", 20_000, 20_000, validate_every=4_000, bf16_share=0.85),
+    "ant": _grounded(
+        "ant/run",
+        20_000,
+        20_000,
+        "grounded-halves",
+        validate_every=4_000,
+        bf16_share=0.85,
+    ),
     "anymal": _grounded(
         "anymal/forward", 15_000, 20_000, validate_every=4_000, bf16_share=0.8
     ),
