@@ -23,37 +23,19 @@ table II.1.1.
 """
 
 from itertools import pairwise
-from math import ceil
-from typing import NamedTuple
 
 import mujoco
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.elimination import times
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import cross
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.modules.free_step import expect_none, untold_pushes
-from torchrl_nerd.modules.look import Look, LookAt
-from torchrl_nerd.modules.springs import ContactSprings, LimitSprings
+from torchrl_nerd.modules.look import LookAt
+from torchrl_nerd.modules.march import March, Reached, reached
 from torchrl_nerd.scenes.scene import Scene
 
 EULER = mujoco.mjtIntegrator.mjINT_EULER
-
-
-class _March(NamedTuple):
-    """Where a march through substeps has come to; rows last."""
-
-    speed: Tensor  # (nv, N)
-    moved: Tensor  # (nv, N), a tangent
-
-    def to(self, other: "_March", share: float) -> "_March":
-        """A share of the way to another one."""
-        pairs = zip(self, other, strict=True)
-        return _March(*(torch.lerp(one, end, share) for one, end in pairs))
 
 
 class GroundStep(nn.Module):
@@ -71,10 +53,6 @@ class GroundStep(nn.Module):
         ValueError: in one sentence, another robot, another number of looks, or substeps
             that cannot be shared out among the parts.
     """
-
-    limited: Tensor
-    limited_places: Tensor
-    reaches: Tensor
 
     def __init__(
         self, scene: Scene, looks: int = 2, stride: int = 1, parts: int = 1
@@ -99,26 +77,14 @@ class GroundStep(nn.Module):
             )
         self.parts, self.substeps = parts, substeps // parts  # of each part
         self.step_size = scene.control_step / substeps
-        # when in a substep it is pushed, of its whole: Euler's velocities lead its places
-        self.at = 0.5 if is_fine else 0.0
-        mean, third = 0.5 * (self.substeps - 1) + self.at, self.substeps / 3
+        at = 0.5 if is_fine else 0.0  # Euler's velocities lead its places
+        mean, third = 0.5 * (self.substeps - 1) + at, self.substeps / 3
         looks_at = {1: (mean,), 2: (0.0, mean), 3: (0.0, third, 2.0 * third)}
         self.times = looks_at[looks]  # of the looks, in substeps
         axes = JointAxes.of(model, scene.base)
         self.look = LookAt(scene, axes, 0.0 if is_fine else 2.0 * self.step_size)
-        self.layout, self.whole = scene.layout, self.look.whole
-        self.contact = ContactSprings(scene)
-        self.limit = LimitSprings(model, axes)
-        limited = [2 * self.whole + joint for joint in self.limit.joints]
-        pushed = [*self.look.rates.tolist(), *limited]
-        reaches = np.zeros((model.nv, len(pushed)))
-        reaches[np.array(pushed, int), range(len(pushed))] = 1.0
-        addresses = self.look.motion.qpos_addresses
-        places = [addresses[joint] for joint in self.limit.joints]
-        for name, numbers in (("limited", limited), ("limited_places", places)):
-            index = torch.from_numpy(np.array(numbers, dtype=np.int64))
-            self.register_buffer(name, index, persistent=False)
-        keep_constants(self, reaches=reaches)
+        self.layout = scene.layout
+        self.march = March(scene, axes, self.look, self.step_size, at)
 
     def forward(
         self,
@@ -162,7 +128,6 @@ class GroundStep(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """What `forward` returns, of one part and rows ``N``."""
         given = joint_torque, ground, dtype
-        joints = qpos.mT[self.limited_places].to(dtype)
         began, ended = self.times[0], self.times[-1]
         place, guess = qpos, qvel
         ahead = began * self.step_size
@@ -170,112 +135,23 @@ class GroundStep(nn.Module):
             place = integrate_pos(self.layout, qpos, ahead * qvel)
         look = self.look(place, guess, *given)
         if began:  # back to the depths of the start
-            speed = self._turned(qvel.mT, look.rotation.mT).to(dtype)
+            speed = self.march.turned(qvel.mT, look.rotation.mT).to(dtype)
             rising = (self.look.velocity(look.levers, speed) * look.normal).sum(0)
             look = look._replace(depth=look.depth + ahead * rising)
         start = look
         for since, until in pairwise(self.times):
-            marches = self._march(start, look, since, qvel, joints, until)
-            place, guess = self._moved(qpos, _reached(marches, until), look.rotation)
+            marches = self.march(start, look, since, qpos, qvel, until)
+            place, guess = self._moved(qpos, reached(marches, until), look.rotation)
             look = self.look(place, guess, *given)
         line = start, look, ended - began
-        marches = self._march(*line, qvel, joints, self.substeps)
-        guess = self._turned(guess.mT, look.rotation.mT)
-        wrong = (_reached(marches, ended).speed - guess).mT
+        marches = self.march(*line, qpos, qvel, self.substeps)
+        guess = self.march.turned(guess.mT, look.rotation.mT)
+        wrong = (reached(marches, ended).speed - guess).mT
         return *self._moved(qpos, marches[-1], look.rotation), wrong
 
     def _moved(
-        self, qpos: Tensor, march: _March, rotation: Tensor
+        self, qpos: Tensor, march: Reached, rotation: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The state ``(N, nq)``, ``(N, nv)`` where a march has come to."""
-        speed, moved = (self._turned(x.to(qpos), rotation).mT for x in march)
+        """The state ``(N, nq)``, ``(N, nv)`` where substeps have come to."""
+        speed, moved = (self.march.turned(x.to(qpos), rotation).mT for x in march)
         return integrate_pos(self.layout, qpos, moved), speed
-
-    def _march(
-        self,
-        start: Look,
-        look: Look,
-        since: float,
-        qvel: Tensor,
-        joints: Tensor,
-        until: float,
-    ) -> list[_March]:
-        """Where substeps lead to, one by one, from nowhere on.
-
-        Args:
-            start: the first look, whence levers and free accelerations change
-            look: to the last one, in whose axes the march is, with whose mass matrix.
-            since: time between both, in substeps; 0: they are one, and nothing changes.
-            qvel: at the start, ``(N, nv)``.
-            joints: where those with limits are, ``(L, N)``.
-            until: a time in substeps to be reached.
-        """
-        step, levers, normal, depth, free, inverse, _ = self.step_size, *look
-        speed = self._turned(qvel.mT, look.rotation.mT).to(free)
-        bend, drift = None, None
-        if since:
-            turn = look.rotation.mT @ start.rotation
-            levers, normal = (_rotated(x, turn) for x in (start.levers, start.normal))
-            free, depth = self._turned(start.free, turn), start.depth
-            share = 1.0 / since  # of the way to it, each substep
-            bend, drift = share * (look.levers - levers), share * (look.free - free)
-        first, moved = levers, torch.zeros_like(speed)
-        change = moved
-        marches, reaches = [_March(speed, moved)], self.reaches.to(speed)
-        for number in range(ceil(until)):
-            time = number + self.at
-            if bend is not None:
-                levers = torch.add(first, bend, alpha=time)
-            velocity = self.look.velocity(levers, speed)
-            rising = (velocity * normal).sum(0)
-            if time:
-                depth = depth - min(1.0, time) * step * rising
-            damped = speed
-            if self.at:
-                moved = self._composed(moved, self.at * step * speed)
-                damped = speed + self.at * change  # halfway, if pushed as just before
-                velocity = self.look.velocity(levers, damped)
-                rising = (velocity * normal).sum(0)
-            sliding = velocity - rising * normal
-            force = self.contact(depth, rising, sliding, normal)
-            at = joints + moved[self.limited], damped[self.limited]
-            pushes = (levers * force[:, :, None]).sum(0).flatten(0, 1), self.limit(*at)
-            push = times(reaches, torch.cat(pushes))
-            if self.whole:
-                push = torch.cat((force.sum(1), push[self.whole :]))
-            gain = free if drift is None else torch.add(free, drift, alpha=time)
-            change = step * (gain + (inverse * push).sum(1))
-            speed = speed + change
-            moved = self._composed(moved, (1.0 - self.at) * step * speed)
-            marches.append(_March(speed, moved))
-        return marches
-
-    def _composed(self, moved: Tensor, further: Tensor) -> Tensor:
-        """The tangent of two motions, one after the other, to second order."""
-        total = moved + further
-        if not self.whole:
-            return total
-        turns = slice(self.whole, 2 * self.whole)
-        twist = 0.5 * cross(moved[turns], further[turns])
-        return torch.cat((total[: self.whole], total[turns] + twist, total[6:]))
-
-    def _turned(self, rates: Tensor, rotation: Tensor) -> Tensor:
-        """``rates (nv, N)`` with the base's velocity in other axes."""
-        if not self.whole:
-            return rates
-        return torch.cat((_rotated(rates[:3], rotation), rates[3:]))
-
-
-def _reached(marches: list[_March], time: float) -> _March:
-    """Where a march was at a time, in substeps."""
-    before = int(time)
-    if before == time:
-        return marches[before]
-    return marches[before].to(marches[before + 1], time - before)
-
-
-def _rotated(vectors: Tensor, rotation: Tensor) -> Tensor:
-    """``rotation (N, 3, 3)`` applied to ``vectors (3, *size, N)``."""
-    rotation = rotation.permute(1, 2, 0).to(vectors)
-    rotation = rotation.reshape(3, 3, *[1] * (vectors.ndim - 2), -1)
-    return (rotation * vectors).sum(1)
