@@ -17,7 +17,7 @@ from torchrl_nerd.geometry.manifold import FREE
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import RobotCentric, StateDelta
 
-Limit = Callable[[Tensor], Tensor] | None
+Limit = Callable[[Tensor, float], Tensor] | None
 
 
 class PlainDelta(StateDelta):

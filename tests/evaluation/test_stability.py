@@ -60,6 +60,19 @@ def test_what_does_not_depend_on_weights_holds_for_any(scene, generator):
         assert result.passes, (result.case, result.learned)
 
 
+def test_every_seed_has_starts_of_its_own(generator):
+    scene, drawn = load_scene("cartpole"), []
+    case = Case(
+        "made up", "", lambda w, g, _: drawn.append(starts(w.scene, 2, g)) or {}
+    )
+    world = DynamicsWorld(MujocoDynamics(scene))
+    for seed in (0, 1, 1, 2**20):
+        list(run_cases(world, world, [case], seed))
+    first, other, again, far = (x["qpos"] for x in drawn[::2])
+    assert torch.equal(other, again)
+    assert not torch.equal(first, other) and not torch.equal(first, far)
+
+
 def test_a_figure_that_is_no_number_keeps_no_line():
     case = Case("made up", "", lambda *_: {}, lines={"x": 1.0})
     assert case.passes({"x": 1.0}, is_true=False)

@@ -31,6 +31,7 @@ from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torques
+from torchrl_nerd.seeds import stream
 from torchrl_nerd.settings import expect_at_least
 
 CHUNK = 2048  # trajectories stepped together; also what a kill can lose
@@ -130,7 +131,7 @@ def plain_strategy(scene: Scene) -> tuple[None, Draw]:
 def draw_chunk(draw: Draw, config: DataConfig, chunk: Chunk) -> TensorDict:
     """One chunk's trajectories; seed and number decide them, not who draws them."""
     number, rows = chunk
-    generator = Generator().manual_seed((config.seed << 24) + number)
+    generator = stream(config.seed, number)
     return draw(rows, config.steps, generator)
 
 

@@ -32,6 +32,13 @@ def starts(scene: Scene, rows: int, generator: Generator) -> TensorDict:
     return TensorDict(scene.sample_initial(rows, generator)[0], [rows])
 
 
+def nudged(start: TensorDict, size: float, generator: Generator) -> TensorDict:
+    """The same states with every velocity off by normal noise of that size."""
+    qvel = start[QVEL]
+    noise = torch.randn(qvel.shape, generator=generator, dtype=qvel.dtype)
+    return start.clone().update({QVEL: qvel + size * noise})
+
+
 @cache
 def settled(scene: Scene, rows: int) -> TensorDict:
     """Where the robot comes to lie in true dynamics, dropped from its training ranges.

@@ -6,9 +6,9 @@ from torch import Generator
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.measures import apart
-from torchrl_nerd.evaluation.stability.states import starts
+from torchrl_nerd.evaluation.stability.states import nudged, starts
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import QPOS
 
 ROWS, STEPS = 32, 200
 NUDGE = 1e-6  # of every velocity
@@ -18,12 +18,9 @@ GONE = 0.3  # m or rad: the prediction no longer holds
 def _run(world: World, generator: Generator, scale: float) -> Figures:
     truth = DynamicsWorld(MujocoDynamics(world.scene))
     start = starts(world.scene, ROWS, generator)
-    nudged = start.clone()
-    nudged[QVEL] = nudged[QVEL] + NUDGE * torch.randn(
-        nudged[QVEL].shape, generator=generator, dtype=torch.float64
-    )
+    beside = nudged(start, NUDGE, generator)
     true = truth.roll(start, STEPS)[QPOS]
-    floor = apart(world.scene, true, truth.roll(nudged, STEPS)[QPOS])
+    floor = apart(world.scene, true, truth.roll(beside, STEPS)[QPOS])
     error = apart(world.scene, true, world.roll(start, STEPS)[QPOS])
     grown = (floor[:, -1].median() / floor[:, 1].median().clamp(min=1e-15)).log()
     rate = float(grown) / (world.scene.control_step * (STEPS - 1))
