@@ -10,7 +10,7 @@ import pytest
 import torchrl_nerd
 
 PACKAGE = Path(torchrl_nerd.__file__).parent
-LEAVES = {"compiled", "files", "row_threads", "settings", "__version__"}
+LEAVES = {"compiled", "files", "row_threads", "seeds", "settings", "__version__"}
 LEVELS = (
     {"keys", "geometry", "tensor_files"},
     {"scenes"},

@@ -12,6 +12,7 @@ from torchrl_nerd.data.policy_data import policy_data
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.seeds import stream
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.policy_strategy import along_policy
 
@@ -37,7 +38,7 @@ def test_it_draws_what_the_policy_does(folder, tmp_path):
     task = make_task(TASK)
     actor = make_actor(load_policy(folder, task))
     for chunk, rows in enumerate((4, 4, 2)):
-        generator = torch.Generator().manual_seed((CONFIG.seed << 24) + chunk)
+        generator = stream(CONFIG.seed, chunk)
         expected = policy_data(task, actor, rows, CONFIG.steps, generator, 0.2)
         found = data[chunk * CHUNK : chunk * CHUNK + rows]
         for key in expected.keys(True, True):

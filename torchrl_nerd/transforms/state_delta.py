@@ -88,7 +88,8 @@ class StateDelta(Transform):
             qvel: ``(*batch, nv)``.
             delta: ``(*batch, 2 nv)``.
             limit: what keeps a motion ``(*batch, nv)`` over so many seconds within
-                bounds: the next velocities, over one, and how far positions move.
+                bounds: the next velocities, over one, and how far positions move of
+                what begins within them.
         """
         change, residual = delta.split(self.layout.nv, -1)
         if self.base.is_floating:
@@ -96,7 +97,8 @@ class StateDelta(Transform):
         after = qvel + change if limit is None else limit(qvel + change, 1.0)
         moved = 0.5 * self.step_size * (qvel + after) + residual
         if limit is not None:
-            moved = limit(moved, self.step_size)
+            within = limit(qvel, 1.0) == qvel  # what begins faster goes on as it may
+            moved = torch.where(within, limit(moved, self.step_size), moved)
         for _, v in self.layout.rotations:
             turn = quat_exp(moved[..., v : v + 3])
             after = _replace(after, v, rotate_inverse(turn, after[..., v : v + 3]))
