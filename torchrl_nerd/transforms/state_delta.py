@@ -19,6 +19,8 @@ from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, STATE_DELTA
 from torchrl_nerd.scenes.scene import Scene
 
+ROUNDING = 1e-6  # of a velocity
+
 
 class StateDelta(Transform):
     """Velocity change and trapezoid residual of the position, ``(*batch, 2 nv)``.
@@ -97,7 +99,8 @@ class StateDelta(Transform):
         after = qvel + change if limit is None else limit(qvel + change, 1.0)
         moved = 0.5 * self.step_size * (qvel + after) + residual
         if limit is not None:
-            within = limit(qvel, 1.0) == qvel  # what begins faster goes on as it may
+            # what begins faster goes on as it may; what was slowed to the bound does not
+            within = (limit(qvel, 1.0) - qvel).abs() <= ROUNDING * qvel.abs()
             moved = torch.where(within, limit(moved, self.step_size), moved)
         for _, v in self.layout.rotations:
             turn = quat_exp(moved[..., v : v + 3])
