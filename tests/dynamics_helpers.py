@@ -57,10 +57,10 @@ def is_free(scene: Scene) -> bool:
     return True
 
 
-def is_grounded(scene: Scene) -> bool:
-    """Whether a `GroundStep` can move the robot."""
+def is_grounded(scene: Scene, parts: int = 1) -> bool:
+    """Whether a `GroundStep` of so many parts can move the robot."""
     try:
-        GroundStep(scene)
+        GroundStep(scene, parts=parts)
     except ValueError:
         return False
     return True
@@ -72,7 +72,7 @@ STEPPED = [
     (scene, name)
     for name, config in STEPS.items()
     for scene in (FREE if isinstance(config, FreeConfig) else GROUNDED)
-    if scene.substeps % getattr(config, "parts", 1) == 0
+    if isinstance(config, FreeConfig) or is_grounded(scene, config.parts)
 ]
 each_free = pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.name)
 each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)

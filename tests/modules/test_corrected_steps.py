@@ -94,6 +94,8 @@ def test_changes_are_bounded_by_speed_and_not_by_the_data(scene, network, genera
     after = step(model, rows)
     assert (coverage.sizes(after[QVEL]) <= limit * (1.0 + 1e-9)).all()
     moved = differentiate_pos(scene.layout, rows[QPOS], after[QPOS])
+    way = 0.5 * coverage.sizes(rows[QVEL]) + 1.5 * limit  # m/s: trapezoid, residual
+    assert (coverage.sizes(moved) <= 2.0 * scene.control_step * way).all()
     is_within = coverage.sizes(rows[QVEL]) <= limit
     farthest = scene.control_step * limit + 1e-9
     assert (coverage.sizes(moved) <= farthest)[is_within].all()
