@@ -153,6 +153,9 @@ def test_it_keeps_the_substeps_that_it_learned_from(generator, tmp_path):
     save_checkpoint(model, tmp_path, make_card(model))
     loaded = load_checkpoint(tmp_path, scene)
     assert loaded.free_step.lag == 0.0
+    assert (
+        loaded.free_step.parts == model.free_step.parts
+    )  # pushes at the ends of joints
     drive = random_drive(scene, 4, 5, generator)
     paths = [roll(NeRDDynamics(m), *drive) for m in (model, loaded)]
     assert not unequal_keys(*paths)

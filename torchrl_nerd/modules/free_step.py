@@ -66,7 +66,9 @@ class FreeStep(nn.Module):
         is_limited = model.jnt_limited[axes.joints] != 0
         self.stops, self.parts = None, 1
         if is_limited.any() and not scene.base.is_floating:
-            self.stops = JointStops(model, axes)
+            # the scene's own, so that a model of a finer teacher is the same in both
+            own = scene.control_step / (scene.substeps // scene.refinement)
+            self.stops = JointStops(model, axes, own)
             self.parts = self.stops.parts(self.period)
         low, high = model.jnt_range[axes.joints].T
         margin = model.jnt_margin[axes.joints]

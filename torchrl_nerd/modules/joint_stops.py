@@ -34,6 +34,7 @@ class JointStops(nn.Module):
     Args:
         model: compiled, of a robot without a free base.
         axes: its joints.
+        substep: s, of MuJoCo.
     """
 
     ends: Tensor
@@ -41,15 +42,16 @@ class JointStops(nn.Module):
     power: Tensor
     law: Tensor
 
-    def __init__(self, model: mujoco.MjModel, axes: JointAxes) -> None:
+    def __init__(self, model: mujoco.MjModel, axes: JointAxes, substep: float) -> None:
         super().__init__()
+        self.substep = substep
         self.joints = np.flatnonzero(model.jnt_limited[axes.joints]).tolist()
         ids = [axes.joints[joint] for joint in self.joints]
         low, high = model.jnt_range[ids].T
         margin = model.jnt_margin[ids]
         solimp = model.jnt_solimp[ids]
-        springs = _springs(model, model.jnt_solref[ids], solimp[:, 1])
-        self.quickest, self.substep = float(springs[1].max()), model.opt.timestep
+        springs = _springs(model, model.jnt_solref[ids], solimp[:, 1], self.substep)
+        self.quickest = float(springs[1].max())
         law = *springs, model.dof_invweight0[model.jnt_dofadr[ids]]
         impedance, power = _impedance(solimp)
         # a number where joints agree: a square takes no time, a power most of the step's
@@ -144,12 +146,12 @@ def _impedance(solimp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _springs(
-    model: mujoco.MjModel, solref: np.ndarray, most: np.ndarray
+    model: mujoco.MjModel, solref: np.ndarray, most: np.ndarray, substep: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness, 1/s^2, and damping, 1/s, of what limits ask for, in either format."""
     (first, second), most = solref.T, most.clip(SOFTEST, HARDEST)
     is_direct = first <= 0.0
-    shortest = 2.0 * model.opt.timestep
+    shortest = 2.0 * substep
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         shortest = TINY
     time, ratio = np.maximum(first, shortest), np.maximum(second, TINY)
