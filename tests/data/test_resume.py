@@ -98,7 +98,9 @@ def test_a_killed_run_goes_on_to_the_same_bits(moment, chunk, killed, whole, tmp
     cut_short = killed / f"{moment}-{MOMENTS[moment] + chunk}"
     folder = shutil.copytree(cut_short, tmp_path / "killed")
     if chunk:
-        assert read_json(folder / "data.json")["chunks_done"] == chunk
+        is_ahead = moment == "simulate"  # the chunk before may not be written yet
+        done = read_json(folder / "data.json")["chunks_done"]
+        assert chunk - is_ahead <= done <= chunk
     with pytest.raises(ValueError, match=r"not finished|found no data\.json"):
         load_data(SCENE, folder)
     generate(SCENE, CONFIG, folder, quiet=True)

@@ -15,6 +15,7 @@ from torchrl_nerd.cli.options import (
     run_name,
     scene_of,
 )
+from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.generate import (
     CARD,
     DataConfig,
@@ -121,7 +122,7 @@ class Data(Command):
         scene = scene_of(self.scene, self.fine)
         out = self.folder
         draw = self.strategy(scene)
-        mapper = partial(ray_map, address=self.ray) if self.ray else map
+        mapper = partial(ray_map, address=self.ray) if self.ray else ahead
         generate(scene, self.config, out, self.quiet, draw, mapper)
         card = read_json(out / CARD)
         print(

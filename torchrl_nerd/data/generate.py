@@ -20,6 +20,7 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from torchrl_nerd import __version__
+from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.store import (
     create_store,
     expect_finite,
@@ -141,7 +142,7 @@ def generate(
     folder: Path,
     quiet: bool = False,
     strategy: tuple[str, Draw] | None = None,
-    mapper: Mapper = map,
+    mapper: Mapper = ahead,
 ) -> Path:
     """Write a data set, or go on with one that was cut short.
 
@@ -152,7 +153,8 @@ def generate(
         quiet: no progress bar.
         strategy: another way to draw trajectories than `simulate`, and its name, by
             which the card knows it.
-        mapper: where chunks are drawn: here, one after the other, or as `ray_map` does.
+        mapper: where chunks are drawn: here, each while the one before is written, or as
+            `ray_map` does.
 
     Raises:
         ValueError: the folder cannot be written or holds data of another card.
