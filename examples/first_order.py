@@ -69,6 +69,9 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
     optimizer = Adam(policy.mlp.parameters(), cfg.lr)
     schedule = LinearLR(optimizer, 1.0, end_factor=0.02, total_iters=cfg.updates)
     windows = max(1, cfg.episode // cfg.window)
+    turn = (
+        torch.arange(cfg.num_envs) % windows
+    )  # every update has all parts of episodes
     rewards, best = [], -float("inf")
     now, recent = env.reset(), None
     progress = trange(1, cfg.updates + 1, unit="window")
@@ -81,10 +84,7 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
             optimizer.step()
         schedule.step()
         rewards.append(float(reward.detach()))
-        if update % windows == 0:
-            now, recent = env.reset(), None
-        else:  # where the window ended, but without its graph
-            now = env.reset(env.state.detach(), set_state=True)
+        now, recent = go_on(env, recent, policy.memory, (update + turn) % windows == 0)
         if update % cfg.evaluate_every == 0 or update == cfg.updates:
             where = cfg.task, make_actor(policy), ["nerd"]
             earned = transfer(*where, min(256, cfg.episodes), seed=cfg.seed + 1)
@@ -98,14 +98,52 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
 def window_reward(
     env: NeRDEnv, policy: Policy, now: TensorDictBase, recent: Tensor | None, steps: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Mean reward of the policy's mean actions, with gradients, and what it saw last."""
+    """Mean reward of the policy's mean actions, with gradients, and what it saw last.
+
+    Args:
+        env: learned dynamics that are differentiable.
+        policy: what acts.
+        now: what the env gave last.
+        recent: ``(num_envs, memory * D)``, what the policy saw last; None at the start.
+        steps: how many actions.
+    """
     total = torch.zeros(())
     for _ in range(steps):
         recent = recall(recent, now["observation"], policy.memory)
         mean, _ = policy(recent)
+        if mean.requires_grad:
+            mean.register_hook(bound_rows)
         now = env.step(now.set("action", mean.tanh()))["next"]
         total = total + now["reward"].mean()
     return total / steps, None if recent is None else recent.detach()
+
+
+def bound_rows(gradient: Tensor, times: float = 4.0) -> Tensor:
+    """Gradients ``(num_envs, num_actions)``, no row longer than 4 times the median one.
+
+    Where an arm is near chaos its gradient grows with every step that it goes back
+    through, and one such row would point the whole batch its way. What is no number
+    counts nothing.
+    """
+    gradient = gradient.nan_to_num(0.0, 0.0, 0.0)
+    length = gradient.norm(dim=-1, keepdim=True)
+    bound = times * length.median()
+    return gradient * (bound / length.clamp_min(1e-30)).clamp_max(1.0)
+
+
+def go_on(
+    env: NeRDEnv, recent: Tensor | None, memory: int, ended: Tensor
+) -> tuple[TensorDictBase, Tensor | None]:
+    """Where the window ended, without its graph; rows ``ended (num_envs,)`` begin anew."""
+    state = env.state.detach()
+    if ended.any():
+        env.reset()
+        state = env.state.where(ended, state)
+    now = env.reset(state, set_state=True)
+    if recent is not None:
+        first = recall(None, now["observation"], memory)
+        recent = torch.where(ended[:, None], first, recent)
+    return now, recent
 
 
 def main(cfg: Config) -> None:

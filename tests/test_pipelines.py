@@ -255,7 +255,46 @@ def test_windows_go_on_where_the_last_one_ended(example, generator):
     for _ in range(2):
         part, recent = first_order.window_reward(env, policy, now, recent, 3)
         parts.append(part)
-        now = env.reset(env.state.detach(), set_state=True)
+        ended = torch.zeros(4, dtype=torch.bool)
+        now, recent = first_order.go_on(env, recent, policy.memory, ended)
     torch.testing.assert_close(sum(parts) / 2, whole)
     gradients = torch.autograd.grad(whole, list(policy.mlp.parameters()))
     assert all(gradient.any() for gradient in gradients)
+
+
+def test_rows_whose_episode_ended_begin_anew_and_the_others_go_on(example, seed):
+    first_order = example("first_order")
+    model = from_pretrained("franka").requires_grad_(False)
+    env = NeRDEnv("franka/reach", model, 6, seed, differentiable=True)
+    policy = first_order.make_policy(first_order.Config(num_envs=6), env)
+    _, recent = first_order.window_reward(env, policy, env.reset(), None, 4)
+    before, ended = env.state, torch.arange(6) % 2 == 0
+    now, seen = first_order.go_on(env, recent, policy.memory, ended)
+    assert not any(x.requires_grad for x in now.values(True, True))
+    assert torch.equal(now["qpos"][~ended], before["qpos"][~ended])
+    assert torch.equal(now["goal"][~ended], before["goal"][~ended])
+    assert torch.equal(seen[~ended], recent[~ended])
+    assert not now["qvel"][ended].any()  # at rest, as episodes of this task begin
+    assert (now["goal"] != before["goal"])[ended].all()
+    first = now["observation"].tile(policy.memory)
+    assert torch.equal(seen[ended], first[ended])
+
+
+def test_no_row_points_the_batch_its_way(example, generator):
+    """Rows near chaos are shortened, others left alone to the bit."""
+    bound_rows = example("first_order").bound_rows
+    gradient = torch.randn(65, 7, dtype=torch.float64, generator=generator)
+    gradient /= gradient.norm(dim=-1, keepdim=True)
+    gradient *= torch.linspace(0.5, 1.5, 65, dtype=torch.float64)[:, None]
+    assert torch.equal(bound_rows(gradient), gradient)
+    wild = gradient.clone()
+    wild[:4] *= torch.tensor([1e3, 1e30, 1e150, 20.0], dtype=torch.float64)[:, None]
+    wild[4, 2], wild[5, 1] = torch.nan, torch.inf
+    found = bound_rows(wild)
+    assert found.isfinite().all() and torch.equal(found[6:], wild[6:])
+    median = wild.nan_to_num(0.0, 0.0, 0.0).norm(dim=-1).median()
+    assert (found.norm(dim=-1) < 4.0 * median * (1 + 1e-9)).all()
+    along = (found[:4] * gradient[:4]).sum(-1)  # their direction stays
+    torch.testing.assert_close(
+        along, found[:4].norm(dim=-1) * gradient[:4].norm(dim=-1)
+    )
