@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check model-anymal model-ant-mlp model-anymal-mlp model-double_pendulum-mlp format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -63,22 +63,6 @@ bench-check: $(STAMP) ## whether anything got slower, against a baseline of rati
 
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained
-
-model-anymal: $(STAMP) ## ANYmal: learned, tried by two policies, learned anew with what these do
-	$(NERD) data anymal --trajectories 15000 --out datasets/anymal
-	$(NERD) train anymal --data datasets/anymal --out runs/anymal_random
-	for task in forward sideways; do \
-		$(PY) examples/ppo.py --task anymal/$$task --dynamics runs/anymal_random/last \
-			--out runs/ppo_$$task --horizon 16 --minibatch 8192 --lr 1e-3 \
-			--total-frames 8000000 --episodes 512 --compile || exit 1; \
-	done
-	$(NERD) data anymal --policy runs/ppo_forward --trajectories 2500 --seed 11 \
-		--out datasets/anymal_forward
-	$(NERD) data anymal --policy runs/ppo_sideways --trajectories 2500 --seed 11 \
-		--out datasets/anymal_sideways
-	$(NERD) train anymal --out runs/anymal \
-		--data datasets/anymal datasets/anymal_forward datasets/anymal_sideways
-	cp runs/anymal/last/* $(PRETRAINED)/anymal/
 
 model-ant-mlp: $(STAMP) ## the Ant's network alone: learned, tried by a policy, learned on
 	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp

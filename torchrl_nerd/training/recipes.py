@@ -98,7 +98,12 @@ RECIPES: dict[str, Recipe] = {
         bf16_share=0.85,
     ),
     "anymal": _grounded(
-        "anymal/forward", 15_000, 20_000, validate_every=4_000, bf16_share=0.8
+        "anymal/forward",
+        20_000,
+        20_000,
+        "grounded-halves",
+        validate_every=4_000,
+        bf16_share=0.8,
     ),
     "franka": _free("franka/reach_torque"),
     "franka_gravity": replace(
