@@ -1,9 +1,10 @@
-"""Open-loop error against the size of the data and of the model, Cartpole by default.
+"""Open-loop error against data, updates and the size of the model, Cartpole by default.
 
     python benchmarks/scaling_error.py
 
-Starts the same training for every size of data at one network, then for every network at
-one size of data; what is finished is read, so that a run that was cut short goes on.
+Trains one network on every size of data and by every number of updates, then all others on
+most data by most updates; what is finished is read, so that a run that was cut short goes
+on.
 """
 
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ import tyro
 from tensordict import TensorDict
 from torch import Generator
 
-from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd.checkpoint import CARD, load_checkpoint
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import passive_errors
@@ -36,12 +37,12 @@ class Options:
 
     scene: str = "cartpole"
     trajectories: tuple[int, ...] = (20, 100, 500, 2500)
-    """Sizes of data, of 100 transitions each; the largest is that of all networks."""
+    """Sizes of data, of 100 transitions each; the largest is that of all others."""
     networks: tuple[str, ...] = ("mlp-nano", "mlp-tiny", "mlp")
-    """Beside the first one, which sees all sizes of data."""
+    """Beside the first one, by the largest data and the most updates."""
     first: str = "mlp-micro"
-    updates: int = 3_000
-    """On 1,024 single states each."""
+    updates: tuple[int, ...] = (300, 1_000, 3_000)
+    """On 1,024 single states each; the largest number is that of all others."""
     rows: int = 256
     """Trajectories of the test."""
     horizons: tuple[int, ...] = (100, 500)
@@ -53,23 +54,23 @@ class Options:
 
 
 def measure(
-    data: TensorDict, network: str, trajectories: int, options: Options
+    data: TensorDict, network: str, trajectories: int, updates: int, options: Options
 ) -> dict[str, Any]:
     """Figures of one training, made as far as they are not there."""
-    folder = options.out / options.scene / f"{network}_{trajectories}_{options.seed}"
-    settings = {"updates": options.updates, "rows": options.rows}
-    settings |= {"horizons": list(options.horizons)}
+    name = f"{network}_{trajectories}_{updates}_{options.seed}"
+    folder = options.out / options.scene / name
+    settings = {"rows": options.rows, "horizons": list(options.horizons)}
     path = folder / "figures.json"
     if path.exists() and read_json(path)["settings"] == settings:
         return read_json(path)
     scene, recipe = load_scene(options.scene), recipe_of(options.scene)
     config = TrainConfig(
         network=network,
-        steps=options.updates,
+        steps=updates,
         rollout_steps=0,
         single_share=1.0,
         softening=recipe.train.softening,
-        validate_every=options.updates,
+        validate_every=updates,
         seed=options.seed,
     )
     some = cast(TensorDict, data[:trajectories])
@@ -88,6 +89,8 @@ def measure(
         "network": network,
         "parameters": sum(w.numel() for w in model.network.parameters()),
         "transitions": some.numel(),
+        "updates": updates,
+        "seconds": read_json(folder / "last" / CARD)["training"]["seconds"],
         "errors": {
             str(horizon): {name: asdict(e) for name, e in by_name.items()}
             for horizon, by_name in errors.items()
@@ -99,15 +102,17 @@ def measure(
 
 
 def run(options: Options) -> Iterator[dict[str, Any]]:
-    """Figures of every size of data, then of every size of network."""
-    largest = max(options.trajectories)
+    """Figures of every size of data, every number of updates, every network."""
+    largest, longest = max(options.trajectories), max(options.updates)
     generator = Generator().manual_seed(options.seed)
     data = simulate(load_scene(options.scene), largest, STEPS, generator)
     data = cast(TensorDict, data[is_sound(data)])
     for trajectories in options.trajectories:
-        yield measure(data, options.first, trajectories, options)
+        yield measure(data, options.first, trajectories, longest, options)
+    for updates in sorted(set(options.updates) - {longest}):
+        yield measure(data, options.first, largest, updates, options)
     for network in options.networks:
-        yield measure(data, network, largest, options)
+        yield measure(data, network, largest, longest, options)
 
 
 def main(options: Options) -> list[dict[str, Any]]:
@@ -121,9 +126,10 @@ def main(options: Options) -> list[dict[str, Any]]:
             for name, e in by_name.items()
         )
         sizes = (
-            f"{figures['parameters']:>9,} weights {figures['transitions']:>9,} steps"
+            f"{figures['parameters']:>9,} weights {figures['transitions']:>9,} steps "
+            f"{figures['updates']:>6,} updates {figures['seconds']:>5.0f} s"
         )
-        print(f"{figures['network']:<10}{sizes}  {errors}", flush=True)
+        print(f"{figures['network']:<16}{sizes}  {errors}", flush=True)
         if options.json is not None:
             threads = torch.get_num_threads()
             write_json(options.json, {"threads": threads, "models": found})

@@ -37,17 +37,19 @@ def test_contacts_are_those_of_mujoco(generator):
 
 def test_a_size_that_was_measured_is_read(seed, tmp_path, monkeypatch):
     options = scaling_error.Options(
-        trajectories=(2, 3), networks=("mlp-nano",), updates=1, rows=2, seed=seed
+        trajectories=(2, 3), networks=("mlp-nano",), updates=(1, 2), rows=2, seed=seed
     )
     options.out, options.horizons = tmp_path, (1,)
     first = scaling_error.main(options)
-    assert [(x["network"], x["transitions"]) for x in first] == [
-        ("mlp-micro", 200),
-        ("mlp-micro", 300),
-        ("mlp-nano", 300),
+    assert [(x["network"], x["transitions"], x["updates"]) for x in first] == [
+        ("mlp-micro", 200, 2),
+        ("mlp-micro", 300, 2),
+        ("mlp-micro", 300, 1),
+        ("mlp-nano", 300, 2),
     ]
+    assert all(x["seconds"] >= 0.0 for x in first)
     monkeypatch.setattr(scaling_error, "Trainer", None)  # nothing is trained again
     assert scaling_error.main(options) == first
-    options.updates = 2
+    options.updates = (3,)
     with pytest.raises(TypeError):
         scaling_error.main(options)
