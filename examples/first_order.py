@@ -69,9 +69,7 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
     optimizer = Adam(policy.mlp.parameters(), cfg.lr)
     schedule = LinearLR(optimizer, 1.0, end_factor=0.02, total_iters=cfg.updates)
     windows = max(1, cfg.episode // cfg.window)
-    turn = (
-        torch.arange(cfg.num_envs) % windows
-    )  # every update has all parts of episodes
+    turn = torch.arange(cfg.num_envs) % windows  # each update sees all of an episode
     rewards, best = [], -float("inf")
     now, recent = env.reset(), None
     progress = trange(1, cfg.updates + 1, unit="window")
@@ -119,7 +117,7 @@ def window_reward(
 
 
 def bound_rows(gradient: Tensor, times: float = 4.0) -> Tensor:
-    """Gradients ``(num_envs, num_actions)``, no row longer than 4 times the median one.
+    """Gradients ``(num_envs, num_actions)``, no row longer than ``times`` the median one.
 
     Where an arm is near chaos its gradient grows with every step that it goes back
     through, and one such row would point the whole batch its way. What is no number
