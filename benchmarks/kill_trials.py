@@ -14,7 +14,7 @@ import signal
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.data import generate as generation
+from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.generate import DataConfig, generate, load_data, simulate
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NETWORKS, NeRD
@@ -87,15 +88,14 @@ class Generating:
 
     def run(self, folder: Path, tell: Tell) -> None:
         """See `Work`."""
-        generation.CHUNK, scene, calls = CHUNK, load_scene(SCENE), [0]
+        generation.CHUNK = CHUNK
 
-        def draw(rows: int, steps: int, generator: Generator):  # noqa: ANN202
-            calls[0] += 1
-            if calls[0] > 2:  # an example, the first chunk; then one more is stored
-                tell()
-            return simulate(scene, rows, steps, generator)
+        def told(draw: Callable, chunks: Iterable) -> Iterator:
+            for data in ahead(draw, chunks):
+                yield data
+                tell()  # whoever asks for the next one has stored this one
 
-        generate(scene, DATA, folder, quiet=True, strategy=("told", draw))
+        generate(load_scene(SCENE), DATA, folder, quiet=True, mapper=told)
 
     def done(self, folder: Path) -> int:
         """See `Work`."""
