@@ -37,6 +37,8 @@ class Bench(DeviceCommand):
     """Processor threads; torch's own choice by default."""
     budget: tuple[float, ...] = ()
     """Largest mean errors, in the table's order: names the fastest row within them."""
+    without: tuple[str, ...] = ()
+    """Rows with one of these in their names take no part, as in --without mlp bf16."""
     plot: Path | None = None
     """Draw the race to this PNG."""
     quiet: bool = False
@@ -60,6 +62,7 @@ class Bench(DeviceCommand):
             self.threads,
             self.device,
             self.quiet,
+            self.without,
         )
         print(bench_table(report))
         for batch in self.batches if self.budget else ():

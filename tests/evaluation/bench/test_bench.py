@@ -71,6 +71,26 @@ def test_a_whole_race(name, tmp_path, monkeypatch):
     assert (tmp_path / "broken.png").exists()
 
 
+def test_who_is_left_out_takes_no_part(monkeypatch):
+    monkeypatch.setattr(rates, "VISIT", 0.01)
+    words = "MuJoCo x", "guarded", "bf16", "fine", "micro"
+    scene = load_scene("cartpole")
+    report = bench(
+        scene,
+        (2,),
+        rows=2,
+        rounds=1,
+        steps=2,
+        is_compiling=False,
+        threads=1,
+        without=words,
+    )
+    integrators = ("MuJoCo implicitfast", "MuJoCo RK4")
+    coarse = {f"{name} x{n}" for name in integrators for n in (1, 4)}
+    assert set(report.errors) == coarse | {"cartpole", "cartpole, window"}
+    assert set(report.rates[2]) == set(report.errors)
+
+
 def test_another_number_of_substeps_is_the_same_control_step(name, generator):
     scene = load_scene(name)
     for substeps in (1, 3, 16):
@@ -150,6 +170,8 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, rounds=0)
     with pytest.raises(ValueError, match="batch 0"):
         bench(scene, (0,))
+    with pytest.raises(ValueError, match="none without MuJoCo, cartpole"):
+        bench(scene, without=("MuJoCo", "cartpole"))
     other = load_scene("dm_control/cheetah-run")
     with pytest.raises(ValueError, match="no protocol for 'dm_control/cheetah-run'"):
         bench(other)

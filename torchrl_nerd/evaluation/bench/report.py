@@ -109,6 +109,7 @@ def bench(
     threads: int | None = None,
     device: torch.device | str = "cpu",
     quiet: bool = False,
+    without: Sequence[str] = (),
 ) -> BenchReport:
     """Race MuJoCo and the shipped models of a scene on this machine.
 
@@ -124,9 +125,10 @@ def bench(
         device: of learned models and of every state whose steps are timed; MuJoCo's
             states then travel to the processor and back within its time.
         quiet: no progress bars.
+        without: rows with one of these in their names take no part.
 
     Raises:
-        ValueError: a scene without a protocol, or a setting out of range.
+        ValueError: a scene without a protocol, a setting out of range, or nobody left.
     """
     expect_at_least(1, rounds=rounds, **{f"batch {b}": b for b in batches})
     expect_at_least(2, rows=rows)
@@ -137,7 +139,15 @@ def bench(
         torch.set_num_threads(threads)
     threads = torch.get_num_threads()
     protocol = PROTOCOLS[scene.name]()
-    everyone = contenders(scene, threads, is_compiling, device)
+    everyone = [
+        who
+        for who in contenders(scene, threads, is_compiling, device)
+        if not any(word in who.name for word in without)
+    ]
+    if not everyone:
+        raise ValueError(
+            f"expected rows to race, got none without {', '.join(without)}"
+        )
     ground = courses(protocol, rows, seed, threads, steps)
     errors = {
         who.name: contender_errors(who, ground)
