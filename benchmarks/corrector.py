@@ -35,7 +35,8 @@ from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import summarize
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, network_config
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training.losses import one_step_loss
 from torchrl_nerd.training.muon import Muon

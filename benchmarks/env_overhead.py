@@ -18,7 +18,8 @@ import tyro
 
 from torchrl_nerd import NeRDEnv
 from torchrl_nerd.files import write_json
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.tasks import make_task
 
 

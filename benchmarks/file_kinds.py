@@ -21,7 +21,8 @@ from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data, si
 from torchrl_nerd.data.recorded import load_tosses, read_transitions, write_tosses
 from torchrl_nerd.evaluation.policy import Policy, load_policy, save_policy
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.train_config import TrainConfig

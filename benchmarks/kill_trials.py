@@ -31,7 +31,8 @@ from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.generate import DataConfig, generate, load_data, simulate
 from torchrl_nerd.files import read_json, write_json
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.tensor_files import read_tensors
 from torchrl_nerd.training.train_config import TrainConfig

@@ -28,7 +28,8 @@ from torchrl_nerd.evaluation.bench.cost import memory_bytes
 from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_in_turn
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD, network_config
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.settings import expect_at_least
 

@@ -19,7 +19,8 @@ from tyro.conf import Positional
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_in_turn
 from torchrl_nerd.files import write_json
-from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import Scene, load_scene
 
 

@@ -28,7 +28,8 @@ from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.ground_step import GroundStep
-from torchrl_nerd.modules.nerd import NETWORKS, STEPS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS, STEPS
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.sequences import cover, data_stats

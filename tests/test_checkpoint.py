@@ -27,7 +27,7 @@ from torchrl_nerd.checkpoint import (
 )
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json, write_atomically, write_json
-from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import SCENES
 from torchrl_nerd.training.recipes import RECIPES
 from torchrl_nerd.training.train_config import TrainConfig

@@ -6,7 +6,7 @@ import scaling_error
 import torch
 from tensordict import TensorDict
 
-from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import load_scene
 
 

@@ -26,7 +26,8 @@ from torchrl_nerd.modules.correction import (
 )
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.grounded import GroundedNeRD
-from torchrl_nerd.modules.nerd import Config, NeRD, NetworkConfig
+from torchrl_nerd.modules.nerd import Config, NeRD
+from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene, is_import, load_scene

@@ -28,7 +28,8 @@ from torchrl_nerd.envs import GroundTruthEnv
 from torchrl_nerd.envs.memory import recall
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.geometry.manifold import differentiate_pos
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import load_scene
 from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
 from torchrl_nerd.seeds import stream

@@ -13,7 +13,8 @@ from torchrl_nerd.dynamics import (
     NeRDDynamics,
     UntrustedError,
 )
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 
 ROWS = 12
 GUARDS = ("flag", "truncate", "fallback")

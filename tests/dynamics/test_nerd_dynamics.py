@@ -19,7 +19,8 @@ from torch import Tensor
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import SCENES, load_scene
 
 ROWS, STEPS = 4, 14

@@ -6,7 +6,7 @@ import torch
 from torchrl_nerd.checkpoint import make_model
 from torchrl_nerd.evaluation.protocols import PROTOCOLS, protocol_of
 from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
-from torchrl_nerd.modules.nerd import NETWORKS, network_config
+from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.tasks import TASKS, make_task
 from torchrl_nerd.training.recipes import RECIPES, recipe_of

@@ -29,7 +29,7 @@ from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.grounded import GroundedNeRD
-from torchrl_nerd.modules.nerd import STEPS
+from torchrl_nerd.modules.networks import STEPS
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training.sequences import cover
 from torchrl_nerd.training.start import begin_from

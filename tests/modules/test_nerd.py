@@ -10,7 +10,9 @@ from dynamics_helpers import random_drive, random_model, scene_stats
 from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.modules.nerd import NETWORKS, TARGET, NeRD, SceneTokens
+from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.modules.networks import NETWORKS
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.transforms import (
     ContactFeatures,

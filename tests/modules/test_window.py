@@ -5,7 +5,7 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
-from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.window import WindowNetwork
 
 INPUTS, OUTPUTS, ROWS, STEPS = 5, 3, 4, 24

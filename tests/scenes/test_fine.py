@@ -17,7 +17,8 @@ from torchrl_nerd.checkpoint import (
 from torchrl_nerd.data.generate import DataConfig, generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 
 
 @every_scene

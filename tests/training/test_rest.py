@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import SCENES
 from torchrl_nerd.training.rest import LARGEST, ROWS, STILL, find_rest, resting
 

@@ -16,7 +16,8 @@ from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.correction import ResidualConfig
-from torchrl_nerd.modules.nerd import NETWORKS, NeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.scenes import SCENES, load_scene
 from torchrl_nerd.training import trainer

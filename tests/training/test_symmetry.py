@@ -9,7 +9,9 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.frames import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.baselines import MLPConfig
-from torchrl_nerd.modules.nerd import NETWORKS, TARGET, TOKEN, NeRD, SceneTokens
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.networks import NETWORKS
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene, load_scene
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.images import Images

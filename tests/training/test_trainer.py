@@ -13,7 +13,7 @@ from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
 from torchrl_nerd.files import read_json
-from torchrl_nerd.modules.nerd import NETWORKS
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.training.log import TrainingLog

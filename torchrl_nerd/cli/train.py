@@ -17,7 +17,8 @@ from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
 from torchrl_nerd.data.generate import CARD, generate, load_data_sets
 from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.files import read_json, writable_folder
-from torchrl_nerd.modules.nerd import NeRD, network_config
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName

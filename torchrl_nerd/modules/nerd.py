@@ -7,63 +7,14 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
-from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.coverage import Coverage
 from torchrl_nerd.modules.flight import Flight
-from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.settings import SettingError
-from torchrl_nerd.transforms import (
-    ContactFeatures,
-    Normalize,
-    RobotCentric,
-    StateDelta,
-    Stats,
-)
-
-NetworkConfig = TransformerConfig | MLPConfig | GRUConfig | FreeConfig | GroundedConfig
-
-NETWORKS: dict[str, NetworkConfig] = {
-    **PRESETS,
-    "mlp-nano": MLPConfig(depth=1, width=16),
-    "mlp-micro": MLPConfig(depth=1, width=32),
-    "mlp-tiny": MLPConfig(depth=2, width=32),
-    "mlp": MLPConfig(),
-    "mlp-wide": MLPConfig(depth=4, width=120),
-    "mlp-large": MLPConfig(depth=4, width=128),
-    "mlp-larger": MLPConfig(depth=4, width=160),
-    "gru": GRUConfig(),
-}
-"""Networks by name, for the command line."""
-
-STEPS: dict[str, NetworkConfig] = {
-    "free": FreeConfig(),
-    "grounded": GroundedConfig(),
-    "grounded-halves": GroundedConfig(parts=2),
-    "grounded-small": GroundedConfig(depth=1, width=16, looks=1),
-    "grounded-fast": GroundedConfig(looks=1, stride=2),
-    "grounded-fine": GroundedConfig(looks=3),
-}
-"""Those that correct a step: of a `FreeNeRD`, for robots that nothing touches, and of a
-`GroundedNeRD`, for robots on springs."""
+from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 TOKEN, TARGET = "token", "target"
 LARGEST = 1e6  # of what a simulator within foresees, normalised
-
-
-def network_config(name: str) -> NetworkConfig:
-    """The network of that name in `NETWORKS` or `STEPS`.
-
-    Raises:
-        SettingError: no such network.
-    """
-    known = NETWORKS | STEPS
-    if name not in known:
-        raise SettingError(
-            f"unknown network '{name}', expected one of {', '.join(known)}"
-        )
-    return known[name]
 
 
 class Memory(Protocol):
@@ -114,7 +65,7 @@ class NeRD(nn.Module):
         scene: Scene,
         config: Config,
         stats: Mapping[NestedKey, Stats] | None = None,
-        tokens: "SceneTokens | None" = None,
+        tokens: SceneTokens | None = None,
         state_delta: StateDelta | None = None,
     ) -> None:
         super().__init__()
@@ -258,41 +209,6 @@ class NeRD(nn.Module):
     def device(self) -> torch.device:
         """Where it computes."""
         return next(self.network.parameters()).device
-
-
-class SceneTokens(nn.Module):
-    """The features of a scene as one vector per state.
-
-    `RobotCentric`, torques and `ContactFeatures`, in this order.
-
-    Args:
-        scene: the robot.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        super().__init__()
-        self.robot = RobotCentric(scene)
-        self.contact = ContactFeatures(scene)
-        widths = (*self.robot.sizes.values(), *self.contact.sizes.values())
-        self.size = sum(widths)
-
-    def gap(self, raw: Tensor) -> Tensor:
-        """Between contact points and the ground, m, ``(*batch, P)``, of raw tokens.
-
-        Far ones are farther away than they show.
-        """
-        contact = self.contact
-        first = self.size - sum(contact.sizes.values())
-        beyond = raw[..., first : first + contact.count]
-        return beyond + (contact.margins - contact.radii)
-
-    def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
-    ) -> Tensor:
-        """Raw tokens ``(*batch, F)`` in the dtype of the state."""
-        state = self.robot.state_features(qpos, qvel)
-        contacts = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
-        return torch.cat((state, joint_torque, *contacts), -1)
 
 
 def unit_stats(size: int) -> Stats:

@@ -9,7 +9,8 @@ from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneTokens
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.images import Images, telling_rows

@@ -6,13 +6,8 @@ from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import make_model
 from torchrl_nerd.modules.correction import GroundedConfig
-from torchrl_nerd.modules.nerd import (
-    NETWORKS,
-    STEPS,
-    Config,
-    NeRD,
-    network_config,
-)
+from torchrl_nerd.modules.nerd import Config, NeRD
+from torchrl_nerd.modules.networks import NETWORKS, STEPS, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import Symmetry, data_stats
 

@@ -7,8 +7,10 @@ from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.evaluation.system_identification import PUBLISHED
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
 from torchrl_nerd.modules.correction import ResidualConfig
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneTokens, network_config
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.modules.residual import ResidualNeRD
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.cube import HALF
 from torchrl_nerd.training.finetune import FineTuner

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from torchrl_nerd.modules.nerd import network_config
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.settings import expect_at_least
 
 COUNTS = (

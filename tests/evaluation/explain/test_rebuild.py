@@ -19,7 +19,7 @@ from torchrl_nerd.evaluation.explain.rebuild import (
 from torchrl_nerd.evaluation.explain.states import draw_states
 from torchrl_nerd.geometry.frames import matrix_from_quat
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import SceneTokens
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 
 ROWS = 200
 

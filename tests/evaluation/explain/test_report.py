@@ -5,7 +5,7 @@ from helpers import every_scene
 
 from torchrl_nerd.evaluation.explain.report import explain
 from torchrl_nerd.evaluation.explain.table import report_table
-from torchrl_nerd.modules.nerd import SceneTokens
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 
 ROWS = 300
 

@@ -28,7 +28,7 @@ from torchrl_nerd.geometry.frames import (
 )
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import SceneTokens
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import StateDelta
 

@@ -25,7 +25,7 @@ from torchrl_nerd.keys import (
     ROBOT_TORQUE,
     TERRAIN,
 )
-from torchrl_nerd.modules.nerd import SceneTokens
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 
 LINEAR, ANGULAR = "base linear velocity", "base angular velocity"

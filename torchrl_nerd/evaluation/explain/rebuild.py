@@ -37,7 +37,7 @@ from torchrl_nerd.evaluation.explain.paper_input import (
 )
 from torchrl_nerd.geometry.frames import rotate, wrap_angle
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import SceneTokens
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 
 

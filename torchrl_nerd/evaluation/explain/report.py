@@ -24,7 +24,7 @@ from torchrl_nerd.evaluation.explain.rebuild import Piece, rebuild_errors
 from torchrl_nerd.evaluation.explain.states import draw_states
 from torchrl_nerd.evaluation.explain.timing import StepTime, time_inputs
 from torchrl_nerd.keys import QPOS, TERRAIN
-from torchrl_nerd.modules.nerd import network_config
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.explain import SolverReport
 from torchrl_nerd.settings import expect_at_least

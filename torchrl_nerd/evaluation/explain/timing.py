@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchrl_nerd.evaluation.explain.paper_input import PaperInput
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import SceneTokens, network_config
+from torchrl_nerd.modules.networks import network_config
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 
 ROUNDS = 40
