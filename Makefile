@@ -41,8 +41,10 @@ $(STAMP):
 	$(PIP) --no-deps "$(DM_CONTROL)"
 	@rm -f $(VENV)/.installed-* && touch $@
 
+# Threads that soon fall asleep: beside other work the longer wait of GNU's OpenMP takes
+# up to thirty times as long, see docs/howto/machine.md.
 demo: $(STAMP) ## learn a swing-up in learned dynamics, check it in true physics
-	$(PY) examples/ppo.py
+	GOMP_SPINCOUNT=1000 $(PY) examples/ppo.py
 
 test: check ## lint, types and the test suite
 	$(PYTEST) -n $(WORKERS) $(ARGS)
