@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from shutil import copyfile
 
+import equal_error
 import pytest
 import stability_table
 import torch
@@ -260,6 +261,12 @@ def test_the_tables_of_hard_cases_are_what_was_measured():
     page = (ROOT / "docs" / "stability.md").read_text()
     assert stability_table.with_lines(found) in page
     assert stability_table.without_lines(found) in page
+
+
+def test_the_table_of_equal_error_is_what_was_measured():
+    found = equal_error.read(ROOT / "docs" / "figures")
+    page = (ROOT / "docs" / "performance.md").read_text()
+    assert equal_error.table(found) in page
 
 
 def test_the_site_shows_every_page_once():

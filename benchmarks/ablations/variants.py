@@ -68,6 +68,10 @@ COMMON = {
     "no input normalisation": Variant("features in their own units", raw=(TOKEN,)),
     "no output normalisation": Variant("targets in their own units", raw=(TARGET,)),
     "full features": Variant("the paper's input, whole", tokens=features.PaperTokens),
+    "no foresight": Variant(
+        "no forces foreseen, depths to come at constant velocity",
+        tokens=features.straight,
+    ),
 }
 
 NETWORKS = {
@@ -86,10 +90,6 @@ NETWORKS = {
 VARIANTS: Mapping[str, Mapping[str, Variant]] = {
     "double_pendulum": {
         **COMMON,
-        "no foresight": Variant(
-            "no forces foreseen, depths to come at constant velocity",
-            tokens=features.straight,
-        ),
         "link frame": Variant(
             "contacts in the first link's frame", tokens=features.LinkTokens
         ),
@@ -109,6 +109,7 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = {
         "quaternion": Variant(
             "the base's turn as four numbers", target=targets.QuaternionDelta
         ),
+        **NETWORKS,
     },
 }
 """Scene -> name -> variant; the order is that of the tables."""

@@ -1,0 +1,62 @@
+"""Tables of speed: rates at equal error, and what an early exit could spare."""
+
+import early_exit
+import equal_error
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_nerd.modules.free_step import FreeStep
+from torchrl_nerd.scenes import load_scene
+
+
+def race(learned: tuple[float, float], *true: tuple[float, float]) -> dict:
+    """What `nerd bench` writes of one model and MuJoCo's rows: error and rate of each."""
+    names = ["cube, compiled", *(f"MuJoCo x{n}" for n in range(len(true)))]
+    pairs = dict(zip(names, (learned, *true), strict=True))
+    rates = {
+        k: {"steps_per_s": s, "envs_per_s": 0.5 * s} for k, (_, s) in pairs.items()
+    }
+    errors = {k: {"position": {"mean": e}} for k, (e, _) in pairs.items()}
+    return {"scene": "cube", "errors": errors, "rates": {"8": rates}}
+
+
+def test_mujoco_s_rate_at_an_error_is_on_its_front(generator):
+    """Rates that are a power of the error stay so between rows; worse rows do not count."""
+    power, scale, at = (1.0 + torch.rand(3, generator=generator)).tolist()
+    true = [(error, scale * error**power) for error in (1.0, 2.0, 4.0)]
+    dominated = (3.0, 0.5 * scale)
+    (found,) = equal_error.ratios(race((at, 7.0), *true, dominated))
+    assert (found.scene, found.model, found.batch) == ("cube", "cube", 8)
+    expected = 7.0 / (scale * at**power)
+    assert found.alone == pytest.approx((expected, expected))
+    assert found.in_env == pytest.approx((expected, expected))
+
+
+def test_beyond_mujoco_s_rows(generator):
+    """Less exact than all of them counts against the fastest; more exact has no rival."""
+    fastest = float(1.0 + torch.rand((), generator=generator))
+    true = [(1.0, 0.5 * fastest), (2.0, fastest), (None, 9.0)]
+    (found,) = equal_error.ratios(race((5.0, 3.0), *true))
+    assert found.alone == pytest.approx((3.0 / fastest, 3.0 / fastest))
+    (found,) = equal_error.ratios(race((0.5, 3.0), *true))
+    assert "so exact" in equal_error.written(found.alone)
+
+
+def test_who_flies_and_who_rests(generator):
+    scene = load_scene("cube")
+    state = TensorDict(scene.sample_initial(3, generator)[0], [3])
+    state["qpos"][:, 2] = torch.tensor([5.0, 0.0, 0.0]).double()
+    state["qvel"][2] = 0.0
+    clear, slow = early_exit.kinds(FreeStep(scene), scene, state, None)
+    assert clear.tolist() == [True, False, False]
+    assert slow.tolist() == [False, False, True]
+
+
+def test_shares_of_a_scene(seed, tmp_path):
+    path = tmp_path / "shares.json"
+    options = early_exit.Options(("cube",), rows=3, seed=seed, json=path)
+    (found,) = early_exit.main(options)  # a cube has no motors
+    assert found.drive == "passive" and found.steps == 80
+    assert 0.0 < found.flying < 1.0 and found.resting >= 0.0
+    assert found.bound >= 1.0 and path.exists()
