@@ -42,5 +42,10 @@ def plot_ratios(rows: Sequence[Row], path: Path) -> None:
         axes.invert_yaxis()
         axes.margins(x=0.12)
         axes.set(xscale="log", xlabel=f"{case}: mean error in the base's")
-        axes.tick_params(labelsize=8)
+        for formatter in (
+            axes.xaxis.set_major_formatter,
+            axes.xaxis.set_minor_formatter,
+        ):
+            formatter("{x:g}")
+        axes.tick_params(which="both", labelsize=8)
     save_figure(figure, path)
