@@ -1,9 +1,14 @@
 """Tables of speed: rates at equal error, and what an early exit could spare."""
 
+import json
+import shutil
+
+import draw_races
 import early_exit
 import equal_error
 import pytest
 import torch
+from stability_table import FIGURES
 from tensordict import TensorDict
 
 from torchrl_nerd.modules.free_step import FreeStep
@@ -60,3 +65,16 @@ def test_shares_of_a_scene(seed, tmp_path):
     assert found.drive == "passive" and found.steps == 80
     assert 0.0 < found.flying < 1.0 and found.resting >= 0.0
     assert found.bound >= 1.0 and path.exists()
+
+
+def test_an_arm_s_race_is_drawn_of_its_ends(tmp_path):
+    path = FIGURES / "bench_franka.json"
+    report = draw_races.BenchReport.from_figures(json.loads(path.read_text()))
+    assert draw_races.with_ends(report).quantities == ["joint1", "joint7"]
+    shutil.copy(path, tmp_path)
+    (tmp_path / "bench_other.json").write_text(
+        json.dumps(draw_races.replace(report, rates={8: report.rates[512]}).figures())
+    )
+    drawn = draw_races.main(draw_races.Options(tmp_path))  # the other has no such batch
+    assert drawn == [tmp_path / "bench_franka.png"]
+    assert drawn[0].read_bytes().startswith(b"\x89PNG")

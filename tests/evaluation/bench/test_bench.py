@@ -25,7 +25,7 @@ from torchrl_nerd.evaluation.bench.errors import (
 from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
 from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.rates import states_on_the_way
-from torchrl_nerd.evaluation.bench.report import bench
+from torchrl_nerd.evaluation.bench.report import BenchReport, bench
 from torchrl_nerd.evaluation.bench.table import bench_table
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import open_loop
@@ -60,7 +60,8 @@ def test_a_whole_race(name, tmp_path, monkeypatch):
         assert all(math.isfinite(error.mean) for error in errors.values())
     text = bench_table(report)
     assert all(row in text for row in expected)
-    json.dumps(report.figures())
+    read = json.loads(json.dumps(report.figures()))
+    assert BenchReport.from_figures(read) == report
     plot_race(report, tmp_path / "race.png")
     assert (tmp_path / "race.png").read_bytes().startswith(b"\x89PNG")
     for quantity in report.quantities:

@@ -1,8 +1,9 @@
 """The race of a scene: rows of error and rate, their front, and whom to ship."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any
 
 import mujoco
@@ -20,6 +21,7 @@ from torchrl_nerd.evaluation.bench.errors import (
 from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
 from torchrl_nerd.evaluation.bench.rates import Rate, rates, states_on_the_way
 from torchrl_nerd.evaluation.protocols import PROTOCOLS, Protocol
+from torchrl_nerd.evaluation.rollout_error import ErrorSummary
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
@@ -96,6 +98,34 @@ class BenchReport:
             for batch in self.rates
         }
         return asdict(self) | {"fronts": fronts, "within_paper": choices}
+
+    @classmethod
+    def from_figures(cls, figures: Mapping[str, Any]) -> "BenchReport":
+        """The report whose `figures` these are, as read from JSON; null is infinity."""
+
+        def errors(found: Mapping[str, Any]) -> dict[str, Errors]:
+            return {
+                name: {quantity: _summary(e) for quantity, e in row.items()}
+                for name, row in found.items()
+            }
+
+        rates = {
+            int(batch): {name: Rate(**rate) for name, rate in found.items()}
+            for batch, found in figures["rates"].items()
+        }
+        flops = figures["matrix_flop_per_s"].items()
+        return cls(
+            scene=figures["scene"],
+            steps=figures["steps"],
+            rows=figures["rows"],
+            errors=errors(figures["errors"]),
+            floors=errors(figures["floors"]),
+            rates=rates,
+            costs={name: Cost(**cost) for name, cost in figures["costs"].items()},
+            matrix_flop_per_s={int(batch): flop for batch, flop in flops},
+            published=figures["published"],
+            machine=figures["machine"],
+        )
 
 
 def bench(
@@ -182,6 +212,11 @@ def bench(
             "mujoco": mujoco.__version__,
         },
     )
+
+
+def _summary(error: Mapping[str, Any]) -> ErrorSummary:
+    found: dict[str, Any] = {k: inf if x is None else x for k, x in error.items()}
+    return ErrorSummary(**found)
 
 
 def _device_name(device: torch.device | str) -> str:
