@@ -5,17 +5,16 @@
 A picture beside every race of 512 rows; of an arm, first and last joint.
 """
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
+from equal_error import ROWS, races
 from stability_table import FIGURES
 
 from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.report import BenchReport
 
-ROWS = 512
 MOST_PANELS = 3
 
 
@@ -44,8 +43,7 @@ def with_ends(report: BenchReport) -> BenchReport:
 def main(options: Options) -> list[Path]:
     """Draw them; returns where."""
     drawn = []
-    for path in sorted(options.folder.glob("bench_*.json")):
-        report = BenchReport.from_figures(json.loads(path.read_text()))
+    for path, report in races(options.folder).items():
         if ROWS in report.rates:
             picture = path.with_suffix(".png")
             plot_race(with_ends(report), picture)

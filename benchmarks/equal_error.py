@@ -8,21 +8,22 @@ same race: between two rows of it on a straight line in the logarithms of error 
 beyond its fastest row at that row's.
 """
 
-import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import exp, isfinite, log
+from math import exp, inf, isfinite, log
 from pathlib import Path
-from typing import Any
 
 import tyro
 from stability_table import FIGURES
 
 from torchrl_nerd.evaluation.bench.pareto import pareto_front
+from torchrl_nerd.evaluation.bench.report import BenchReport
+from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import load_scene
 
 WAY = ", compiled"  # how a model runs in this table, in float32
 RATES = ("steps_per_s", "envs_per_s")
+ROWS = 512  # the batch of most races
 
 Point = tuple[float, float]
 """Error, and steps per second."""
@@ -66,48 +67,45 @@ def rate_at(error: float, points: Mapping[str, Point]) -> float:
     return exp((1.0 - share) * log(slow) + share * log(fast))
 
 
-def ratios(race: Mapping[str, Any]) -> Iterator[Ratio]:
+def ratios(report: BenchReport) -> Iterator[Ratio]:
     """Of every model of one race, batch by batch."""
-    errors = {name: _means(found) for name, found in race["errors"].items()}
-    true = [name for name in errors if name.startswith("MuJoCo")]
-    for batch, rates in race["rates"].items():
-        for name in errors:
-            if not name.endswith(WAY):
-                continue
-
-            def spread(
-                kind: str, name: str = name, rates: Mapping[str, Any] = rates
-            ) -> tuple[float, float]:
-                found = []
-                for quantity, error in errors[name].items():
-                    points = {x: (errors[x][quantity], rates[x][kind]) for x in true}
-                    rival = rate_at(error, points)
-                    own = rates[name][kind]
-                    found.append(own / rival if rival else float("inf"))
-                return min(found), max(found)
-
-            model = name.removesuffix(WAY)
-            yield Ratio(race["scene"], model, int(batch), *map(spread, RATES))
+    for batch in report.rates:
+        for name in report.errors:
+            if name.endswith(WAY):
+                both = (spread(report, batch, name, kind) for kind in RATES)
+                yield Ratio(report.scene, name.removesuffix(WAY), batch, *both)
 
 
-def _means(found: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Mean error of every quantity; what is no number was not finite."""
-    means = {name: error["mean"] for name, error in found.items()}
-    return {name: float("inf") if x is None else x for name, x in means.items()}
+def spread(
+    report: BenchReport, batch: int, name: str, kind: str
+) -> tuple[float, float]:
+    """Smallest and largest ratio of a row's rate over the quantities that err."""
+    rates = {row: getattr(rate, kind) for row, rate in report.rates[batch].items()}
+    true = [row for row in report.errors if row.startswith("MuJoCo")]
+    found = []
+    for quantity, error in report.errors[name].items():
+        points = {x: (report.errors[x][quantity].mean, rates[x]) for x in true}
+        rival = rate_at(error.mean, points)
+        found.append(rates[name] / rival if rival else inf)
+    return min(found), max(found)
 
 
 def table(found: list[Ratio]) -> str:
     """Markdown, smallest robots first."""
-    size: Callable[[Ratio], int] = lambda x: load_scene(x.scene).model.nv  # noqa: E731
+    scenes = {x.scene: load_scene(x.scene) for x in found}
+
+    def order(x: Ratio) -> tuple:
+        return scenes[x.scene].model.nv, x.scene, x.batch != ROWS, x.batch
+
     lines = [
         "| scene | dofs | contact points | substeps | model | rows | at equal error |"
         " in env and collector |",
         "|---" * 8 + "|",
     ]
-    for x in sorted(found, key=lambda x: (size(x), x.scene, x.batch != 512, x.batch)):
-        scene = load_scene(x.scene)
-        points, steps = len(scene.contacts), scene.substeps
-        cells = (x.scene, size(x), points, steps, f"`{x.model}`", f"{x.batch:,}")
+    for x in sorted(found, key=order):
+        scene = scenes[x.scene]
+        sizes = scene.model.nv, len(scene.contacts), scene.substeps
+        cells = (x.scene, *sizes, f"`{x.model}`", f"{x.batch:,}")
         shown = (*cells, written(x.alone), written(x.in_env))
         lines.append(f"| {' | '.join(map(str, shown))} |")
     return "\n".join(lines)
@@ -121,11 +119,17 @@ def written(spread: tuple[float, float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+def races(folder: Path) -> dict[Path, BenchReport]:
+    """Every race in the folder, by its file."""
+    paths = sorted(folder.glob("bench_*.json"))
+    return {path: BenchReport.from_figures(read_json(path)) for path in paths}
+
+
 def read(folder: Path) -> list[Ratio]:
     """Of every race in the folder; of a model that ran in two, the later file's."""
     found = {}
-    for path in sorted(folder.glob("bench_*.json")):
-        for ratio in ratios(json.loads(path.read_text())):
+    for report in races(folder).values():
+        for ratio in ratios(report):
             found[ratio.scene, ratio.model, ratio.batch] = ratio
     return list(found.values())
 

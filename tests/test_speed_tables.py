@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import asdict, replace
 
 import draw_races
 import early_exit
@@ -11,19 +12,26 @@ import torch
 from stability_table import FIGURES
 from tensordict import TensorDict
 
+from torchrl_nerd.evaluation.bench.rates import Rate
+from torchrl_nerd.evaluation.bench.report import BenchReport
 from torchrl_nerd.modules.free_step import FreeStep
 from torchrl_nerd.scenes import load_scene
 
 
-def race(learned: tuple[float, float], *true: tuple[float, float]) -> dict:
-    """What `nerd bench` writes of one model and MuJoCo's rows: error and rate of each."""
+def race(
+    learned: tuple[float, float], *true: tuple[float | None, float]
+) -> BenchReport:
+    """Of one model and MuJoCo's rows, as JSON tells it: error and rate of each."""
     names = ["cube, compiled", *(f"MuJoCo x{n}" for n in range(len(true)))]
     pairs = dict(zip(names, (learned, *true), strict=True))
-    rates = {
-        k: {"steps_per_s": s, "envs_per_s": 0.5 * s} for k, (_, s) in pairs.items()
+    speeds = {k: Rate(s, 0.5 * s, 0.0, None) for k, (_, s) in pairs.items()}
+    report = BenchReport("cube", 1, 1, {}, {}, {8: speeds}, {}, {}, {}, {})
+    others = {"interval": 0.0, "final": 0.0, "p95": 0.0}
+    errors = {
+        k: {"position": {"unit": "m", "mean": e, **others}}
+        for k, (e, _) in pairs.items()
     }
-    errors = {k: {"position": {"mean": e}} for k, (e, _) in pairs.items()}
-    return {"scene": "cube", "errors": errors, "rates": {"8": rates}}
+    return BenchReport.from_figures(asdict(report) | {"errors": errors})
 
 
 def test_mujoco_s_rate_at_an_error_is_on_its_front(generator):
@@ -69,11 +77,11 @@ def test_shares_of_a_scene(seed, tmp_path):
 
 def test_an_arm_s_race_is_drawn_of_its_ends(tmp_path):
     path = FIGURES / "bench_franka.json"
-    report = draw_races.BenchReport.from_figures(json.loads(path.read_text()))
+    report = BenchReport.from_figures(json.loads(path.read_text()))
     assert draw_races.with_ends(report).quantities == ["joint1", "joint7"]
     shutil.copy(path, tmp_path)
     (tmp_path / "bench_other.json").write_text(
-        json.dumps(draw_races.replace(report, rates={8: report.rates[512]}).figures())
+        json.dumps(replace(report, rates={8: report.rates[512]}).figures())
     )
     drawn = draw_races.main(draw_races.Options(tmp_path))  # the other has no such batch
     assert drawn == [tmp_path / "bench_franka.png"]
