@@ -17,10 +17,14 @@ class Bench(DeviceCommand):
     """Speed against error: the shipped models and MuJoCo, coarse and fine, in one race.
 
     Example: nerd bench cartpole --json results/bench.json --plot results/bench.png
+
+    Example: nerd bench dm_control/cheetah-run --models runs/dm_control-cheetah-run/best
     """
 
     scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    """Name of the robot: cartpole, double_pendulum, ant, ..., dm_control/DOMAIN-TASK."""
+    models: tuple[str, ...] = ()
+    """Names of models, or checkpoint folders; all that are shipped for it by default."""
     batches: tuple[int, ...] = (1, 64, 512, 4096)
     """Rows stepped together."""
     rows: int = 256
@@ -63,6 +67,7 @@ class Bench(DeviceCommand):
             self.device,
             self.quiet,
             self.without,
+            self.models,
         )
         print(bench_table(report))
         for batch in self.batches if self.budget else ():

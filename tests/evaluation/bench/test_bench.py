@@ -8,7 +8,12 @@ import mujoco
 import pytest
 import torch
 
-from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.checkpoint import (
+    make_card,
+    make_model,
+    save_checkpoint,
+    shipped_models,
+)
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.bench import rates
 from torchrl_nerd.evaluation.bench.contenders import (
@@ -29,6 +34,7 @@ from torchrl_nerd.evaluation.bench.report import BenchReport, bench
 from torchrl_nerd.evaluation.bench.table import bench_table
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import open_loop
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import load_scene
 
 
@@ -70,6 +76,31 @@ def test_a_whole_race(name, tmp_path, monkeypatch):
         broken[quantity] = replace(broken[quantity], mean=math.nan)
     plot_race(report, tmp_path / "broken.png")
     assert (tmp_path / "broken.png").exists()
+
+
+def test_a_robot_of_the_suite_races_with_a_model_of_ones_own(tmp_path, monkeypatch):
+    """An untrained one here: it is slow and wrong, and says so."""
+    monkeypatch.setattr(rates, "VISIT", 0.01)
+    scene = load_scene("dm_control/hopper-stand")
+    model = make_model(scene, NETWORKS["mlp-micro"]).eval()
+    folder = save_checkpoint(model, tmp_path / "hopper", make_card(model))
+    report = bench(
+        scene,
+        (2,),
+        rows=2,
+        rounds=1,
+        steps=2,
+        is_compiling=False,
+        threads=1,
+        without=("guarded", "bf16", "RK4", "implicitfast"),
+        models=[str(folder)],
+    )
+    learned = {row for row in report.errors if not row.startswith("MuJoCo")}
+    assert learned == {str(folder)} == set(report.costs)
+    own = report.errors[f"MuJoCo x{scene.substeps}"]
+    for quantity, error in report.errors[str(folder)].items():
+        assert error.mean > own[quantity].mean
+    assert not report.published and report.rates[2][str(folder)].envs_per_s > 0.0
 
 
 def test_who_is_left_out_takes_no_part(monkeypatch):
@@ -173,6 +204,7 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, (0,))
     with pytest.raises(ValueError, match="none without MuJoCo, cartpole"):
         bench(scene, without=("MuJoCo", "cartpole"))
-    other = load_scene("dm_control/cheetah-run")
-    with pytest.raises(ValueError, match="no protocol for 'dm_control/cheetah-run'"):
-        bench(other)
+    with pytest.raises(ValueError, match="robot with a task.*'gymnasium/Hopper-v5'"):
+        bench(load_scene("gymnasium/Hopper-v5"))
+    with pytest.raises(ValueError, match="checkpoint folder, got 'nowhere'"):
+        bench(scene, models=["nowhere"])

@@ -1,7 +1,7 @@
 """Who takes part: MuJoCo, coarse and fine, and learned models in several ways to run."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -45,6 +45,7 @@ def contenders(
     threads: int,
     is_compiling: bool = True,
     device: torch.device | str = "cpu",
+    models: Sequence[str] = (),
 ) -> list[Contender]:
     """Everyone who takes part in a scene's race.
 
@@ -53,10 +54,11 @@ def contenders(
         threads: of MuJoCo's pool.
         is_compiling: let learned models also run compiled.
         device: of learned models.
+        models: see `learned_contenders`.
     """
     return [
         *mujoco_contenders(scene, threads),
-        *learned_contenders(scene, is_compiling, device),
+        *learned_contenders(scene, is_compiling, device, models),
     ]
 
 
@@ -80,12 +82,29 @@ def mujoco_contenders(scene: Scene, threads: int) -> Iterator[Contender]:
 
 
 def learned_contenders(
-    scene: Scene, is_compiling: bool, device: torch.device | str = "cpu"
+    scene: Scene,
+    is_compiling: bool,
+    device: torch.device | str = "cpu",
+    models: Sequence[str] = (),
 ) -> Iterator[Contender]:
-    """The scene's shipped models, streaming and otherwise."""
-    for name in shipped_models():
-        if name != scene.name and not name.startswith(f"{scene.name}-"):
-            continue
+    """Models of a scene, streaming and otherwise.
+
+    Args:
+        scene: the robot.
+        is_compiling: let them also run compiled.
+        device: theirs.
+        models: names of shipped ones, or checkpoint folders; all that are shipped for the
+            robot where none are given.
+
+    Raises:
+        ValueError: see `from_pretrained`.
+    """
+    shipped = [
+        name
+        for name in shipped_models()
+        if name == scene.name or name.startswith(f"{scene.name}-")
+    ]
+    for name in models or shipped:
         model = from_pretrained(name, scene).to(device)
         yield _learned(name, model)
         yield Contender(f"{name}, guarded", True, _guarded(model))

@@ -20,11 +20,11 @@ from torchrl_nerd.evaluation.bench.errors import (
 )
 from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
 from torchrl_nerd.evaluation.bench.rates import Rate, rates, states_on_the_way
-from torchrl_nerd.evaluation.protocols import PROTOCOLS, Protocol
+from torchrl_nerd.evaluation.protocols import Protocol, protocol_of
 from torchrl_nerd.evaluation.rollout_error import ErrorSummary
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks import Task, make_task
 
 COUNTED = 8  # rows of the step whose arithmetic is counted
 
@@ -140,11 +140,12 @@ def bench(
     device: torch.device | str = "cpu",
     quiet: bool = False,
     without: Sequence[str] = (),
+    models: Sequence[str] = (),
 ) -> BenchReport:
-    """Race MuJoCo and the shipped models of a scene on this machine.
+    """Race MuJoCo and learned models of a scene on this machine.
 
     Args:
-        scene: one with a protocol.
+        scene: one that has a task.
         batches: rows stepped together, for the rates.
         rows: trajectories of each case, for the errors.
         rounds: turns of each contender.
@@ -156,22 +157,21 @@ def bench(
             states then travel to the processor and back within its time.
         quiet: no progress bars.
         without: rows with one of these in their names take no part.
+        models: see `learned_contenders`.
 
     Raises:
-        ValueError: a scene without a protocol, a setting out of range, or nobody left.
+        ValueError: a scene without a task, a setting out of range, or nobody left.
     """
     expect_at_least(1, rounds=rounds, **{f"batch {b}": b for b in batches})
     expect_at_least(2, rows=rows)
-    if scene.name not in PROTOCOLS:
-        known = ", ".join(PROTOCOLS)
-        raise ValueError(f"no protocol for '{scene.name}', expected one of {known}")
+    protocol = protocol_of(scene)
+    task = _task_of(scene, protocol)
     if threads is not None:
         torch.set_num_threads(threads)
     threads = torch.get_num_threads()
-    protocol = PROTOCOLS[scene.name]()
     everyone = [
         who
-        for who in contenders(scene, threads, is_compiling, device)
+        for who in contenders(scene, threads, is_compiling, device, models)
         if not any(word in who.name for word in without)
     ]
     if not everyone:
@@ -184,13 +184,11 @@ def bench(
         for who in tqdm(everyone, "errors", disable=quiet)
     }
     floors = chaos_floor(ground, threads, seed)
-    tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
-    state = states_on_the_way(tasks[-1], COUNTED, seed)
-    here = tasks[-1].scene
-    counted = {who.name: step_cost(who.make(here), state) for who in everyone}
+    state = states_on_the_way(task, COUNTED, seed)
+    counted = {who.name: step_cost(who.make(task.scene), state) for who in everyone}
     costs = {name: cost for name, cost in counted.items() if cost is not None}
     speeds = {
-        batch: rates(everyone, tasks[-1], batch, rounds, seed, costs, device)
+        batch: rates(everyone, task, batch, rounds, seed, costs, device)
         for batch in tqdm(batches, "rates", unit=" batches", disable=quiet)
     }
     horizon = ground[0].steps
@@ -212,6 +210,20 @@ def bench(
             "mujoco": mujoco.__version__,
         },
     )
+
+
+def _task_of(scene: Scene, protocol: Protocol) -> Task:
+    """Whose starts, observations, rewards and resets are timed; of the suite, its own."""
+    tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
+    if tasks:
+        return tasks[-1]
+    try:
+        return make_task(scene.name)
+    except ValueError:
+        raise ValueError(
+            f"expected a robot with a task to race, such as ant or "
+            f"dm_control/humanoid-run, got '{scene.name}', which has none"
+        ) from None
 
 
 def _summary(error: Mapping[str, Any]) -> ErrorSummary:
