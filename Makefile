@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp format docs build lock clean
+.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -110,6 +110,41 @@ model-double_pendulum-mlp: $(STAMP) ## the double pendulum's network alone: two 
 		--rollout-steps 3000 --lr 0.004 --lr-other 0.0012 --rollout-lr 0.08 \
 		--out runs/double_pendulum_on
 	cp runs/double_pendulum_on/best/* $(PRETRAINED)/double_pendulum-mlp/
+
+# Policies, learned in the shipped models alone. A shipped one is that of its command.
+POLICIES := torchrl_nerd/policies
+PPO := OMP_NUM_THREADS=1 $(PY) examples/ppo.py
+BY_GRADIENTS := OMP_NUM_THREADS=1 $(PY) examples/first_order.py --compile \
+	--num-envs 256 --window 64 --lr 1e-3 --evaluate-every 40 --episodes 2048
+SHIP_POLICY = mkdir -p $(POLICIES)/$* && cp runs/$@/policy.* $(POLICIES)/$*/
+WALKERS := policy-ant-run policy-ant-spin policy-anymal-forward policy-anymal-sideways
+SPINNER := policy-ant-spin_track
+LEGGED := --compile --horizon 16 --minibatch 8192 --lr 1e-3
+
+policies: policy-cartpole-swingup $(WALKERS) $(SPINNER) policy-franka-reach policy-franka-reach_torque ## a policy for every task with a goal, eight hours on one core
+
+policy-cartpole-swingup: policy-%: $(STAMP)
+	$(PPO) --total-frames 6000000 --out runs/$@
+	$(SHIP_POLICY)
+
+$(WALKERS): policy-%: $(STAMP)
+	$(PPO) --task $(subst -,/,$*) $(LEGGED) --total-frames 8000000 --out runs/$@
+	$(SHIP_POLICY)
+
+$(SPINNER): policy-%: $(STAMP)
+	$(PPO) --task $(subst -,/,$*) $(LEGGED) --total-frames 12000000 --seed 1 --out runs/$@
+	$(SHIP_POLICY)
+
+policy-franka-reach: policy-%: $(STAMP)
+	$(PPO) --task franka/reach --compile --seed 1 --out runs/$@-ppo
+	$(BY_GRADIENTS) --task franka/reach --start runs/$@-ppo --updates 850 --seed 1 --out runs/$@-on
+	$(BY_GRADIENTS) --task franka/reach --start runs/$@-on --updates 340 --seed 1 --out runs/$@
+	$(SHIP_POLICY)
+
+policy-franka-reach_torque: policy-%: $(STAMP)
+	$(PPO) --task franka/reach_torque --compile --seed 1 --out runs/$@-ppo
+	$(BY_GRADIENTS) --task franka/reach_torque --start runs/$@-ppo --updates 3200 --seed 1 --out runs/$@
+	$(SHIP_POLICY)
 
 format: $(STAMP) ## repair what ruff can repair
 	$(PY) -m ruff check --fix .

@@ -10,6 +10,7 @@ beside PPO stands in docs/results.md.
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -24,7 +25,11 @@ from tqdm import trange
 from torchrl_nerd import NeRDEnv, from_pretrained
 from torchrl_nerd.envs.memory import recall, remember
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
-from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
+from torchrl_nerd.evaluation.policy_transfer import (
+    ReturnSummary,
+    transfer,
+    transfer_table,
+)
 from torchrl_nerd.files import write_json
 from torchrl_nerd.tasks import make_task
 from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
@@ -59,7 +64,13 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
     return Policy.for_env(seen, cfg.episode, ppo.widths, memory=ppo.memory)
 
 
-def train(cfg: Config) -> tuple[Policy, list[float]]:
+def measure(cfg: Config, policy: Policy) -> ReturnSummary:
+    """What it earns in NeRD, from starts that the final evaluation does not have."""
+    episodes, where = min(256, cfg.episodes), (cfg.task, make_actor(policy))
+    return transfer(*where, ["nerd"], episodes, seed=cfg.seed + 1)["nerd"]
+
+
+def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]]:
     """The policy that earned most in NeRD, and the mean reward of every window."""
     model = from_pretrained(make_task(cfg.task).scene.name).requires_grad_(False)
     env = NeRDEnv(cfg.task, model, cfg.num_envs, cfg.seed, differentiable=True)
@@ -68,9 +79,11 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
         env.compile()
     optimizer = Adam(policy.mlp.parameters(), cfg.lr)
     schedule = LinearLR(optimizer, 1.0, end_factor=0.02, total_iters=cfg.updates)
+    best = measure(cfg, policy)
+    keep(cfg, policy)
     windows = max(1, cfg.episode // cfg.window)
     turn = torch.arange(cfg.num_envs) % windows  # each update sees all of an episode
-    rewards, best = [], -float("inf")
+    rewards: list[float] = []
     now, recent = env.reset(), None
     progress = trange(1, cfg.updates + 1, unit="window")
     for update in progress:
@@ -84,13 +97,31 @@ def train(cfg: Config) -> tuple[Policy, list[float]]:
         rewards.append(float(reward.detach()))
         now, recent = go_on(env, recent, policy.memory, (update + turn) % windows == 0)
         if update % cfg.evaluate_every == 0 or update == cfg.updates:
-            where = cfg.task, make_actor(policy), ["nerd"]
-            earned = transfer(*where, min(256, cfg.episodes), seed=cfg.seed + 1)
-            progress.set_postfix({name: x.mean for name, x in earned.items()})
-            if earned["nerd"].mean > best:
-                best = earned["nerd"].mean
-                save_policy(policy, cfg.out, {**asdict(cfg), "dynamics": "nerd"})
+            earned = measure(cfg, policy)
+            progress.set_postfix(earned=earned.mean, best=best.mean)
+            if earned.mean > best.mean:
+                best = earned
+                keep(cfg, policy)
+            elif earned.mean + earned.interval < best.mean:
+                step_back(policy, load_policy(cfg.out), optimizer)
     return load_policy(cfg.out), rewards
+
+
+def keep(cfg: Config, policy: Policy) -> None:
+    """Write down the best one so far."""
+    save_policy(policy, cfg.out, {**asdict(cfg), "dynamics": "nerd"})
+
+
+def step_back(policy: Policy, best: Policy, optimizer: Adam) -> None:
+    """Go on from the best one at half the step: the gradients of late led astray.
+
+    Where most rows are near chaos they say little, and a policy that they have made worse
+    meets more of it.
+    """
+    policy.load_state_dict(best.state_dict())
+    optimizer.state.clear()
+    for group in optimizer.param_groups:
+        group["lr"] *= 0.5
 
 
 def window_reward(

@@ -13,10 +13,12 @@ import torch
 from dynamics_helpers import unequal_keys
 from tensordict import TensorDict
 from torch import nn
+from torch.optim.lr_scheduler import LinearLR
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import NeRDEnv, from_pretrained, load_scene, make_env
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy_transfer import summarize
 from torchrl_nerd.transforms import Stats
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -223,7 +225,14 @@ def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path)
         episodes=8,
         out=tmp_path,
     )
-    policy, rewards = first_order.train(cfg)
+
+    def early(cfg, policy):  # so few updates help the first steps of an episode alone
+        env = NeRDEnv(cfg.task, num_envs=64, seed=cfg.seed + 1)
+        with torch.no_grad():
+            reward, _ = first_order.window_reward(env, policy, env.reset(), None, 24)
+        return summarize(reward.expand(2), reward.expand(2))
+
+    policy, rewards = first_order.train(cfg, early)
     assert len(rewards) == cfg.updates
     idle = copy.deepcopy(policy)
     nn.init.zeros_(idle.mlp[-1].weight)
@@ -240,6 +249,35 @@ def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path)
     kept = load_policy(tmp_path).state_dict()
     assert all(torch.equal(kept[k], x) for k, x in policy.state_dict().items())
     assert (tmp_path / "returns.json").is_file()
+
+
+def test_a_step_that_leads_astray_is_taken_back(example, tmp_path):
+    """However large the step, nothing is lost: the start is what is left then."""
+    first_order = example("first_order")
+    cfg = first_order.Config(
+        num_envs=4, window=2, episode=4, updates=4, lr=1e3, evaluate_every=1, episodes=8
+    )
+    policy = first_order.make_policy(cfg, make_env(cfg.task, "nerd", 4))
+    with torch.no_grad():  # an arm that stays put earns more than one that flails
+        policy.mlp[-1].weight.zero_()
+    start = tmp_path / "start"
+    first_order.keep(replace(cfg, out=start), policy)
+    cfg = replace(cfg, start=start, out=tmp_path / "out")
+    learned, rewards = first_order.train(cfg)
+    assert len(rewards) == cfg.updates
+    earned, before = (first_order.measure(cfg, p).mean for p in (learned, policy))
+    assert earned >= before
+    optimizer = torch.optim.Adam(learned.mlp.parameters(), 1e-2)
+    schedule = LinearLR(optimizer, 1.0, 0.5, total_iters=10)
+    for _ in range(3):
+        optimizer.step()
+        schedule.step()
+    rate = optimizer.param_groups[0]["lr"]
+    first_order.step_back(learned, policy, optimizer)
+    schedule.step()
+    assert optimizer.param_groups[0]["lr"] < 0.5 * rate  # and it goes on falling
+    for name, weight in learned.state_dict().items():
+        assert torch.equal(weight, policy.state_dict()[name])
 
 
 def test_windows_go_on_where_the_last_one_ended(example, generator):

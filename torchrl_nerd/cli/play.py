@@ -12,6 +12,7 @@ from torchrl_nerd.evaluation.render.movie import check_movie
 from torchrl_nerd.evaluation.render.pair import Idle, Pair, follow, idle, play_pair
 from torchrl_nerd.evaluation.render.viewer import check_display, view
 from torchrl_nerd.evaluation.rollout_error import unit_of
+from torchrl_nerd.evaluation.shipped_policies import shipped_policies
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import make_task
@@ -23,17 +24,17 @@ SECONDS = 5.0  # of motion, where neither steps nor the task says less
 class Play(DeviceCommand):
     """A film of one episode, learned beside MuJoCo: same start, same actions.
 
-    Example: nerd play cartpole/swingup --policy runs/ppo --out swing_up.gif
+    Example: nerd play ant/run --seed 3 --steps 120
 
-    Example: nerd play ant/run --seed 3 --steps 120 --actions zero
+    Example: nerd play cartpole/swingup --policy runs/ppo --out swing_up.gif
     """
 
     task: Positional[str]
     """Id of the task, such as cartpole/swingup."""
     policy: Path | None = None
-    """Folder of a policy, as examples/ppo.py writes it; without one, see --actions."""
-    actions: Idle = "random"
-    """Without a policy: random, or zero."""
+    """Folder of a policy, as examples/ppo.py writes it; by default the shipped one."""
+    actions: Idle | None = None
+    """Random or zero, in place of a policy; random where a task has none."""
     own_actions: bool = False
     """The policy acts on each dynamics' own state, not on MuJoCo's for both."""
     model: str = "nerd"
@@ -72,11 +73,13 @@ class Play(DeviceCommand):
         if self.steps is not None:
             expect_at_least(1, steps=self.steps)
             steps = self.steps
-        memory = 1
-        if self.policy is None:
-            act = idle(task, steps, self.seed, self.actions)
+        memory, folder = 1, self.policy
+        if folder is None and self.actions is None:
+            folder = shipped_policies().get(self.task)
+        if folder is None:
+            act = idle(task, steps, self.seed, self.actions or "random")
         else:
-            policy = load_policy(self.policy, task).to(self.device)
+            policy = load_policy(folder, task).to(self.device)
             act, memory = follow(make_actor(policy)), policy.memory
         pair = play_pair(
             self.task,

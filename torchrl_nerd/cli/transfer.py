@@ -8,6 +8,7 @@ from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
+from torchrl_nerd.evaluation.shipped_policies import shipped_policy
 from torchrl_nerd.tasks import make_task
 
 
@@ -15,13 +16,15 @@ from torchrl_nerd.tasks import make_task
 class Transfer(DeviceCommand):
     """Returns of a policy in learned and in true dynamics, and the gap.
 
+    Example: nerd transfer ant/run --episodes 256
+
     Example: nerd transfer cartpole/swingup --policy runs/ppo
     """
 
     task: Positional[str]
     """Id of the task, such as cartpole/swingup."""
-    policy: Path
-    """Folder of a policy, as examples/ppo.py writes it."""
+    policy: Path | None = None
+    """Folder of a policy, as examples/ppo.py writes it; by default the shipped one."""
     dynamics: tuple[str, ...] = ("nerd", "mujoco")
     """Any of nerd, mujoco, dm_control, mujoco_warp, checkpoint folders."""
     episodes: int = 2048
@@ -35,11 +38,13 @@ class Transfer(DeviceCommand):
         """Print a table and return its rows.
 
         Raises:
-            ValueError: fewer than 2 episodes; see `load_policy` and `transfer`.
+            ValueError: fewer than 2 episodes; see `shipped_policy`, `load_policy` and
+                `transfer`.
         """
         if self.episodes < 2:
             raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
-        policy = load_policy(self.policy, make_task(self.task))
+        task = make_task(self.task)
+        policy = load_policy(self.policy or shipped_policy(self.task), task)
         actor = make_actor(policy.to(self.device))
         summaries = transfer(
             self.task,
