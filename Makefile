@@ -117,22 +117,19 @@ PPO := OMP_NUM_THREADS=1 $(PY) examples/ppo.py
 BY_GRADIENTS := OMP_NUM_THREADS=1 $(PY) examples/first_order.py --compile \
 	--num-envs 256 --window 64 --lr 1e-3 --evaluate-every 40 --episodes 2048
 SHIP_POLICY = mkdir -p $(POLICIES)/$* && cp runs/$@/policy.* $(POLICIES)/$*/
-WALKERS := policy-ant-run policy-ant-spin policy-anymal-forward policy-anymal-sideways
-SPINNER := policy-ant-spin_track
-LEGGED := --compile --horizon 16 --minibatch 8192 --lr 1e-3
+LEGGED := $(addprefix policy-,ant-run ant-spin ant-spin_track anymal-forward anymal-sideways)
+FRAMES := 8000000
 
-policies: policy-cartpole-swingup $(WALKERS) $(SPINNER) policy-franka-reach policy-franka-reach_torque ## a policy for every task with a goal, eight hours on one core
+policies: policy-cartpole-swingup $(LEGGED) policy-franka-reach policy-franka-reach_torque ## a policy for every task with a goal, eight hours on one core
 
 policy-cartpole-swingup: policy-%: $(STAMP)
 	$(PPO) --total-frames 6000000 --out runs/$@
 	$(SHIP_POLICY)
 
-$(WALKERS): policy-%: $(STAMP)
-	$(PPO) --task $(subst -,/,$*) $(LEGGED) --total-frames 8000000 --out runs/$@
-	$(SHIP_POLICY)
-
-$(SPINNER): policy-%: $(STAMP)
-	$(PPO) --task $(subst -,/,$*) $(LEGGED) --total-frames 12000000 --seed 1 --out runs/$@
+policy-ant-spin_track: FRAMES := 24000000
+$(LEGGED): policy-%: $(STAMP)
+	$(PPO) --task $(subst -,/,$*) --compile --horizon 16 --minibatch 8192 --lr 1e-3 \
+		--total-frames $(FRAMES) --out runs/$@
 	$(SHIP_POLICY)
 
 policy-franka-reach: policy-%: $(STAMP)

@@ -22,11 +22,13 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LinearLR
 from tqdm import trange
 
-from torchrl_nerd import NeRDEnv, from_pretrained
+from torchrl_nerd import NeRDEnv, from_pretrained, make_env
 from torchrl_nerd.envs.memory import recall, remember
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import (
     ReturnSummary,
+    policy_returns,
+    summarize,
     transfer,
     transfer_table,
 )
@@ -66,8 +68,9 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
 
 def measure(cfg: Config, policy: Policy) -> ReturnSummary:
     """What it earns in NeRD, from starts that the final evaluation does not have."""
-    episodes, where = min(256, cfg.episodes), (cfg.task, make_actor(policy))
-    return transfer(*where, ["nerd"], episodes, seed=cfg.seed + 1)["nerd"]
+    env = make_env(cfg.task, "nerd", min(256, cfg.episodes), seed=cfg.seed + 1)
+    returns = policy_returns(remember(env, policy.memory), make_actor(policy))
+    return summarize(returns, returns)
 
 
 def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]]:

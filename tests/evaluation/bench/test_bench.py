@@ -35,7 +35,7 @@ from torchrl_nerd.evaluation.bench.table import bench_table
 from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.scenes import Scene, load_scene
 
 
 @pytest.fixture(params=list(PROTOCOLS))
@@ -78,23 +78,20 @@ def test_a_whole_race(name, tmp_path, monkeypatch):
     assert (tmp_path / "broken.png").exists()
 
 
+def brief_race(scene: Scene, **how) -> BenchReport:
+    """Of two rows and two steps, nothing compiled."""
+    sizes = {"rows": 2, "rounds": 1, "steps": 2, "threads": 1}
+    return bench(scene, (2,), is_compiling=False, **sizes, **how)
+
+
 def test_a_robot_of_the_suite_races_with_a_model_of_ones_own(tmp_path, monkeypatch):
     """An untrained one here: it is slow and wrong, and says so."""
     monkeypatch.setattr(rates, "VISIT", 0.01)
     scene = load_scene("dm_control/hopper-stand")
     model = make_model(scene, NETWORKS["mlp-micro"]).eval()
     folder = save_checkpoint(model, tmp_path / "hopper", make_card(model))
-    report = bench(
-        scene,
-        (2,),
-        rows=2,
-        rounds=1,
-        steps=2,
-        is_compiling=False,
-        threads=1,
-        without=("guarded", "bf16", "RK4", "implicitfast"),
-        models=[str(folder)],
-    )
+    words = "guarded", "bf16", "RK4", "implicitfast"
+    report = brief_race(scene, without=words, models=[str(folder)])
     learned = {row for row in report.errors if not row.startswith("MuJoCo")}
     assert learned == {str(folder)} == set(report.costs)
     own = report.errors[f"MuJoCo x{scene.substeps}"]
@@ -107,16 +104,7 @@ def test_who_is_left_out_takes_no_part(monkeypatch):
     monkeypatch.setattr(rates, "VISIT", 0.01)
     words = "MuJoCo x", "guarded", "bf16", "fine", "micro"
     scene = load_scene("cartpole")
-    report = bench(
-        scene,
-        (2,),
-        rows=2,
-        rounds=1,
-        steps=2,
-        is_compiling=False,
-        threads=1,
-        without=words,
-    )
+    report = brief_race(scene, without=words)
     integrators = ("MuJoCo implicitfast", "MuJoCo RK4")
     coarse = {f"{name} x{n}" for name in integrators for n in (1, 4)}
     assert set(report.errors) == coarse | {"cartpole", "cartpole, window"}
