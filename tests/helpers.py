@@ -1,6 +1,7 @@
 """Small robots made for a test, random true transitions, and robots moved elsewhere."""
 
 import copy
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +54,23 @@ ARM = """
         contype="0" conaffinity="1"/></body>
   </body></worldbody><actuator><motor joint="elbow"/></actuator></mujoco>"""
 """Ball and hinge on a mount, fixed and turned, over a fixed and tilted plane."""
+
+
+def slow_but(quick: Iterable[str], names: Iterable[str]) -> list:
+    """All names for `pytest.mark.parametrize`; those that are not quick, marked slow."""
+    quick = set(quick)
+    return [
+        name if name in quick else pytest.param(name, marks=pytest.mark.slow)
+        for name in names
+    ]
+
+
+def first_of_each_robot(names: Iterable[str]) -> list[str]:
+    """Of cube, cube_real and cube_slope, or of ant/run and ant/spin, the first."""
+    first: dict[str, str] = {}
+    for name in names:
+        first.setdefault(name.replace("/", "_").split("_")[0], name)
+    return list(first.values())
 
 
 def make_scene(model: mujoco.MjModel | str, name: str = "handmade") -> Scene:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from helpers import slow_but
 
 from torchrl_nerd import __version__
 from torchrl_nerd.cli import COMMANDS, main
@@ -201,13 +202,7 @@ def test_no_traceback_reaches_the_terminal():
     assert done.stderr.count("\n") == 1 and done.stderr.startswith("nerd: unknown")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
-        for name in SCENES
-    ],
-)
+@pytest.mark.parametrize("name", slow_but(QUICK, SCENES))
 def test_from_data_to_figures(name, tmp_path, seed, capsys):
     scene = load_scene(name)
     data, run, best = (str(tmp_path / x) for x in ("data", "run", "best"))

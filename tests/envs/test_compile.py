@@ -5,6 +5,7 @@ import pickle
 from collections.abc import Iterator
 from functools import partial
 from itertools import cycle
+from typing import get_args
 
 import pytest
 import torch
@@ -15,14 +16,16 @@ from dynamics_helpers import (
     random_model,
     row_uniforms,
 )
+from helpers import first_of_each_robot, slow_but
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.compiled import Compiled
+from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import uniforms
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.tasks import TASKS, make_task
 
 TASK = "cartpole/swingup"
 ROWS, STEPS = 4, 5
@@ -40,6 +43,7 @@ def path(env: SceneEnv, actions: torch.Tensor) -> list[TensorDictBase]:
     return records
 
 
+@pytest.mark.parametrize("task_id", slow_but(first_of_each_robot(TASKS), TASKS))
 def test_its_pieces_are_the_eager_steps(task_id, generator):
     """Traced, and run as they were traced: every bit is the same."""
     maker = EnvMaker(task_id, "streaming", generator)
@@ -88,7 +92,7 @@ def act_next(actions: Iterator[torch.Tensor], td: TensorDictBase) -> TensorDictB
     return td.set("action", next(actions))
 
 
-@pytest.mark.parametrize("guard", [None, "flag", "truncate", "raise", "fallback"])
+@pytest.mark.parametrize("guard", [None, *slow_but(["fallback"], get_args(Guard))])
 def test_torchrl_rolls_it_out(guard, seed):
     """With automatic resets, whatever looks at its steps."""
     task = make_task(TASK)

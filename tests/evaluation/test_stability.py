@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from dynamics_helpers import EnvMaker, random_model
+from helpers import slow_but
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -19,9 +20,10 @@ from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_ca
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, settled, starts
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, EnvWorld
 from torchrl_nerd.evaluation.traces import energy as traced_energy
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes import SCENES, Scene, load_scene
 
 SCALE = 0.001
+QUICK = ("cartpole", "double_pendulum", "franka", "cube")  # others take a minute
 SLOW = (
     *("adversary", "chaos", "drop", "sliding", "resting", "margin", "horizon"),
     *("stiff_contact", "execution", "slope"),
@@ -40,7 +42,9 @@ def results_of(scene, names, generator):
     return list(run_cases(truth, learned, choose_cases(names), seed, SCALE))
 
 
-def test_the_true_dynamics_keep_their_lines(scene, generator):
+@pytest.mark.parametrize("name", slow_but(QUICK, SCENES))
+def test_the_true_dynamics_keep_their_lines(name, generator):
+    scene = load_scene(name)
     results = results_of(scene, SHORT, generator)
     assert {r.case: r.true for r in results if not r.true_passes} == {}
     table = as_table(results)

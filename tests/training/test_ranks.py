@@ -41,7 +41,13 @@ def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str
 
 @pytest.mark.parametrize(
     ("name", "more"),
-    [("double_pendulum", ()), ("cube", ("--network", "mlp-micro", "--use-symmetry"))],
+    [
+        ("double_pendulum", ()),
+        pytest.param(
+            *("cube", ("--network", "mlp-micro", "--use-symmetry")),
+            marks=pytest.mark.slow,
+        ),
+    ],
 )
 def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
     generate(load_scene(name), DataConfig(60, 8), tmp_path / "data", quiet=True)

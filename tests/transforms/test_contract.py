@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import slow_but
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import (
@@ -30,6 +31,8 @@ from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, OBSERVATION, QPOS, QVEL, STA
 
 each_transform = pytest.mark.parametrize("name", TRANSFORMS)
 each_scene = pytest.mark.parametrize("scene", TASK_OF)
+# Two processes an env; what is of a scene, one process shows as well.
+each_kind = pytest.mark.parametrize("scene", slow_but(("cartpole", "ant"), TASK_OF))
 
 
 def check(env, *names):
@@ -61,7 +64,7 @@ def test_serial_trans_env_check(name, scene):
     check(named(env, scene), name)
 
 
-@each_scene
+@each_kind
 def test_parallel_trans_env_check(scene):
     env = ParallelEnv(2, creators(scene, of_transformed=True))
     check(named(env, scene), *TRANSFORMS)
@@ -75,7 +78,7 @@ def test_trans_serial_env_check(name, scene):
     check(named(env, scene), name)
 
 
-@each_scene
+@each_kind
 def test_trans_parallel_env_check(scene):
     env = ParallelEnv(2, creators(scene, of_transformed=False))
     check(named(TransformedEnv(env, make_compose(scene)), scene), *TRANSFORMS)

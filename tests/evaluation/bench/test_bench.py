@@ -7,6 +7,7 @@ from dataclasses import replace
 import mujoco
 import pytest
 import torch
+from helpers import slow_but
 
 from torchrl_nerd.checkpoint import (
     make_card,
@@ -37,6 +38,8 @@ from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.scenes import Scene, load_scene
 
+QUICK = ("cartpole", "franka", "ant", "cube")  # fewer models, or a kind of their own
+
 
 @pytest.fixture(params=list(PROTOCOLS))
 def name(request) -> str:
@@ -44,6 +47,7 @@ def name(request) -> str:
     return request.param
 
 
+@pytest.mark.parametrize("name", slow_but(QUICK, PROTOCOLS))
 def test_a_whole_race(name, tmp_path, monkeypatch):
     monkeypatch.setattr(rates, "VISIT", 0.01)  # speeds need not be exact here
     scene = load_scene(name)

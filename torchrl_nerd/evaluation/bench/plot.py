@@ -51,6 +51,7 @@ def plot_race(report: BenchReport, path: Path, batch: int | None = None) -> None
             xlabel=f"{quantity}, mean error over {report.steps} steps ({unit})",
             ylabel=f"control steps per second, {batch} rows",
         )
+        axes.tick_params(which="minor", labelsize=7)  # larger ones cover each other
         axes.legend(frameon=False, fontsize=7)
         _write_names(axes, points, best)
     save_figure(figure, path)
