@@ -23,7 +23,6 @@ from torchrl_nerd.data.generate import CARD, DataConfig, Draw, generate, load_da
 from torchrl_nerd.data.strategies import strategies
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.envs import make_env
-from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.rollout_error import passive_errors
@@ -122,7 +121,7 @@ class Study:
         episodes = self.options.episodes
         env = make_env(self.task_id, dynamics, episodes, seed=TEST_SEED)
         loaded = load_policy(policy, env.task)
-        return policy_returns(remember(env, loaded.memory), make_actor(loaded))
+        return policy_returns(env, make_actor(loaded))
 
     def measure(self, model: Path, name: str, seed: int) -> dict[str, Any]:
         """Errors by test, and returns."""

@@ -69,7 +69,7 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
 def measure(cfg: Config, policy: Policy) -> ReturnSummary:
     """What it earns in NeRD, from starts that the final evaluation does not have."""
     env = make_env(cfg.task, "nerd", min(256, cfg.episodes), seed=cfg.seed + 1)
-    returns = policy_returns(remember(env, policy.memory), make_actor(policy))
+    returns = policy_returns(env, make_actor(policy))
     return summarize(returns, returns)
 
 

@@ -65,14 +65,6 @@ def slow_but(quick: Iterable[str], names: Iterable[str]) -> list:
     ]
 
 
-def first_of_each_robot(names: Iterable[str]) -> list[str]:
-    """Of cube, cube_real and cube_slope, or of ant/run and ant/spin, the first."""
-    first: dict[str, str] = {}
-    for name in names:
-        first.setdefault(name.replace("/", "_").split("_")[0], name)
-    return list(first.values())
-
-
 def make_scene(model: mujoco.MjModel | str, name: str = "handmade") -> Scene:
     """A scene of any model, driven by unit torques, two substeps a control step."""
     if isinstance(model, str):

@@ -61,6 +61,7 @@ def test_true_dynamics_have_no_gradients(dynamics):
         make_env("cartpole/swingup", dynamics, differentiable=True)
 
 
+@pytest.mark.slow  # test_compile.py rolls the same pair out in a collector
 def test_a_compiled_env_steps_as_an_eager_one(seed):
     generator = torch.Generator().manual_seed(seed)
     actions = 2.0 * torch.rand(STEPS, ROWS, 1, generator=generator) - 1.0

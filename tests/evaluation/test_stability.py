@@ -23,7 +23,7 @@ from torchrl_nerd.evaluation.traces import energy as traced_energy
 from torchrl_nerd.scenes import SCENES, Scene, load_scene
 
 SCALE = 0.001
-QUICK = ("cartpole", "double_pendulum", "franka", "cube")  # others take a minute
+QUICK = ("cartpole", "double_pendulum", "franka", "cube")  # others take up to a minute
 SLOW = (
     *("adversary", "chaos", "drop", "sliding", "resting", "margin", "horizon"),
     *("stiff_contact", "execution", "slope"),

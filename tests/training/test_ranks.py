@@ -44,7 +44,8 @@ def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str
     [
         ("double_pendulum", ()),
         pytest.param(
-            *("cube", ("--network", "mlp-micro", "--use-symmetry")),
+            "cube",
+            ("--network", "mlp-micro", "--use-symmetry"),
             marks=pytest.mark.slow,
         ),
     ],

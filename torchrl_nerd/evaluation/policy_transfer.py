@@ -49,8 +49,10 @@ class ReturnSummary:
 def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
     """Undiscounted return of one whole episode per row, ``(num_envs,)``, float64.
 
-    A row that ends early earns nothing after its end. Actions are the policy's mean.
+    A row that ends early earns nothing after its end. Actions are the policy's mean; it
+    is shown as many observations as it remembers.
     """
+    env = remember(env, memory_of(actor))
     tensordict = env.reset()
     is_running = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
     returns = torch.zeros(*env.batch_size, 1, dtype=torch.float64, device=env.device)
@@ -128,7 +130,7 @@ def transfer(
     for name in tqdm(names, "dynamics", disable=quiet):
         rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
         env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
-        returns[name] = policy_returns(remember(env, memory_of(actor)), actor)
+        returns[name] = policy_returns(env, actor)
     return {name: summarize(value, returns[TRUTH]) for name, value in returns.items()}
 
 
