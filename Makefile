@@ -68,22 +68,22 @@ PRETRAINED := torchrl_nerd/pretrained
 
 model-ant-mlp: $(STAMP) ## the Ant's network alone: learned, tried by a policy, learned on
 	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp
-	$(NERD) train ant --data datasets/ant_mlp --network mlp-larger --flies --use-symmetry \
-		--steps 46000 --rollout-steps 6000 --rollout-rounds 2 --bf16-share 0.85 \
+	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --flies --use-symmetry \
+		--steps 46000 --rollout-steps 6000 --rollout-restarts 2 --bf16-fraction 0.85 \
 		--validate-every 5000 --out runs/ant_mlp
 	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant_mlp/best --out runs/ppo_ant \
 		--horizon 16 --minibatch 8192 --lr 1e-3 --total-frames 8000000 --episodes 512
 	$(NERD) data ant --policy runs/ppo_ant --trajectories 12000 --out datasets/ant_policy
 	$(NERD) train ant --start runs/ant_mlp/best --data datasets/ant_mlp datasets/ant_policy \
-		--network mlp-larger --flies --use-symmetry --bf16-share 0.85 \
-		--steps 12000 --rollout-steps 4000 --rollout-rounds 1 --lr 0.004 --lr-other 0.0012 \
-		--rollout-lr 0.25 --validate-every 2000 --out runs/ant_policy
+		--network mlp-4x160 --flies --use-symmetry --bf16-fraction 0.85 \
+		--steps 12000 --rollout-steps 4000 --rollout-restarts 1 --lr 0.004 --adamw-lr 0.0012 \
+		--rollout-lr-ratio 0.25 --validate-every 2000 --out runs/ant_policy
 	cp runs/ant_policy/best/* $(PRETRAINED)/ant-mlp/
 
 model-anymal-mlp: $(STAMP) ## ANYmal's network alone: learned, tried by two policies, learned on
 	$(NERD) data anymal --trajectories 20000 --out datasets/anymal_mlp
-	$(NERD) train anymal --data datasets/anymal_mlp --network mlp-large --flies \
-		--steps 15000 --rollout-steps 1000 --bf16-share 0.8 --out runs/anymal_mlp
+	$(NERD) train anymal --data datasets/anymal_mlp --network mlp-4x128 --flies \
+		--steps 15000 --rollout-steps 1000 --bf16-fraction 0.8 --out runs/anymal_mlp
 	for task in forward sideways; do \
 		$(PY) examples/ppo.py --task anymal/$$task --dynamics runs/anymal_mlp/best \
 			--out runs/ppo_anymal_$$task --horizon 16 --minibatch 8192 --lr 1e-3 \
@@ -95,19 +95,19 @@ model-anymal-mlp: $(STAMP) ## ANYmal's network alone: learned, tried by two poli
 		--out datasets/anymal_sideways
 	$(NERD) train anymal --start runs/anymal_mlp/best --out runs/anymal_on \
 		--data datasets/anymal_mlp datasets/anymal_forward datasets/anymal_sideways \
-		--network mlp-large --flies --bf16-share 0.8 --steps 7000 --rollout-steps 1000 \
-		--lr 0.004 --lr-other 0.0012 --validate-every 1000
+		--network mlp-4x128 --flies --bf16-fraction 0.8 --steps 7000 --rollout-steps 1000 \
+		--lr 0.004 --adamw-lr 0.0012 --validate-every 1000
 	cp runs/anymal_on/best/* $(PRETRAINED)/anymal-mlp/
 
-PENDULUM_MLP := --network mlp-wide --softening 1.0 --bf16-share 0.9 --validate-every 6000
+PENDULUM_MLP := --network mlp-4x120 --loss_eps 1.0 --bf16-fraction 0.9 --validate-every 6000
 
 model-double_pendulum-mlp: $(STAMP) ## the double pendulum's network alone: two legs
 	$(NERD) data double_pendulum --trajectories 150000 --out datasets/double_pendulum_mlp
 	$(NERD) train double_pendulum --data datasets/double_pendulum_mlp $(PENDULUM_MLP) \
-		--steps 90000 --rollout-steps 4000 --rollout-lr 0.03 --out runs/double_pendulum_mlp
+		--steps 90000 --rollout-steps 4000 --rollout-lr-ratio 0.03 --out runs/double_pendulum_mlp
 	$(NERD) train double_pendulum --start runs/double_pendulum_mlp/best \
 		--data datasets/double_pendulum_mlp $(PENDULUM_MLP) --steps 24000 \
-		--rollout-steps 3000 --lr 0.004 --lr-other 0.0012 --rollout-lr 0.08 \
+		--rollout-steps 3000 --lr 0.004 --adamw-lr 0.0012 --rollout-lr-ratio 0.08 \
 		--out runs/double_pendulum_on
 	cp runs/double_pendulum_on/best/* $(PRETRAINED)/double_pendulum-mlp/
 

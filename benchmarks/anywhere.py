@@ -19,9 +19,7 @@ from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import (
-    Source,
     action_drive,
     initial_states,
     open_loop_errors,
@@ -30,6 +28,7 @@ from torchrl_nerd.evaluation.rollout_error import (
 from torchrl_nerd.files import write_json
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.robots import PRESETS, Source
 from torchrl_nerd.scenes import Scene
 
 FLOOR = 1e-6  # m and rad: no model's error is compared below it
@@ -78,7 +77,7 @@ def error_curves(
 
 def main(options: Options) -> dict[str, float]:
     """Print a line for each quantity."""
-    protocol = PROTOCOLS[options.scene]()
+    protocol = PRESETS[options.scene].protocol()
     ((case, source),) = protocol.cases.items()
     scene, steps = scene_of(source), max(protocol.horizons)
     model = from_pretrained(options.model or options.scene, scene)

@@ -25,9 +25,9 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.bench.contenders import Contender, learned_contenders
 from torchrl_nerd.evaluation.bench.rates import Race, Turn
 from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import make_task
 
 BASELINE = Path(__file__).with_name("bench_baseline.json")
 TOLERANCE = 0.2

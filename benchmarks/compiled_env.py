@@ -19,7 +19,7 @@ from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.bench.rates import Runner, two_in_turn
 from torchrl_nerd.files import write_json
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """A network that corrects a coarse MuJoCo step, beside pure NeRD and MuJoCo itself.
 
     python benchmarks/corrector.py
-    python benchmarks/corrector.py --scene ant --substeps 4 --network mlp-large
+    python benchmarks/corrector.py --scene ant --substeps 4 --network mlp-4x128
 
 The corrector's output is added to the end of one coarse step; a NeRD's, to the present
 state. Both learn from the same transitions of the finest truth, with the same network, loss
@@ -23,6 +23,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor, nn
 from tqdm import trange
 
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.contenders import (
@@ -31,16 +32,14 @@ from torchrl_nerd.evaluation.bench.contenders import (
 )
 from torchrl_nerd.evaluation.bench.errors import Course, courses
 from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way
-from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import summarize
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import network_config
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import PRESETS, load_scene
 from torchrl_nerd.training.losses import one_step_loss
 from torchrl_nerd.training.muon import Muon
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import split_parameters
 from torchrl_nerd.transforms import Stats
 
@@ -54,7 +53,7 @@ class Options:
     scene: str = "cartpole"
     substeps: int = 1
     """Of the coarse step."""
-    network: str = "mlp-micro"
+    network: str = "mlp-1x32"
     trajectories: int = 2_000
     """Of the data, 50 steps each, at 64 substeps or four times the scene's own."""
     updates: int = 6_000
@@ -62,7 +61,7 @@ class Options:
     """Trajectories of the test."""
     rounds: int = 5
     """Turns of each contender at 512 rows."""
-    softening: tuple[float, ...] = (1e-2, 1e-4)
+    loss_eps: tuple[float, ...] = (1e-2, 1e-4)
     """Of the loss: a corrector and a NeRD for each; a smaller one heeds quiet states."""
     compile: bool = False
     seed: int = 0
@@ -116,7 +115,7 @@ def make_model(options: Options, stats: dict | None, is_corrector: bool) -> NeRD
 
 
 def learn(
-    data: TensorDict, base: TensorDictBase, options: Options, softening: float
+    data: TensorDict, base: TensorDictBase, options: Options, loss_eps: float
 ) -> NeRD:
     """A model of the change from ``base [N]`` to the next states of ``data [N]``."""
     torch.manual_seed(options.seed)
@@ -133,7 +132,7 @@ def learn(
     token = model.normalize.normalize(TOKEN, token).float()
     target = model.normalize.normalize(TARGET, target).float()
     model.coverage.fit(token, target, data[NEXT_QPOS], data[NEXT_QVEL])
-    fit(model.network, token, target, options, softening)
+    fit(model.network, token, target, options, loss_eps)
     return model.eval()
 
 
@@ -142,19 +141,19 @@ def fit(
     token: Tensor,
     target: Tensor,
     options: Options,
-    softening: float,
+    loss_eps: float,
 ) -> None:
     """As `Trainer` does on single states; ends with the averaged weights."""
     how, generator = TrainConfig(), Generator().manual_seed(options.seed)
     matrices, others = split_parameters(network)
     optimizers = {
         how.lr: Muon(matrices, lr=how.lr),
-        how.lr_other: torch.optim.AdamW(others, betas=(0.9, 0.95), weight_decay=0.0),
+        how.adamw_lr: torch.optim.AdamW(others, betas=(0.9, 0.95), weight_decay=0.0),
     }
     average = {name: w.detach().clone() for name, w in network.named_parameters()}
     for step in trange(options.updates, disable=None):
         pick = torch.randint(len(token), (1024,), generator=generator)
-        loss = one_step_loss(network(token[pick]), target[pick], softening)
+        loss = one_step_loss(network(token[pick]), target[pick], loss_eps)
         network.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), how.clip)
@@ -208,15 +207,15 @@ def main(options: Options) -> dict[str, Any]:
     for who in mujoco_contenders(scene, threads):
         if "implicitfast" not in who.name:
             everyone[who.name] = who.make(scene)
-    for softening in options.softening:
-        corrector = learn(data, end, options, softening)
-        pure = learn(data, data, options, softening)
-        name = f"softening {softening:.0e}"
+    for loss_eps in options.loss_eps:
+        corrector = learn(data, end, options, loss_eps)
+        pure = learn(data, data, options, loss_eps)
+        name = f"loss_eps {loss_eps:.0e}"
         everyone[f"corrector, {name}"] = ResidualDynamics(
             corrector, coarse, options.compile
         )
         everyone[f"NeRD, {name}"] = NeRDDynamics(pure, compile=options.compile)
-    ground = courses(PROTOCOLS[scene.name](), options.rows, 500, threads)[:1]
+    ground = courses(PRESETS[scene.name].protocol(), options.rows, 500, threads)[:1]
     errors = {name: errors_of(dynamics, ground) for name, dynamics in everyone.items()}
     rates = rates_of(everyone, options)
     for name, by_quantity in errors.items():

@@ -19,10 +19,12 @@ import tyro
 from torch import Generator
 from tyro.conf import Positional
 
-from torchrl_nerd.data.generate import DataConfig, generate
+from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.generate import generate
 from torchrl_nerd.dynamics.mujoco import CONTROL, torque_model
 from torchrl_nerd.files import write_json
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
 
 

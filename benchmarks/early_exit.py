@@ -19,18 +19,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.protocols import protocol_of
-from torchrl_nerd.evaluation.rollout_error import (
-    Source,
-    action_drive,
-    initial_states,
-    scene_of,
-)
+from torchrl_nerd.evaluation.rollout_error import action_drive, initial_states, scene_of
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.flight import LEAST_GAP
 from torchrl_nerd.modules.free_step import FreeStep
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import Source, load_scene, protocol_of
+from torchrl_nerd.scenes import Scene
 
 SLOW = 1e-3  # m/s or rad/s
 

@@ -22,7 +22,7 @@ from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.stability.cases.trust import auc, inputs, scores
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, NeRD
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 
 @dataclass

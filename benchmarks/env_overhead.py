@@ -20,7 +20,7 @@ from torchrl_nerd import NeRDEnv
 from torchrl_nerd.files import write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 
 @dataclass
@@ -86,7 +86,10 @@ def main(options: Options) -> None:
         torch.set_num_threads(options.threads)
     scene = make_task(options.task).scene
     models = {"shipped": None}
-    models |= {name: NeRD(scene, NETWORKS[name]) for name in ("tiny", "small", "paper")}
+    models |= {
+        name: NeRD(scene, NETWORKS[name])
+        for name in ("transformer-2x64", "transformer-4x128", "paper")
+    }
     figures = {}
     print(f"{options.task}, {options.rows} rows, {torch.get_num_threads()} threads")
     print(

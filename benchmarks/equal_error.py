@@ -19,7 +19,7 @@ from stability_table import FIGURES
 from torchrl_nerd.evaluation.bench.pareto import pareto_front
 from torchrl_nerd.evaluation.bench.report import BenchReport
 from torchrl_nerd.files import read_json
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 WAY = ", compiled"  # how a model runs in this table, in float32
 RATES = ("steps_per_s", "envs_per_s")

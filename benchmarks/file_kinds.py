@@ -15,17 +15,17 @@ from torchrl_nerd.checkpoint import (
     make_card,
     save_checkpoint,
 )
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.cube_tosses import COLUMNS, read_log
-from torchrl_nerd.data.generate import CARD, DataConfig, generate, load_data, simulate
+from torchrl_nerd.data.generate import CARD, generate, load_data, simulate
 from torchrl_nerd.data.recorded import load_tosses, read_transitions, write_tosses
 from torchrl_nerd.evaluation.policy import Policy, load_policy, save_policy
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training.log import TrainingLog
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer
 
 Found = dict[str, Tensor]
@@ -36,7 +36,7 @@ SCENE, CUBE = "cartpole", "cube_real"
 DATA = DataConfig(trajectories=6, steps=4)
 CHUNK = 2  # trajectories, in place of the package's own chunk
 TRAIN = TrainConfig(
-    network="mlp", steps=2, rollout_steps=0, rows=2, length=2, save_every=2
+    network="mlp-4x64", steps=2, rollout_steps=0, rows=2, length=2, save_every=2
 )
 
 
@@ -57,7 +57,7 @@ class Kind:
 
 
 def _make_checkpoint(folder: Path) -> None:
-    model = NeRD(load_scene(SCENE), NETWORKS["tiny"])
+    model = NeRD(load_scene(SCENE), NETWORKS["transformer-2x64"])
     save_checkpoint(model, folder, make_card(model))
 
 

@@ -27,27 +27,27 @@ from torch import Generator
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.ahead import ahead
-from torchrl_nerd.data.generate import DataConfig, generate, load_data, simulate
+from torchrl_nerd.data.generate import generate, load_data, simulate
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.tensor_files import read_tensors
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer
 
 SCENE = "cartpole"
 CHUNK = 4  # trajectories, in place of the package's own chunk
 DATA = DataConfig(trajectories=40 * CHUNK - 1, steps=4)
 TRAIN = TrainConfig(
-    network="mlp",
+    network="mlp-4x64",
     steps=20,
     rollout_steps=4,
     rows=4,
     length=2,
-    rollout_rows=4,
+    rollout_batch_size=4,
     rollout_length=2,
     save_every=2,
     validate_every=4,
@@ -150,7 +150,7 @@ class Saving:
 
     def run(self, folder: Path, tell: Tell) -> None:
         """See `Work`."""
-        model = NeRD(load_scene(SCENE), NETWORKS["tiny"])
+        model = NeRD(load_scene(SCENE), NETWORKS["transformer-2x64"])
         # the last one again: its card may have been left behind by its weights
         for number in range(max(1, self.done(folder)), SAVES + 1):
             for weight in model.network.parameters():

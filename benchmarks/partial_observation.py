@@ -13,12 +13,12 @@ from pathlib import Path
 import torch
 
 from torchrl_nerd import from_pretrained, load_scene
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.toss_error import STATES, summarize_both, toss_errors
 from torchrl_nerd.files import write_json
 from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import PRETRAINED_NAME
 
 CASES = {

@@ -27,8 +27,8 @@ from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.evaluation.policy import make_actor
 from torchrl_nerd.files import write_json
+from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks.ppo import PPO_CONFIGS
 
 TRUTH = "MuJoCo"
 

@@ -19,10 +19,12 @@ import ray
 import tyro
 from tyro.conf import Positional
 
-from torchrl_nerd.data.generate import CHUNK, DataConfig, Mapper, generate
+from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.generate import CHUNK, Mapper, generate
 from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.files import write_json
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 
 
 @dataclass

@@ -19,7 +19,8 @@ import torch
 import tyro
 
 from torchrl_nerd.checkpoint import load_checkpoint
-from torchrl_nerd.data.generate import CARD, DataConfig, Draw, generate, load_data
+from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.data.generate import CARD, Draw, generate, load_data
 from torchrl_nerd.data.strategies import strategies
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.envs import make_env
@@ -27,10 +28,7 @@ from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
-from torchrl_nerd.tasks import make_task
-from torchrl_nerd.tasks.ppo import PPO_CONFIGS
-from torchrl_nerd.training.recipes import RECIPES
-from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.robots import PPO_CONFIGS, PRESETS, make_task
 from torchrl_nerd.training.trainer import Trainer
 
 TEST_SEED = 500  # of starts and episodes; never one of training or validation
@@ -42,11 +40,11 @@ class Options:
     """What to compare, and how much to spend on it."""
 
     scene: str = "cartpole"
-    """A scene with a recipe."""
+    """A scene with a preset."""
     only: tuple[str, ...] = ()
     """Names of strategies; all that the scene has by default."""
     task: str | None = None
-    """What the policies do; the task of the scene's recipe by default."""
+    """What the policies do; the task of the scene's preset by default."""
     transitions: int = 200_000
     """Of each data set, at 100 steps a trajectory."""
     network: str = "mlp"
@@ -106,8 +104,8 @@ class Study:
             network=options.network,
             steps=options.updates,
             rollout_steps=0,
-            single_share=1.0,
-            softening=RECIPES[options.scene].train.softening,
+            single_step_fraction=1.0,
+            loss_eps=PRESETS[options.scene].train.loss_eps,
             validate_every=options.updates,
             seed=seed,
         )
@@ -153,10 +151,10 @@ class Study:
 
 def run(options: Options) -> Iterator[dict[str, Any]]:
     """Figures of every strategy and seed; those already measured are read."""
-    if options.scene not in RECIPES:
-        known = ", ".join(RECIPES)
+    if options.scene not in PRESETS:
+        known = ", ".join(PRESETS)
         raise ValueError(f"expected a scene of {known}, got '{options.scene}'")
-    task_id = str(options.task or RECIPES[options.scene].task)
+    task_id = str(options.task or PRESETS[options.scene].task)
     task, folder = make_task(task_id), options.out / options.scene
     policy, explorer = options.policy, options.explorer
     if task_id in PPO_CONFIGS and options.policy_frames:

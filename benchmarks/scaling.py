@@ -30,7 +30,8 @@ from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 
 HEAVY = "dm_control/humanoid-run"
@@ -43,7 +44,7 @@ class Options:
 
     scenes: tuple[str, ...] = (*SCENES, HEAVY)
     batches: tuple[int, ...] = (1, 16, 64, 512, 4096)
-    network: str = "mlp-large"
+    network: str = "mlp-4x128"
     compile: bool = False
     """Compile the learned step: minutes for each scene with contact."""
     rounds: int = 5

@@ -18,13 +18,12 @@ from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.checkpoint import CARD, load_checkpoint
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.training.recipes import recipe_of
-from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.robots import load_scene, preset_of, source_of
 from torchrl_nerd.training.trainer import Trainer
 
 TEST_SEED = 500  # of starts; never one of training or validation
@@ -38,9 +37,9 @@ class Options:
     scene: str = "cartpole"
     trajectories: tuple[int, ...] = (20, 100, 500, 2500)
     """Sizes of data, of 100 transitions each; the largest is that of all others."""
-    networks: tuple[str, ...] = ("mlp-nano", "mlp-tiny", "mlp")
+    networks: tuple[str, ...] = ("mlp-1x16", "mlp-2x32", "mlp-4x64")
     """Beside the first one, by the largest data and the most updates."""
-    first: str = "mlp-micro"
+    first: str = "mlp-1x32"
     updates: tuple[int, ...] = (300, 1_000, 3_000)
     """On 1,024 single states each; the largest number is that of all others."""
     rows: int = 256
@@ -63,18 +62,18 @@ def measure(
     path = folder / "figures.json"
     if path.exists() and read_json(path)["settings"] == settings:
         return read_json(path)
-    scene, recipe = load_scene(options.scene), recipe_of(options.scene)
+    scene, preset = load_scene(options.scene), preset_of(options.scene)
     config = TrainConfig(
         network=network,
         steps=updates,
         rollout_steps=0,
-        single_share=1.0,
-        softening=recipe.train.softening,
+        single_step_fraction=1.0,
+        loss_eps=preset.train.loss_eps,
         validate_every=updates,
         seed=options.seed,
     )
     some = cast(TensorDict, data[:trajectories])
-    source, horizons = recipe.source(scene), options.horizons
+    source, horizons = source_of(scene), options.horizons
     Trainer(scene, some, source, config, folder, horizons=horizons).run()
     model = load_checkpoint(folder / "last", scene)
     errors = passive_errors(

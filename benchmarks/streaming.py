@@ -21,7 +21,8 @@ from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_i
 from torchrl_nerd.files import write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 
 
 @dataclass
@@ -29,7 +30,7 @@ class Options:
     """What to time, and how often."""
 
     scene: Positional[str] = "ant"
-    presets: tuple[str, ...] = ("tiny", "small", "paper")
+    presets: tuple[str, ...] = ("transformer-2x64", "transformer-4x128", "paper")
     rows: int = 512
     rounds: int = 5
     compile: bool = True

@@ -30,7 +30,7 @@ from torchrl_nerd import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import Policy, make_actor
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 

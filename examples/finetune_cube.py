@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from torchrl_nerd import from_pretrained, load_scene
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
@@ -21,7 +22,6 @@ from torchrl_nerd.evaluation.toss_error import STATES, first_state
 from torchrl_nerd.evaluation.toss_plot import plot_toss
 from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
 from torchrl_nerd.files import write_json
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import PRETRAINED_NAME, finetune
 
 

@@ -23,6 +23,7 @@ from torch.optim.lr_scheduler import LinearLR
 from tqdm import trange
 
 from torchrl_nerd import NeRDEnv, from_pretrained, make_env
+from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.memory import recall, remember
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import (
@@ -33,8 +34,7 @@ from torchrl_nerd.evaluation.policy_transfer import (
     transfer_table,
 )
 from torchrl_nerd.files import write_json
-from torchrl_nerd.tasks import make_task
-from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
+from torchrl_nerd.robots import PPO_CONFIGS, make_task
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 

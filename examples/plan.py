@@ -23,7 +23,7 @@ from tqdm import trange
 from torchrl_nerd import make_env
 from torchrl_nerd.envs import StatelessEnv
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.tasks.cartpole import CartpoleSwingup
+from torchrl_nerd.robots.cartpole.tasks import CartpoleSwingup
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 

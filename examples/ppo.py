@@ -25,14 +25,15 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_nerd import make_env
+from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.memory import remember
 from torchrl_nerd.evaluation.plots import plot_learning_curve
 from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
 from torchrl_nerd.evaluation.policy_transfer import mean_returns
 from torchrl_nerd.evaluation.transfer_report import report_transfer
+from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.tasks import Task
-from torchrl_nerd.tasks.ppo import PPO_CONFIGS, PPOConfig
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 

@@ -18,14 +18,14 @@ import ppo
 import torch
 import tyro
 
-from torchrl_nerd.data.generate import DataConfig, generate, load_data
+from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.data.generate import generate, load_data
 from torchrl_nerd.evaluation.policy import Policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.files import write_json
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.importer import load_suite
 from torchrl_nerd.tasks.suite import SuiteTask
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer
 
 
@@ -49,11 +49,11 @@ def make_model(scene: Scene, cfg: Config, folder: Path) -> Path:
     data = DataConfig(trajectories=cfg.trajectories, steps=100, seed=cfg.seed)
     generate(scene, data, folder / "data")
     how = TrainConfig(
-        network="mlp",
+        network="mlp-4x64",
         steps=cfg.updates,
         rollout_steps=cfg.updates // 20,
-        single_share=1.0,
-        softening=0.02,
+        single_step_fraction=1.0,
+        loss_eps=0.02,
         validate_every=max(500, cfg.updates // 3),
         seed=cfg.seed,
     )
@@ -119,10 +119,10 @@ def main(cfg: Config) -> None:
     began = time.monotonic()
     task = SuiteTask(f"dm_control/{cfg.name}", cfg.hold)
     folder = cfg.out / cfg.name
-    model = make_model(load_scene(task.scene_name), cfg, folder)
+    model = make_model(task.scene, cfg, folder)
     print(f"model in {model} after {time.monotonic() - began:.0f} s")
     policy = make_policy(task, model, cfg)
-    save_policy(policy, folder, {"task": task.scene_name, "dynamics": str(model)})
+    save_policy(policy, folder, {"task": task.scene.name, "dynamics": str(model)})
     print(f"policy in {folder} after {time.monotonic() - began:.0f} s")
     where, actor = (str(model), "mujoco", "dm_control"), make_actor(policy)
     report = transfer(task, actor, where, cfg.episodes, seed=cfg.seed + 1)

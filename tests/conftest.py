@@ -14,8 +14,8 @@ import torch
 from helpers import EXCERPT
 
 from torchrl_nerd.data.cube_tosses import Tosses, TossLog, make_tosses, read_log
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
-from torchrl_nerd.tasks import TASKS
+from torchrl_nerd.robots import SCENES, TASKS, load_scene
+from torchrl_nerd.scenes import Scene
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 

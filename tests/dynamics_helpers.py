@@ -30,8 +30,8 @@ from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.ground_step import GroundStep
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, STEPS
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import SCENES, load_scene, make_task
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import cover, data_stats
 from torchrl_nerd.transforms import Stats
 
@@ -111,7 +111,9 @@ def scene_stats(scene: Scene) -> dict[NestedKey, Stats]:
     return data_stats(scene, little_data(scene))
 
 
-def random_model(scene: Scene, generator: Generator, network: str = "tiny") -> NeRD:
+def random_model(
+    scene: Scene, generator: Generator, network: str = "transformer-2x64"
+) -> NeRD:
     """A model of the right scale that has learned nothing."""
     data = little_data(scene)
     model = NeRD(scene, NETWORKS[network], scene_stats(scene))
@@ -120,7 +122,9 @@ def random_model(scene: Scene, generator: Generator, network: str = "tiny") -> N
     return model
 
 
-def double_model(scene: Scene, generator: Generator, network: str = "tiny") -> NeRD:
+def double_model(
+    scene: Scene, generator: Generator, network: str = "transformer-2x64"
+) -> NeRD:
     """The same in float64: random weights blow up float32 rounding."""
     model = random_model(scene, generator, network)
     model.network.double()

@@ -15,7 +15,8 @@ from torch import Generator, Tensor
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.frames import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import ContactPoints
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling, sample_torque

@@ -22,8 +22,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.modules.nerd import TARGET, TOKEN
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.training.recipes import recipe_of
+from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.sequences import raw_tokens
 
 every_variant = pytest.mark.parametrize(
@@ -64,7 +63,7 @@ def test_it_trains(name, variant, seed, generator, tmp_path):
     scene = load_scene(name)
     data = simulate(scene, 3, 40, generator)
     data = data[is_sound(data)]
-    source = recipe_of(name).source(scene)
+    source = source_of(scene)
     parts = VARIANTS[name][variant], scene, data, source, tmp_path
     trainer = VariantTrainer(*parts, updates=UPDATES, seed=seed)
     before = [weight.clone() for weight in trainer.model.network.parameters()]

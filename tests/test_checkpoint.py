@@ -25,15 +25,14 @@ from torchrl_nerd.checkpoint import (
     save_checkpoint,
     shipped_models,
 )
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json, write_atomically, write_json
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import SCENES
-from torchrl_nerd.training.recipes import RECIPES
-from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.robots import PRESETS, SCENES
 
 ROOT = Path(__file__).parents[1]
-SCENE = load_scene(next(iter(SCENES)))
+SCENE = load_scene("cartpole")
 
 
 @pytest.fixture
@@ -43,7 +42,7 @@ def folder(tmp_path, generator) -> Path:
     return save_checkpoint(model, tmp_path / "model", make_card(model))
 
 
-@pytest.mark.parametrize("network", ["tiny", "mlp", "gru", "small"])
+@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru", "small"])
 def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
     model = random_model(scene, generator, network)
     card = make_card(model, {"note": "made by a test"})
@@ -126,7 +125,7 @@ def test_a_patch_release_of_mujoco_is_no_news(folder):
 def test_a_file_where_the_folder_should_be(tmp_path, inside, generator):
     path = tmp_path / "model"
     path.write_text("not a folder")
-    model = random_model(SCENE, generator, "mlp")
+    model = random_model(SCENE, generator, "mlp-4x64")
     with pytest.raises(ValueError, match="folder that can be written") as caught:
         save_checkpoint(model, path / inside, make_card(model))
     assert str(path) in str(caught.value)
@@ -179,24 +178,24 @@ MADE_BY_MAKE = re.findall(r"^model-([\w-]+):", (ROOT / "Makefile").read_text(), 
 
 
 @pytest.mark.parametrize(
-    "name", sorted(set(shipped_models()) & set(RECIPES) - set(MADE_BY_MAKE))
+    "name", sorted(set(shipped_models()) & set(PRESETS) - set(MADE_BY_MAKE))
 )
 def test_recipes_are_those_of_the_shipped_models(name):
     made = read_json(PRETRAINED / name / CARD)["training"]
-    recipe = RECIPES[name]
+    preset = PRESETS[name]
     assert not made.get("start")
-    assert made["trajectories"] == recipe.data.trajectories
-    expect_settings(made, asdict(recipe.train))
+    assert made["trajectories"] == preset.data.trajectories
+    expect_settings(made, asdict(preset.train))
 
 
 @pytest.mark.parametrize("name", MADE_BY_MAKE)
 def test_so_are_make_targets_of_models_that_take_more(name):
     made = read_json(PRETRAINED / name / CARD)["training"]
     assert bool(made["start"]) == name.endswith("-mlp")  # learned on
-    recipe = RECIPES[name.removesuffix("-mlp")]
+    preset = PRESETS[name.removesuffix("-mlp")]
     changes, trajectories = last_training(f"model-{name}")
     assert made["trajectories"] == trajectories
-    expect_settings(made, asdict(recipe.train) | changes)
+    expect_settings(made, asdict(preset.train) | changes)
 
 
 def expect_settings(made: dict, settings: dict) -> None:

@@ -16,10 +16,10 @@ from torchrl_nerd.checkpoint import (
     make_card,
     save_checkpoint,
 )
-from torchrl_nerd.scenes import SCENES, Scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.selfcheck import PREFIX
 
-SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
+SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 
 
 @pytest.fixture
@@ -110,15 +110,15 @@ def test_a_card_that_is_no_json_object(folder, content):
     [
         {"network": None},
         {"network": 7},
-        {"network": "tiny"},
-        {"network": ["tiny"]},
+        {"network": "transformer-2x64"},
+        {"network": ["transformer-2x64"]},
         {"network": {}},
         {"network": {"kind": "rnn"}},
-        {"network": {"kind": ["mlp"]}},
-        {"network": {"kind": "mlp", "breadth": 3}},
-        {"network": {"kind": "mlp", "width": "wide"}},
-        {"network": {"kind": "mlp", "width": -1}},
-        {"network": {"kind": "mlp", "width": 1.5}},
+        {"network": {"kind": ["mlp-4x64"]}},
+        {"network": {"kind": "mlp-4x64", "breadth": 3}},
+        {"network": {"kind": "mlp-4x64", "width": "transformer-2x96"}},
+        {"network": {"kind": "mlp-4x64", "width": -1}},
+        {"network": {"kind": "mlp-4x64", "width": 1.5}},
         {"network": {"kind": "transformer", "heads": 0}},
         {"network": {"kind": "transformer", "heads": 7}},
         {"network": {"kind": "transformer", "layers": None}},

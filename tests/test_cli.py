@@ -10,15 +10,13 @@ from helpers import slow_but
 
 from torchrl_nerd import __version__
 from torchrl_nerd.cli import COMMANDS, main
-from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.scenes import SCENES, load_scene
-from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.robots import PRESETS, SCENES, load_scene
 
 NOTHING_RANDOM = ("doctor", "replay")
 SOON_DONE = ("plot", "explain", "replay")
 QUICK = ("cartpole", "double_pendulum", "cube")  # the others take minutes in all
-TINY = ["--network", "mlp", "--rows", "64", "--rollout-rows", "8", "--quiet"]
+TINY = ["--network", "mlp-4x64", "--rows", "64", "--rollout-batch-size", "8", "--quiet"]
 
 
 def refusal(capsys, *argv: str) -> str:
@@ -71,12 +69,12 @@ def test_every_command_explains_itself(command, capsys):
 
 @pytest.mark.parametrize("command", ["data", "train"])
 def test_help_shows_the_recipe_of_the_scene(command, scene, capsys):
-    recipe = RECIPES[scene.name]
+    preset = PRESETS[scene.name]
     with pytest.raises(SystemExit) as stop:
         main([command, scene.name, "--help"])
     text = capsys.readouterr().out
     assert stop.value.code == 0
-    count = recipe.data.trajectories if command == "data" else recipe.train.steps
+    count = preset.data.trajectories if command == "data" else preset.train.steps
     assert f"default: {count})" in text
 
 
@@ -84,7 +82,7 @@ def test_help_shows_the_recipe_of_the_scene(command, scene, capsys):
     ("argv", "plan"),
     [
         ("data cartpole --trajectories 300 --steps 7", "draw 300 trajectories of"),
-        ("train cartpole --network mlp", "begin a run in runs/cartpole"),
+        ("train cartpole --network mlp-4x64", "begin a run in runs/cartpole"),
         ("train cartpole --fine", "to datasets/cartpole-fine"),
         ("eval cartpole --rows 77", "rows                77"),
         ("stability cube --cases resting", "('resting',)"),
@@ -104,7 +102,7 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     draw = "data cartpole --trajectories 8 --steps 20 --quiet".split()
     learn = "train cartpole --steps 1 --rollout-steps 1 --rows 2 --length 2".split()
-    learn += ["--rollout-rows", "2", "--rollout-length", "2", "--quiet"]
+    learn += ["--rollout-batch-size", "2", "--rollout-length", "2", "--quiet"]
     assert main(draw) == main(learn) == main([*draw, "--dry-run"]) == 0
     assert "where 8 are now" in capsys.readouterr().out
     assert main([*learn, "--dry-run"]) == 0
@@ -226,7 +224,7 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
     capsys.readouterr()
     assert main([*argv, "--json", str(figures["eval"])]) == 0
     table = capsys.readouterr().out.splitlines()[1:]
-    content, protocol = read(figures["eval"]), PROTOCOLS[name]()
+    content, protocol = read(figures["eval"]), PRESETS[name].protocol()
     assert content["command"] == "eval" and content["version"] == __version__
     assert content["configuration"].items() >= {"model": best, "rows": 16}.items()
     assert (content["scene"], content["rows"], content["seed"]) == (name, 16, seed)
@@ -249,7 +247,7 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
 
 
 def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
-    """Default folders, whose names hold no slash; the recipe and protocol of any robot."""
+    """Default folders, whose names hold no slash; the preset and protocol of any robot."""
     monkeypatch.chdir(tmp_path)
     name, folder = "dm_control/cheetah-run", "dm_control-cheetah-run"
     sizes = ["--trajectories", "300", "--steps", "20", "--seed", str(seed), "--quiet"]
@@ -257,7 +255,7 @@ def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, cap
     argv = ["train", name, *TINY, "--steps", "150", "--rollout-steps", "2"]
     assert main([*argv, "--validate-every", "152", "--json", "train.json"]) == 0
     card = json.loads((tmp_path / "train.json").read_text())
-    assert card["scene"] == name and card["training"]["single_share"] == 1.0
+    assert card["scene"] == name and card["training"]["single_step_fraction"] == 1.0
     assert set(card["validation_error"]) == {"20", "100"}
     for place in ("datasets", "runs"):
         assert [path.name for path in (tmp_path / place).iterdir()] == [folder]

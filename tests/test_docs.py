@@ -26,7 +26,7 @@ import torchrl_nerd
 from torchrl_nerd import load_scene
 from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.policy import Policy, save_policy
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -44,8 +44,8 @@ SHARED = {"load_scene": load_scene, "torch": torch, "TensorDict": TensorDict}
 
 BUDGETS = {
     "data": "--trajectories 300 --steps 20 --quiet",
-    "train": "--network mlp --steps 2 --rollout-steps 1 --rows 16 --length 2 "
-    "--rollout-rows 2 --rollout-length 2 --quiet",
+    "train": "--network mlp-4x64 --steps 2 --rollout-steps 1 --rows 16 --length 2 "
+    "--rollout-batch-size 2 --rollout-length 2 --quiet",
     "eval": "--rows 2 --quiet",
     "finetune": "--epochs 1 --quiet",
     "transfer": "--episodes 2 --quiet",
@@ -138,7 +138,7 @@ def test_a_new_users_commands_work_one_after_the_other(
             sizes = {"num_envs": 8, "horizon": 4, "total_frames": 32}
             ppo.main(ppo.Run(episodes=2, **sizes))
         elif words[:1] == ["nerd"]:
-            if words[1] == "train":  # else it draws all that the recipe asks for
+            if words[1] == "train":  # else it draws all that the preset asks for
                 fine = [word for word in words if word == "--fine"]
                 assert main(within_budget(["data", words[2], *fine])) == 0
             assert main(within_budget(words[1:])) == 0, capsys.readouterr().err

@@ -10,7 +10,7 @@ import torch
 from dm_control import suite as dm_suite
 
 from torchrl_nerd.evaluation.policy import load_policy
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -21,7 +21,7 @@ from fuzz_files import in_child
 def write(kind, folder):
     scene = load_scene(SCENE)
     if kind == "checkpoint":
-        model = NeRD(scene, NETWORKS["tiny"])
+        model = NeRD(scene, NETWORKS["transformer-2x64"])
         return lambda: save_checkpoint(model, folder, make_card(model))
     if kind == "data":
         config = DataConfig(trajectories=100, steps=100, seed=1)

@@ -12,11 +12,12 @@ import torchrl_nerd
 PACKAGE = Path(torchrl_nerd.__file__).parent
 LEAVES = {"compiled", "files", "row_threads", "seeds", "settings", "__version__"}
 LEVELS = (
-    {"keys", "geometry", "tensor_files"},
+    {"keys", "configs", "geometry", "tensor_files"},
     {"scenes"},
+    {"tasks"},
+    {"robots"},
     {"transforms", "modules"},
     {"dynamics", "selfcheck", "checkpoint"},
-    {"tasks"},
     {"envs"},
     {"data", "training", "evaluation"},
     {"cli", "gymnasium"},
@@ -89,6 +90,7 @@ def test_checkpoints_know_no_env():
     found = own_imports(PACKAGE / "checkpoint.py") - LEAVES
     assert found <= {
         "scenes",
+        "robots",
         "modules",
         "transforms",
         "keys",

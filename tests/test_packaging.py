@@ -41,7 +41,7 @@ def test_wheel_holds_every_file_of_the_package(wheel):
     packed = {path for path in wheel.namelist() if ".dist-info/" not in path}
     assert packed == source
     assert "torchrl_nerd/py.typed" in packed
-    assert any(re.fullmatch(r"torchrl_nerd/scenes/assets/\w+\.xml", p) for p in packed)
+    assert any(re.fullmatch(r"torchrl_nerd/robots/\w+/\w+\.xml", p) for p in packed)
 
 
 def test_every_shipped_model_is_small_and_complete(wheel):

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 
 def test_every_scene_and_batch_is_a_point(seed, tmp_path):
@@ -37,15 +37,15 @@ def test_contacts_are_those_of_mujoco(generator):
 
 def test_a_size_that_was_measured_is_read(seed, tmp_path, monkeypatch):
     options = scaling_error.Options(
-        trajectories=(2, 3), networks=("mlp-nano",), updates=(1, 2), rows=2, seed=seed
+        trajectories=(2, 3), networks=("mlp-1x16",), updates=(1, 2), rows=2, seed=seed
     )
     options.out, options.horizons = tmp_path, (1,)
     first = scaling_error.main(options)
     assert [(x["network"], x["transitions"], x["updates"]) for x in first] == [
-        ("mlp-micro", 200, 2),
-        ("mlp-micro", 300, 2),
-        ("mlp-micro", 300, 1),
-        ("mlp-nano", 300, 2),
+        ("mlp-1x32", 200, 2),
+        ("mlp-1x32", 300, 2),
+        ("mlp-1x32", 300, 1),
+        ("mlp-1x16", 300, 2),
     ]
     assert all(x["seconds"] >= 0.0 for x in first)
     monkeypatch.setattr(scaling_error, "Trainer", None)  # nothing is trained again

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torchrl_nerd.evaluation.bench.rates import Rate
 from torchrl_nerd.evaluation.bench.report import BenchReport
 from torchrl_nerd.modules.free_step import FreeStep
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 
 def race(

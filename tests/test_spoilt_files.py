@@ -18,7 +18,7 @@ from torchrl_nerd.data.cube_tosses import LARGEST_LOG, read_log
 from torchrl_nerd.data.generate import load_data
 from torchrl_nerd.evaluation.policy import load_policy
 from torchrl_nerd.files import read_json, write_json
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training.log import TrainingLog
 
 FILES = 12  # of each kind
@@ -111,8 +111,8 @@ def test_data_that_are_not_finite(tmp_path, rng):
 @pytest.mark.parametrize(
     "network",
     [
-        {"kind": "mlp", "width": 2**14, "depth": 2**14},
-        {"kind": "mlp", "width": 2**14, "depth": 2},
+        {"kind": "mlp-4x64", "width": 2**14, "depth": 2**14},
+        {"kind": "mlp-4x64", "width": 2**14, "depth": 2},
         {"kind": "gru", "width": 2**14, "layers": 2**14},
         {"kind": "transformer", "width": 2**14, "layers": 2, "heads": 2, "band": 2},
     ],

@@ -8,11 +8,17 @@ import streaming
 def test_a_row_for_every_preset(capsys, seed, tmp_path):
     path = tmp_path / "streaming.json"
     options = streaming.Options(
-        "cartpole", ("tiny",), rows=2, rounds=1, compile=False, seed=seed, json=path
+        "cartpole",
+        ("transformer-2x64",),
+        rows=2,
+        rounds=1,
+        compile=False,
+        seed=seed,
+        json=path,
     )
     options.threads = 1
     (found,) = streaming.main(options)
-    assert found.preset == "tiny" and not found.is_compiled
+    assert found.preset == "transformer-2x64" and not found.is_compiled
     assert found.ratio == found.streaming_per_s / found.window_per_s > 0.0
-    assert "tiny" in capsys.readouterr().out.splitlines()[-1]
+    assert "transformer-2x64" in capsys.readouterr().out.splitlines()[-1]
     assert json.loads(path.read_text())["speeds"][0]["ratio"] == found.ratio

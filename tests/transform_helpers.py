@@ -12,8 +12,7 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from torchrl_nerd.envs import GroundTruthEnv
 from torchrl_nerd.keys import OBSERVATION, QPOS, QVEL, STATE_DELTA
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, load_scene, make_task
 from torchrl_nerd.transforms import (
     ContactFeatures,
     Normalize,
@@ -26,7 +25,7 @@ ENVS, STEPS = 3, 4
 TASK_OF: dict[str, str] = {}
 """One task of every scene that has one."""
 for _name in TASKS:
-    TASK_OF.setdefault(make_task(_name).scene_name, _name)
+    TASK_OF.setdefault(make_task(_name).scene.name, _name)
 
 CLASSES = {t.__name__: t for t in (RobotCentric, ContactFeatures, StateDelta)}
 TRANSFORMS = (*CLASSES, "Normalize")

@@ -4,7 +4,8 @@ __version__ = "0.1.0"
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.envs import GroundTruthEnv, NeRDEnv, make_env
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 
 __all__ = [
     "GroundTruthEnv",

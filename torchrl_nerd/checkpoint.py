@@ -30,7 +30,8 @@ from torchrl_nerd.modules.nerd import Config, NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
-from torchrl_nerd.scenes import Scene, is_import, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.selfcheck import PREFIX as CHECK
 from torchrl_nerd.selfcheck import (
     SelfCheck,
@@ -50,7 +51,7 @@ REST = {"coverage.still", *GAIN}
 NEWEST = {"coverage.qpos_low", "coverage.qpos_high", *REST}
 KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
-    "mlp": MLPConfig,
+    "mlp-4x64": MLPConfig,
     "gru": GRUConfig,
     "residual-mlp": ResidualConfig,
     "free-mlp": FreeConfig,

@@ -10,7 +10,7 @@ Or without the import: ``gymnasium.make("torchrl_nerd.gymnasium:TorchrlNerd/AntR
 
 from gymnasium import register
 
-from torchrl_nerd.tasks import TASKS
+from torchrl_nerd.robots import TASKS
 
 MODULE = "torchrl_nerd.envs.gymnasium_env"
 

@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from torchrl_nerd.files import write_json
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 from .measure import Bed, Budget
 from .plot import plot_ratios

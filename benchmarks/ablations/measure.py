@@ -9,9 +9,10 @@ from typing import Any, cast
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_nerd.data.generate import DataConfig, generate, load_data
+from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.generate import generate, load_data
+from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.evaluation.rollout_error import (
     initial_states,
     open_loop,
@@ -20,8 +21,8 @@ from torchrl_nerd.evaluation.rollout_error import (
 )
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import protocol_of, source_of
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.recipes import recipe_of
 
 from .training import VariantTrainer
 from .variants import VARIANTS, Variant
@@ -60,12 +61,12 @@ class Bed:
 
     def __init__(self, scene: Scene, budget: Budget, folder: Path) -> None:
         self.scene, self.budget, self.folder = scene, budget, folder
-        recipe, protocol = recipe_of(scene.name), protocol_of(scene)
+        protocol = protocol_of(scene)
         config = DataConfig(budget.trajectories, STEPS)
         place = folder / f"data_{budget.trajectories}"
-        draw = recipe.draw(scene)
+        draw = preset_strategy(scene)
         self.data = load_data(scene, generate(scene, config, place, strategy=draw))
-        self.source = recipe.source(scene)
+        self.source = source_of(scene)
         self.steps = min(max(protocol.horizons), MOST_STEPS)
         cases = [
             initial_states(source, budget.rows, budget.test_seed)

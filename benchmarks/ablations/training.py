@@ -6,11 +6,11 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from torchrl_nerd.evaluation.rollout_error import Source
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import Symmetry
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer, adamw
 
 from .variants import Variant
@@ -55,8 +55,8 @@ class VariantTrainer(Trainer):
             rows=TOKENS // length,
             length=length,
             lr=LR,
-            lr_other=LR_OTHER if variant.has_muon else LR_ALONE,
-            softening=SOFTENING[scene.name],
+            adamw_lr=LR_OTHER if variant.has_muon else LR_ALONE,
+            loss_eps=SOFTENING[scene.name],
             seed=seed,
         )
         super().__init__(scene, data, source, config, folder, quiet=True, logger="csv")
@@ -70,7 +70,7 @@ class VariantTrainer(Trainer):
         if self.variant.has_muon:
             return super().make_optimizers()
         weights = list(self.model.network.parameters())
-        return {"adamw": adamw(weights, self.config.lr_other)}
+        return {"adamw": adamw(weights, self.config.adamw_lr)}
 
     def validate(self) -> dict[str, float]:
         """Nothing: no choice hangs on it."""

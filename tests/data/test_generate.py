@@ -7,9 +7,9 @@ import torch
 from helpers import true_step
 from tensordict import TensorDict
 
+from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import (
     LARGEST,
-    DataConfig,
     generate,
     is_sound,
     load_data,
@@ -17,10 +17,10 @@ from torchrl_nerd.data.generate import (
     simulate,
 )
 from torchrl_nerd.files import read_json
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.seeds import stream
 
-SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
+SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 STATE = ("qpos", "qvel")
 
 

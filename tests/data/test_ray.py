@@ -12,12 +12,13 @@ import ray
 import torch
 
 from torchrl_nerd.cli import main
+from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data import generate as module
-from torchrl_nerd.data.generate import DataConfig, generate, load_data, simulate
+from torchrl_nerd.data.generate import generate, load_data, simulate
 from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 SCENE = load_scene("double_pendulum")
 CONFIG = DataConfig(trajectories=22, steps=4)

@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data import generate as module
-from torchrl_nerd.data.generate import DataConfig, generate, load_data
+from torchrl_nerd.data.generate import generate, load_data
 from torchrl_nerd.files import read_json
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import load_scene
 
 CHUNK, CHUNKS = 4, 5
-SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
+SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 CONFIG = DataConfig(trajectories=CHUNK * CHUNKS - 1, steps=3, seed=5)
 MOMENTS = {"simulate": 2, "is_sound": 1, "write_json": 2}
 """Functions of the module -> the call that belongs to the first chunk."""
@@ -25,7 +26,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from torchrl_nerd.data import generate as module
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 module.CHUNK = {chunk}
 statuses = []

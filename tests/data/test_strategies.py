@@ -11,10 +11,10 @@ from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.checkpoint import make_card
+from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import (
     CARD,
     SEGMENT,
-    DataConfig,
     generate,
     is_sound,
     load_data,
@@ -30,11 +30,10 @@ from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import PRESETS, load_scene, make_task
 from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
 from torchrl_nerd.seeds import stream
-from torchrl_nerd.tasks import Task, make_task
-from torchrl_nerd.training.recipes import RECIPES
+from torchrl_nerd.tasks import Task
 
 STATE = ("qpos", "qvel")
 
@@ -53,7 +52,7 @@ class Linear:
 
 
 def task_of(scene) -> Task:
-    return make_task(RECIPES[scene.name].task)
+    return make_task(PRESETS[scene.name].task)
 
 
 def seeded(seed: int) -> Generator:
@@ -259,7 +258,7 @@ def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
     config, ranges = DataConfig(3, 2, seed), scene.sampling.ranges()
     generate(scene, config, tmp_path, quiet=True)
     card, expected = read_json(tmp_path / CARD), json.loads(json.dumps(ranges))
-    model = make_card(NeRD(scene, NETWORKS["mlp"]))
+    model = make_card(NeRD(scene, NETWORKS["mlp-4x64"]))
     assert (
         card["ranges"] == json.loads(json.dumps(model["training_ranges"])) == expected
     )

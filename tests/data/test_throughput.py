@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "data_rate.py"
 

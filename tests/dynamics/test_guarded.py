@@ -124,6 +124,6 @@ def test_bad_arguments_are_named(scene, generator):
         GuardedDynamics(learned, least_trust=0)
     with pytest.raises(ValueError, match="expected a patience of at least 0, got -1"):
         GuardedDynamics(learned, patience=-1)
-    ignorant = NeRDDynamics(NeRD(scene, NETWORKS["mlp"]))
+    ignorant = NeRDDynamics(NeRD(scene, NETWORKS["mlp-4x64"]))
     with pytest.raises(ValueError, match="knows what it was trained on"):
         GuardedDynamics(ignorant)

@@ -21,11 +21,11 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import load_scene
 
 ROWS, STEPS = 4, 14
 each_inference = pytest.mark.parametrize("inference", LEARNED)
-SCENE = load_scene(next(iter(SCENES)))
+SCENE = load_scene("cartpole")
 
 
 def tokens_of(model: NeRD, state, torques, terrain) -> Tensor:
@@ -35,7 +35,7 @@ def tokens_of(model: NeRD, state, torques, terrain) -> Tensor:
 
 
 @each_inference
-@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
 def test_a_path_is_encode_network_decode(scene, inference, network, generator):
     model, window = double_model(scene, generator, network), 5
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
@@ -145,7 +145,7 @@ def test_a_deep_copy_takes_its_history_along(inference, generator):
 
 @pytest.mark.slow
 @each_inference
-@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
 def test_compiled_equals_eager(scene, inference, network, generator):
     model = random_model(scene, generator, network)
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
@@ -165,7 +165,7 @@ def test_compiled_equals_eager(scene, inference, network, generator):
 
 
 def test_bad_choices_are_refused_in_one_sentence(generator):
-    model = NeRD(SCENE, NETWORKS["mlp"])
+    model = NeRD(SCENE, NETWORKS["mlp-4x64"])
     with pytest.raises(ValueError, match="'streaming' or 'window', got 'batch'"):
         NeRDDynamics(model, inference="batch")
     with pytest.raises(ValueError, match="window of at least 1.*got 0"):

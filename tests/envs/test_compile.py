@@ -25,7 +25,7 @@ from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import uniforms
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 TASK = "cartpole/swingup"
 ROWS, STEPS = 4, 5
@@ -157,7 +157,7 @@ def test_a_copy_goes_its_own_way(clone, generator):
 
 def test_gradients_pass_through(generator):
     scene = load_scene("cartpole")
-    model = random_model(scene, generator, "mlp").requires_grad_(False)
+    model = random_model(scene, generator, "mlp-4x64").requires_grad_(False)
     start = generator.initial_seed() % 2**32
     gradients = []
     for is_compiled in (False, True):

@@ -6,7 +6,7 @@ from dynamics_helpers import random_model
 
 from torchrl_nerd.envs import NeRDEnv, make_env
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 ROWS, STEPS = 3, 4
 

@@ -12,7 +12,7 @@ from dynamics_helpers import act, random_model
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.envs.dm_environment import DmEnvironment
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 HORIZON = 6
 

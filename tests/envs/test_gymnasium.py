@@ -14,7 +14,7 @@ import torchrl_nerd.gymnasium
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.envs.gymnasium_env import GymnasiumEnv, GymnasiumVectorEnv
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 TASK, ID = "cartpole/swingup", "TorchrlNerd/CartpoleSwingup-v0"
 STEPS = 12

@@ -14,9 +14,9 @@ from dynamics_helpers import EnvMaker, random_actions
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv
 
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import make_task
 
-TASK = next(iter(TASKS))
+TASK = "cartpole/swingup"
 ROWS, HORIZON = 4, 5
 WARM_UP = 100  # steps until caches and pools are as large as they get
 GROWTH = 2 * 2**20  # bytes, of all the steps

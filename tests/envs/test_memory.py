@@ -6,7 +6,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.memory import recall, remember
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 ROWS, STEPS = 4, 6
 

@@ -23,11 +23,10 @@ from torch import Generator, Tensor
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
-from torchrl_nerd.scenes import SCENES
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import SCENES, TASKS, make_task
 
 ROWS, STEPS = 4, 8
-TASK = next(iter(TASKS))
+TASK = "cartpole/swingup"
 
 
 def life(env, generator: Generator) -> Tensor:

@@ -22,7 +22,7 @@ from torchrl_nerd.evaluation.policy_transfer import (
     transfer,
     transfer_table,
 )
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 TASK = "cartpole/swingup"
 

@@ -4,12 +4,18 @@ import pytest
 import torch
 
 from torchrl_nerd.checkpoint import make_model
-from torchrl_nerd.evaluation.protocols import PROTOCOLS, protocol_of
 from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
 from torchrl_nerd.modules.networks import NETWORKS, network_config
-from torchrl_nerd.scenes import SCENES, load_scene
-from torchrl_nerd.tasks import TASKS, make_task
-from torchrl_nerd.training.recipes import RECIPES, recipe_of
+from torchrl_nerd.robots import (
+    PRESETS,
+    SCENES,
+    TASKS,
+    load_scene,
+    make_task,
+    preset_of,
+    protocol_of,
+    source_of,
+)
 
 CARTPOLE = """
                         100     500     1000
@@ -34,11 +40,11 @@ def table(text: str) -> dict[tuple[int, str], float]:
 
 
 def test_every_scene_has_a_protocol_and_recipes_are_of_scenes():
-    assert set(PROTOCOLS) == set(SCENES) >= set(RECIPES)
+    assert set(PRESETS) == set(SCENES) >= set(PRESETS)
 
 
 def test_protocols_fit_their_scene(scene):
-    protocol = PROTOCOLS[scene.name]()
+    protocol = PRESETS[scene.name].protocol()
     names = {scene.model.joint(i).name for i in range(scene.model.njnt)}
     if scene.base.is_floating:
         names = {"base_position", "base_orientation", "joints"}
@@ -52,18 +58,18 @@ def test_protocols_fit_their_scene(scene):
         assert quantity in names and 0.0 < figure < 1.0
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", PRESETS)
 def test_recipes_fit_their_scene(name):
-    recipe = RECIPES[name]
-    assert recipe.task in TASKS and make_task(recipe.task).scene is load_scene(name)
-    assert make_model(load_scene(name), network_config(recipe.train.network))
-    assert recipe.data.steps >= max(recipe.train.length, recipe.train.rollout_length)
+    preset = PRESETS[name]
+    assert preset.task in TASKS and make_task(preset.task).scene is load_scene(name)
+    assert make_model(load_scene(name), network_config(preset.train.network))
+    assert preset.data.steps >= max(preset.train.length, preset.train.rollout_length)
 
 
 def test_published_figures_of_the_cartpole():
     expected = {("passive", *key): value for key, value in table(CARTPOLE).items()}
     assert len(expected) == 6
-    assert PROTOCOLS["cartpole"]().published == expected
+    assert PRESETS["cartpole"].protocol().published == expected
 
 
 def test_published_figures_of_the_double_pendulum():
@@ -72,11 +78,11 @@ def test_published_figures_of_the_double_pendulum():
         for (ground, joint), value in table(DOUBLE_PENDULUM).items()
     }
     assert len(expected) == 14
-    assert PROTOCOLS["double_pendulum"]().published == expected
+    assert PRESETS["double_pendulum"].protocol().published == expected
 
 
 def test_published_figures_of_the_ant():
-    protocol = PROTOCOLS["ant"]()
+    protocol = PRESETS["ant"].protocol()
     assert protocol.horizons == (100, 500) and not protocol.random_actions
     assert protocol.published == {
         ("passive", 500, "base_position"): 0.057,
@@ -86,7 +92,7 @@ def test_published_figures_of_the_ant():
 
 
 def test_arms_are_driven_and_no_other_robot_is():
-    driven = {name for name in PROTOCOLS if PROTOCOLS[name]().random_actions}
+    driven = {name for name in PRESETS if PRESETS[name].protocol().random_actions}
     assert driven == {"franka", "franka_gravity"}
 
 
@@ -100,10 +106,10 @@ def test_arms_are_driven_and_no_other_robot_is():
 )
 def test_robots_of_others_start_within_their_own_ranges(name, cases, seed):
     scene = load_scene(name)
-    protocol, recipe = protocol_of(scene), recipe_of(name)
+    protocol, preset = protocol_of(scene), preset_of(name)
     assert list(protocol.cases) == cases and not protocol.published
     assert protocol.random_actions == ("random",)
-    assert recipe.source(scene) is scene and recipe.train.network in NETWORKS
+    assert source_of(scene) is scene and preset.train.network in NETWORKS
     start = initial_states(scene, 20, seed)
     expected, _ = scene.sample_initial(20, torch.Generator().manual_seed(seed))
     assert all(torch.equal(start[key], value) for key, value in expected.items())

@@ -19,8 +19,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     summarize,
     unit_of,
 )
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, load_scene, make_task
 
 ROWS, STEPS = 6, 5
 

@@ -6,8 +6,7 @@ from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer
 from torchrl_nerd.evaluation.shipped_policies import shipped_policies, shipped_policy
-from torchrl_nerd.tasks import make_task
-from torchrl_nerd.tasks.ppo import PPO_CONFIGS
+from torchrl_nerd.robots import PPO_CONFIGS, make_task
 
 PAPER = {
     "cartpole/swingup": 1212.5,

@@ -20,7 +20,8 @@ from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_ca
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, settled, starts
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, EnvWorld
 from torchrl_nerd.evaluation.traces import energy as traced_energy
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.scenes import Scene
 
 SCALE = 0.001
 QUICK = ("cartpole", "double_pendulum", "franka", "cube")  # others take up to a minute

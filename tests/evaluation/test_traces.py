@@ -5,10 +5,9 @@ import torch
 from helpers import make_scene
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.evaluation.trace_plot import plot_traces, plot_training, read_log
 from torchrl_nerd.evaluation.traces import compare_traces, energy
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene, protocol_of
 
 PENDULUM = """
 <mujoco><worldbody><body pos="0 0 2"><joint name="hinge" axis="0 1 0"/>

@@ -8,14 +8,13 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli import main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
-from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
 from torchrl_nerd.files import read_json
 from torchrl_nerd.keys import QPOS
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.scenes.double_pendulum import double_pendulum_over
-from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
+from torchrl_nerd.robots import PRESETS, load_scene
+from torchrl_nerd.robots.double_pendulum.scene import double_pendulum_over
+from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
 
-CASES = UNSEEN_TERRAIN["double_pendulum"]().cases
+CASES = PRESETS["double_pendulum"].unseen_terrain().cases
 each_case = pytest.mark.parametrize("case", CASES)
 
 

@@ -13,7 +13,7 @@ from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 
 ROWS = 16
 BRANCHED = """<mujoco><option gravity="1 -2 -9"/><worldbody>

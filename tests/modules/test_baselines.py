@@ -9,7 +9,7 @@ from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 
 INPUTS, OUTPUTS, ROWS, STEPS = 5, 3, 4, 14
 CONFIGS = {
-    "mlp": MLPConfig(),
+    "mlp-4x64": MLPConfig(),
     "linear": MLPConfig(depth=0),
     "gru": GRUConfig(),
     "deep gru": GRUConfig(layers=3, width=16),
@@ -85,7 +85,7 @@ def test_gradients_through_stepping_equal_the_full_sequence(config, generator):
         torch.testing.assert_close(got, want, atol=1e-10, rtol=1e-10)
 
 
-@pytest.mark.parametrize("name", ["mlp", "gru"])
+@pytest.mark.parametrize("name", ["mlp-4x64", "gru"])
 def test_only_the_gru_remembers(name, generator):
     network = build(CONFIGS[name], generator)
     tokens = randn(generator, ROWS, STEPS, INPUTS)
@@ -93,10 +93,10 @@ def test_only_the_gru_remembers(name, generator):
     changed[:, 3] = randn(generator, ROWS, INPUTS)
     with torch.no_grad():
         later, other = network(tokens)[:, 4:], network(changed)[:, 4:]
-    assert torch.equal(later, other) == (name == "mlp")
+    assert torch.equal(later, other) == (name == "mlp-4x64")
 
 
-@pytest.mark.parametrize("name", ["mlp", "gru"])
+@pytest.mark.parametrize("name", ["mlp-4x64", "gru"])
 def test_later_tokens_do_not_change_earlier_outputs(name, generator):
     network = build(CONFIGS[name], generator)
     tokens = randn(generator, ROWS, STEPS, INPUTS)

@@ -30,7 +30,7 @@ from torchrl_nerd.modules.correction import FreeConfig, GroundedConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.grounded import GroundedNeRD
 from torchrl_nerd.modules.networks import STEPS
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.training.sequences import cover
 from torchrl_nerd.training.start import begin_from
 
@@ -263,4 +263,4 @@ def test_it_can_be_learned_on(scene, network, generator):
         torch.equal(model.network.state_dict()[k], x) for k, x in weights.items()
     )
     with pytest.raises(ValueError, match=f"start from, {network}, got mlp"):
-        begin_from(start, scene, "mlp")
+        begin_from(start, scene, "mlp-4x64")

@@ -11,7 +11,7 @@ from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.flight import LEAST_GAP, Flight
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 
 ROWS = 64
 
@@ -55,7 +55,7 @@ def test_the_paper_robots_fly():
 
 @each_flying
 def test_what_flies_goes_where_mujoco_goes(scene, generator):
-    model = random_model(scene, generator, "mlp").fly()
+    model = random_model(scene, generator, "mlp-4x64").fly()
     rows = transitions(scene, 4 * ROWS, generator)
     flies, found, _ = flying(model, rows)
     assert flies.any()
@@ -71,7 +71,7 @@ def test_what_flies_goes_where_mujoco_goes(scene, generator):
 @each_flying
 def test_it_flies_where_nothing_is_met(scene, generator):
     """Gaps at both ends are MuJoCo's own distances, limits those of the file."""
-    model = random_model(scene, generator, "mlp").fly()
+    model = random_model(scene, generator, "mlp-4x64").fly()
     rows = transitions(scene, 4 * ROWS, generator)
     flies, found, _ = flying(model, rows)
     terrain = rows.get(TERRAIN, None)
@@ -87,7 +87,7 @@ def test_it_flies_where_nothing_is_met(scene, generator):
 
 @each_flying
 def test_other_rows_are_the_networks_to_the_bit(scene, generator):
-    model = random_model(scene, generator, "mlp").fly()
+    model = random_model(scene, generator, "mlp-4x64").fly()
     rows = transitions(scene, ROWS, generator)
     flies, found, without = flying(model, rows)
     for key in (QPOS, QVEL):
@@ -97,7 +97,7 @@ def test_other_rows_are_the_networks_to_the_bit(scene, generator):
 @each_flying
 def test_a_row_flies_the_same_whoever_flies_beside_it(scene, generator):
     """To the bit: a neighbour that breaks or lands changes nothing."""
-    model = random_model(scene, generator, "mlp").fly()
+    model = random_model(scene, generator, "mlp-4x64").fly()
     rows = transitions(scene, ROWS, generator)
     found = step(model, rows)
     for broken in torch.randperm(ROWS, generator=generator)[:5].tolist():
@@ -141,7 +141,7 @@ def test_one_code_is_compiled_for_any_number_that_flies(
         return fly(*args)
 
     monkeypatch.setattr(Flight, "_fly", noting)
-    model = random_model(scene, generator, "mlp").fly()
+    model = random_model(scene, generator, "mlp-4x64").fly()
     rows = transitions(scene, 8 * ROWS, generator)
     flies = flying(model, rows)[0]
     most = min(ROWS, int(flies.sum()))
@@ -168,7 +168,7 @@ def test_one_code_is_compiled_for_any_number_that_flies(
 def test_a_checkpoint_knows_that_it_flies(tmp_path, generator):
     scene = load_scene("ant")
     for flies in (False, True):
-        model = random_model(scene, generator, "mlp")
+        model = random_model(scene, generator, "mlp-4x64")
         model = model.fly() if flies else model
         card = make_card(model)
         loaded = load_checkpoint(save_checkpoint(model, tmp_path / str(flies), card))
@@ -180,7 +180,7 @@ def test_a_checkpoint_knows_that_it_flies(tmp_path, generator):
 def test_a_path_through_the_air_is_a_parabola(generator):
     """However little the network has learned."""
     scene = load_scene("cube")
-    model = random_model(scene, generator, "mlp").fly()
+    model = random_model(scene, generator, "mlp-4x64").fly()
     rows = random_transitions(scene, ROWS, generator)
     rows[QPOS][:, 2] += 50.0
     torque = torch.zeros(60, ROWS, 0, dtype=torch.float64)

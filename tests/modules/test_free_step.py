@@ -12,7 +12,7 @@ from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.free import FreeNeRD
 from torchrl_nerd.modules.free_step import FreeStep
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.transforms import StateDelta
 
 ROWS = 64

@@ -17,7 +17,7 @@ from helpers import (
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.ground_step import GroundStep
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes.penalty import set_penalty_contact
 
 ROWS = 256

@@ -14,7 +14,7 @@ from torchrl_nerd.modules.transformer import (
 
 INPUTS, OUTPUTS = 5, 3
 CONFIGS = {
-    "tiny": PRESETS["tiny"],
+    "transformer-2x64": PRESETS["transformer-2x64"],
     "narrow band": TransformerConfig(layers=1, width=8, heads=1, band=2),
     "deep": TransformerConfig(layers=3, width=24, heads=3, band=4),
 }

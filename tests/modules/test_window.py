@@ -9,7 +9,7 @@ from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.window import WindowNetwork
 
 INPUTS, OUTPUTS, ROWS, STEPS = 5, 3, 4, 24
-each_network = pytest.mark.parametrize("name", ["tiny", "mlp", "gru"])
+each_network = pytest.mark.parametrize("name", ["transformer-2x64", "mlp-4x64", "gru"])
 
 
 def build(name: str, size: int, generator: Generator) -> WindowNetwork:
@@ -58,7 +58,7 @@ def test_window_is_the_network_on_the_last_tokens(name, size, generator):
 
 
 def test_depth_widens_the_streaming_view_beyond_the_window(generator):
-    window = build("tiny", NETWORKS["tiny"].band, generator)
+    window = build("transformer-2x64", NETWORKS["transformer-2x64"].band, generator)
     tokens = randn(generator, ROWS, STEPS, INPUTS)
     never = torch.zeros(ROWS, STEPS, dtype=torch.bool)
     with torch.no_grad():

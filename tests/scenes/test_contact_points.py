@@ -9,17 +9,17 @@ import torch
 from helpers import every_scene, make_scene, random_states, random_transitions
 
 from torchrl_nerd.keys import CONTACT_DISTANCE, CONTACT_NORMAL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import SCENES, load_scene
-from torchrl_nerd.scenes.contact_points import (
-    MARGIN_PER_RADIUS,
-    MIN_MARGIN,
-    own_contacts,
-)
-from torchrl_nerd.scenes.double_pendulum import (
+from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.robots.double_pendulum.scene import (
     GROUNDS,
     RADIUS,
     ROOT,
     evaluation_ground,
+)
+from torchrl_nerd.scenes.contact_points import (
+    MARGIN_PER_RADIUS,
+    MIN_MARGIN,
+    own_contacts,
 )
 from torchrl_nerd.transforms import ContactFeatures
 

@@ -5,7 +5,7 @@ import torch
 from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.stability.states import ground_turned, starts, turned
-from torchrl_nerd.scenes.cube_slope import STEEPEST
+from torchrl_nerd.robots.cube.scene import STEEPEST
 
 ROWS = 64
 SCENE, LEVEL = load_scene("cube_slope"), load_scene("cube")

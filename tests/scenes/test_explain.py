@@ -15,7 +15,7 @@ from helpers import (
 
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes.explain import base_effects
 from torchrl_nerd.transforms import StateDelta
 

@@ -14,7 +14,8 @@ from torchrl_nerd.checkpoint import (
     read_checkpoint,
     save_checkpoint,
 )
-from torchrl_nerd.data.generate import DataConfig, generate, load_data
+from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.generate import generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
@@ -26,7 +27,9 @@ def test_it_is_another_truth_of_the_same_scene(scene):
     fine = scene.fine
     assert fine.fine is fine and fine.hash != scene.hash
     assert fine.control_step == pytest.approx(scene.control_step, rel=1e-12)
-    models = (NeRD(s, network_config("tiny")).state_dict() for s in (scene, fine))
+    models = (
+        NeRD(s, network_config("transformer-2x64")).state_dict() for s in (scene, fine)
+    )
     shapes = [{key: value.shape for key, value in m.items()} for m in models]
     assert shapes[0] == shapes[1]
 

@@ -19,7 +19,8 @@ from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.scene_tokens import SceneTokens
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.actuators import ActuatorController
 from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.transforms import StateDelta
@@ -231,7 +232,7 @@ def test_control_steps_are_the_tasks(robot):
 def test_a_network_can_step_it(robot, generator):
     state, action = states_and_actions(robot, generator, robot.sampling.clearance)
     torque = robot.controller(action, state[QPOS], state[QVEL])
-    dynamics = NeRDDynamics(NeRD(robot, NETWORKS["tiny"]))
+    dynamics = NeRDDynamics(NeRD(robot, NETWORKS["transformer-2x64"]))
     assert dynamics.model.tokens.size == SceneTokens(robot).size
     tokens = dynamics.model.tokens(state[QPOS], state[QVEL], torque, None)
     assert tokens.shape == (ROWS, dynamics.model.tokens.size)
@@ -367,7 +368,7 @@ def test_data_can_be_drawn_from_a_name(tmp_path):
 @pytest.mark.parametrize("is_file", [True, False])
 def test_a_checkpoint_finds_its_robot_again(is_file, tmp_path):
     scene = servo_scene(tmp_path) if is_file else load_scene("gymnasium/Ant-v5")
-    model = NeRD(scene, NETWORKS["tiny"])
+    model = NeRD(scene, NETWORKS["transformer-2x64"])
     save_checkpoint(model, tmp_path / "checkpoint", make_card(model))
     again = load_checkpoint(tmp_path / "checkpoint", scene if is_file else None)
     assert again.scene.hash == scene.hash

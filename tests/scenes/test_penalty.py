@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes.penalty import set_penalty_contact, set_penalty_limit
 
 RADIUS = 0.1  # m

@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from torchrl_nerd.data.generate import is_sound, simulate
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.scenes.anymal import LEGS, random_pd
-from torchrl_nerd.scenes.franka import HOME
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots.anymal.scene import LEGS, random_pd
+from torchrl_nerd.robots.franka.scene import HOME
 
 PUBLISHED = {
     path.stem: path for path in sorted((Path(__file__).parent / "published").glob("*"))

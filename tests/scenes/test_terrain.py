@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchrl_nerd.geometry.frames import rotate
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.scenes.double_pendulum import (
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots.double_pendulum.scene import (
     GROUNDS,
     LEVEL_TILT,
     evaluation_ground,

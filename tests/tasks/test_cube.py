@@ -5,7 +5,7 @@ import torch
 from dynamics_helpers import act
 
 from torchrl_nerd import GroundTruthEnv
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 TOSSES = ("cube/toss", "cube_real/toss")
 

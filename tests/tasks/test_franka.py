@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd import GroundTruthEnv
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 REACH = ("franka/reach", "franka/reach_torque", "franka_gravity/reach_torque")
 HOME = (0.0, -0.7853, 0.0, -2.3575, 0.0, 1.5703, 0.7857)  # rad

@@ -21,7 +21,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.tasks.suite import SuiteTask
 
 SUITE = [

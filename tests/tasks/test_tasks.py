@@ -6,7 +6,7 @@ import torch
 from dynamics_helpers import random_drive
 from tensordict import TensorDict
 
-from torchrl_nerd.tasks import TASKS, make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 ROWS = 64
 ALMOST_ONE = 1.0 - 2.0**-53

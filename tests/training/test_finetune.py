@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.geometry.manifold import integrate_pos
@@ -13,7 +14,6 @@ from torchrl_nerd.modules.pose_encoder import PoseEncoder
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.convergence import converged, score
 from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.pose_loss import pose_error, rollout
 from torchrl_nerd.training.toss_models import from_scratch
 
@@ -55,7 +55,11 @@ def test_physics_is_fitted_without_gradients(model, tosses):
 
 def test_only_a_simulator_has_physics_to_fit(real_cube, tosses):
     with pytest.raises(SettingError, match="simulator"):
-        tuner(from_scratch(real_cube, tosses, "mlp", seed=0), tosses, update="physics")
+        tuner(
+            from_scratch(real_cube, tosses, "mlp-4x64", seed=0),
+            tosses,
+            update="physics",
+        )
 
 
 def test_statistics_are_frozen_and_the_given_model_is_left_alone(model, tosses):
@@ -94,7 +98,7 @@ def test_it_stops_where_validation_stands_still_at_full_length(model, tosses):
     still = {"lr": 0.0, "physics_lr": 0.0}
     run = tuner(model, tosses, epochs=1.0, validate_every=1, patience=2, **still)
     run.run()
-    short = run.config.short_share * run.updates_per_epoch
+    short = run.config.short_history_fraction * run.updates_per_epoch
     done = run.curve[-1]["epoch"] * run.updates_per_epoch
     assert done == pytest.approx(int(short) + 2) and done < run.updates_per_epoch
 

@@ -10,7 +10,8 @@ from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.losses import (
     one_step_loss,
     relative_error,
@@ -71,14 +72,14 @@ def model_of(scene: Scene, data, config) -> NeRD:
 
 def test_errors_are_relative_lengths(rng):
     targets = rng.normal(size=(4, 5, 3)) * 10.0 ** rng.uniform(-3, 3, size=(4, 5, 1))
-    softening = rng.uniform(0.01, 1.0)
+    loss_eps = rng.uniform(0.01, 1.0)
     outputs = targets + rng.normal(size=targets.shape)
     size = (targets**2).mean(-1)
-    expected = np.sqrt(((outputs - targets) ** 2).mean(-1) / (size + softening))
+    expected = np.sqrt(((outputs - targets) ** 2).mean(-1) / (size + loss_eps))
     pair = torch.from_numpy(outputs), torch.from_numpy(targets)
-    errors = relative_error(pair[0] - pair[1], torch.from_numpy(size), softening)
+    errors = relative_error(pair[0] - pair[1], torch.from_numpy(size), loss_eps)
     np.testing.assert_allclose(errors.numpy(), expected, rtol=1e-5, atol=1e-4)
-    loss = one_step_loss(*pair, softening)
+    loss = one_step_loss(*pair, loss_eps)
     np.testing.assert_allclose(float(loss), expected.mean(), rtol=1e-5, atol=1e-4)
 
 
@@ -118,11 +119,11 @@ def test_one_step_of_the_cartpole_by_hand(generator):
     drift = (velocity - qvel[:, 1]) / scale
     slip = (position - qpos[:, 1]) / (scale * step)
     change = (qvel[:, 1] - qvel[:, 0]) / scale
-    softening = 0.07
-    size = (change**2).mean(-1) + softening
+    loss_eps = 0.07
+    size = (change**2).mean(-1) + loss_eps
     square = (np.concatenate((drift, slip), -1) ** 2).mean(-1) / size
     expected = np.sqrt(square + 1e-8).mean()
-    loss = rollout_loss(model, *batch_of(data), softening)
+    loss = rollout_loss(model, *batch_of(data), loss_eps)
     np.testing.assert_allclose(float(loss.detach()), expected, rtol=1e-5)
 
 

@@ -10,17 +10,17 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from torchrl_nerd.data.generate import DataConfig, generate
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.data.generate import generate
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training import ranks
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.transforms import Stats
 
 BRIEF = (
     *("--steps", "12", "--rollout-steps", "3", "--rows", "8", "--length", "4"),
-    *("--rollout-rows", "4", "--rollout-length", "3", "--warmup", "2"),
+    *("--rollout-batch-size", "4", "--rollout-length", "3", "--warmup", "2"),
     *("--save-every", "5", "--validate-every", "3", "--quiet", "--threads", "1"),
-    *("--bf16-share", "0"),  # whose rounding is a thousand times as coarse
+    *("--bf16-fraction", "0"),  # whose rounding is a thousand times as coarse
 )
 
 
@@ -45,7 +45,7 @@ def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str
         ("double_pendulum", ()),
         pytest.param(
             "cube",
-            ("--network", "mlp-micro", "--use-symmetry"),
+            ("--network", "mlp-1x32", "--use-symmetry"),
             marks=pytest.mark.slow,
         ),
     ],

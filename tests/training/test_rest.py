@@ -10,7 +10,7 @@ from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
-from torchrl_nerd.scenes import SCENES
+from torchrl_nerd.robots import SCENES
 from torchrl_nerd.training.rest import LARGEST, ROWS, STILL, find_rest, resting
 
 GROUNDED = [name for name in SCENES if load_scene(name).terrain is not None]
@@ -28,7 +28,7 @@ def states_at_rest(scene, generator, rows=32):
 
 def sluggish_model(scene, generator, size):
     """Keeps every velocity but for noise of a size, in m/s and rad/s."""
-    model = NeRD(scene, network_config("mlp-micro")).eval()
+    model = NeRD(scene, network_config("mlp-1x32")).eval()
     with torch.no_grad():
         for weight in model.network.head.parameters():
             weight.copy_(size * torch.randn(weight.shape, generator=generator))

@@ -13,12 +13,11 @@ from dynamics_helpers import random_model
 from safetensors.torch import load_file
 from torch import Generator
 
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import simulate
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.tasks import make_task
-from torchrl_nerd.training.train_config import TrainConfig
+from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.training.trainer import Trainer
 
 SCENE, TASK = "cartpole", "cartpole/swingup"
@@ -27,10 +26,10 @@ CONFIG = TrainConfig(
     rollout_steps=8,
     rows=16,
     length=6,
-    rollout_rows=8,
+    rollout_batch_size=8,
     rollout_length=4,
     warmup=3,
-    bf16_share=0.5,
+    bf16_fraction=0.5,
     save_every=4,
     validate_every=3,
 )
@@ -53,8 +52,8 @@ from pathlib import Path
 import torch
 from torch import Generator
 from torchrl_nerd.data.generate import simulate
-from torchrl_nerd.scenes import load_scene
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.training import trainer as module
 
 torch.set_num_threads({threads})

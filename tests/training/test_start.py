@@ -12,6 +12,7 @@ from torchrl_nerd.checkpoint import (
     save_checkpoint,
 )
 from torchrl_nerd.cli import main
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json
@@ -19,20 +20,19 @@ from torchrl_nerd.modules.correction import ResidualConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.residual import ResidualNeRD
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.training import trainer
 from torchrl_nerd.training.sequences import Symmetry, cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer
 
 CONFIG = TrainConfig(
-    network="tiny",
+    network="transformer-2x64",
     steps=6,
     rollout_steps=2,
     rows=4,
     length=3,
-    rollout_rows=4,
+    rollout_batch_size=4,
     rollout_length=3,
     save_every=4,
     validate_every=8,
@@ -100,11 +100,11 @@ def test_statistics_are_frozen_and_bounds_do_not_shrink(
 def test_features_of_another_width_are_refused_in_a_sentence(name, generator):
     scene = load_scene(name)
     start = random_model(scene.foreseeing(False), generator)
-    begin_from(start, start.scene, "tiny")
+    begin_from(start, start.scene, "transformer-2x64")
     sizes = start.tokens.size, NeRD(scene, start.config).tokens.size
     if sizes[0] != sizes[1]:
         with pytest.raises(ValueError, match=f"{sizes[1]} features.*got {sizes[0]}"):
-            begin_from(start, scene, "tiny")
+            begin_from(start, scene, "transformer-2x64")
 
 
 @pytest.mark.parametrize("name", [n for n in SCENES if load_scene(n).terrain])
@@ -116,7 +116,7 @@ def test_the_scene_is_used_as_it_is_given(name, tmp_path, generator):
     save_checkpoint(start, tmp_path, make_card(start))
     start = from_pretrained(tmp_path, scene)
     assert not start.scene.foresees_free_motion
-    model = begin_from(start, scene, "tiny")
+    model = begin_from(start, scene, "transformer-2x64")
     assert model.scene is scene and scene.foresees_free_motion
     for part in ("network", "normalize"):
         mine, theirs = (getattr(m, part).state_dict() for m in (model, start))
@@ -125,35 +125,35 @@ def test_the_scene_is_used_as_it_is_given(name, tmp_path, generator):
 
 
 def test_other_networks_are_refused(generator):
-    start = random_model(CARTPOLE, generator, "mlp")
+    start = random_model(CARTPOLE, generator, "mlp-4x64")
     with pytest.raises(ValueError, match="network.*start from, mlp, got tiny"):
-        begin_from(start, CARTPOLE, "tiny")
+        begin_from(start, CARTPOLE, "transformer-2x64")
     cube = load_scene("cube_real")
     residual = ResidualNeRD(cube, ResidualConfig())
     with pytest.raises(ValueError, match="start from, ResidualConfig.*got mlp"):
-        begin_from(residual, cube, "mlp")
+        begin_from(residual, cube, "mlp-4x64")
 
 
 def test_images_need_statistics_that_they_share(generator):
-    scene, config = load_scene("ant"), NETWORKS["mlp-nano"]
+    scene, config = load_scene("ant"), NETWORKS["mlp-1x16"]
     data = simulate(scene, 64, 4, generator)
     data = data[is_sound(data)]
     symmetry, stats = Symmetry.of(scene, data), data_stats(scene, data)
     shared = NeRD(scene, config, symmetry.complete(stats))
-    begin_from(shared, scene, "mlp-nano", symmetry)
+    begin_from(shared, scene, "mlp-1x16", symmetry)
     alone = NeRD(scene, config, stats)
-    begin_from(alone, scene, "mlp-nano")
+    begin_from(alone, scene, "mlp-1x16")
     with pytest.raises(ValueError, match="trained on symmetry images"):
-        begin_from(alone, scene, "mlp-nano", symmetry)
+        begin_from(alone, scene, "mlp-1x16", symmetry)
 
 
 def test_the_shipped_ant_can_be_shown_images(generator):
     scene = load_scene("ant")
     model, data = from_pretrained("ant-mlp", scene), simulate(scene, 16, 4, generator)
-    begin_from(model, model.scene, "mlp-larger", Symmetry.of(model.scene, data))
+    begin_from(model, model.scene, "mlp-4x160", Symmetry.of(model.scene, data))
 
 
-ARGS = ["train", "cartpole", "--quiet", "--rows", "4", "--rollout-rows", "4"]
+ARGS = ["train", "cartpole", "--quiet", "--rows", "4", "--rollout-batch-size", "4"]
 ARGS += ["--steps", "3", "--rollout-steps", "1", "--length", "2", "--logger", "csv"]
 ARGS += ["--rollout-length", "2", "--validate-every", "4"]
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Generator
 
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.frames import orientation_error
@@ -12,13 +13,12 @@ from torchrl_nerd.modules.baselines import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.scene_tokens import SceneTokens
-from torchrl_nerd.scenes import Scene, load_scene
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import load_scene, make_task
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.images import Images
 from torchrl_nerd.training.losses import rollout_loss
 from torchrl_nerd.training.sequences import Sequences, Symmetry, data_stats, raw_tokens
 from torchrl_nerd.training.symmetry import find_isometries
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer
 from torchrl_nerd.transforms import StateDelta
 
@@ -144,8 +144,10 @@ def test_training_with_symmetry_resumes_to_the_same_bits(tmp_path):
     scene = load_scene("ant")
     data = simulate(scene, 60, 12, Generator().manual_seed(1))
     config = TrainConfig(
-        **dict(network="mlp", use_symmetry=True, steps=6, rollout_steps=4, rows=16),
-        **dict(length=4, rollout_rows=16, rollout_length=4, save_every=4),
+        **dict(
+            network="mlp-4x64", use_symmetry=True, steps=6, rollout_steps=4, rows=16
+        ),
+        **dict(length=4, rollout_batch_size=16, rollout_length=4, save_every=4),
         validate_every=20,
     )
     task = make_task("ant/run")

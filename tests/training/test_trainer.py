@@ -9,26 +9,25 @@ from dynamics_helpers import each_free
 from torch import Generator
 
 from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import SCENES, Scene, load_scene
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import PRESETS, load_scene, make_task
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss
-from torchrl_nerd.training.recipes import RECIPES
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import Trainer, split_parameters
 
-SCENE, OTHER = (load_scene(name) for name in list(SCENES)[:2])
+SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 BRIEF = TrainConfig(
     steps=40,
     rollout_steps=5,
     rows=32,
     length=8,
-    rollout_rows=8,
+    rollout_batch_size=8,
     rollout_length=4,
     warmup=5,
     save_every=15,
@@ -38,7 +37,7 @@ BRIEF = TrainConfig(
 
 def make_trainer(scene: Scene, config: TrainConfig, folder: Path, steps=12) -> Trainer:
     data = simulate(scene, 200, steps, Generator().manual_seed(config.seed))
-    task = make_task(RECIPES[scene.name].task)
+    task = make_task(PRESETS[scene.name].task)
     data, horizons = data[is_sound(data)], (2, 5)
     return Trainer(scene, data, task, config, folder, horizons=horizons, quiet=True)
 
@@ -50,7 +49,7 @@ def loss_of(trainer: Trainer, seed: int) -> float:
         return float(one_step_loss(trainer.model.network(tokens), targets, 0.01))
 
 
-@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
 def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
     trainer = make_trainer(scene, replace(BRIEF, network=network, seed=seed), tmp_path)
     before = loss_of(trainer, seed)
@@ -72,7 +71,9 @@ def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
 
 @each_free
 def test_a_step_that_is_corrected_learns_too(scene, tmp_path, seed):
-    config = replace(BRIEF, network="free", seed=seed, steps=200, single_share=1.0)
+    config = replace(
+        BRIEF, network="free", seed=seed, steps=200, single_step_fraction=1.0
+    )
     trainer = make_trainer(scene, config, tmp_path)
     before = loss_of(trainer, seed)
     path = open_loop(NeRDDynamics(trainer.run()), initial_states(scene, 5, seed), 20)
@@ -85,13 +86,13 @@ def test_a_step_that_is_corrected_learns_too(scene, tmp_path, seed):
         make_trainer(scene, replace(config, use_symmetry=True), tmp_path / "other")
 
 
-@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
 def test_bfloat16_learns_as_much_and_leaves_weights_and_outputs_alone(
     network, tmp_path, seed
 ):
     losses, learned = [], []
     for share in (0.0, 1.0):
-        config = replace(BRIEF, network=network, bf16_share=share, seed=seed)
+        config = replace(BRIEF, network=network, bf16_fraction=share, seed=seed)
         trainer = make_trainer(SCENE, config, tmp_path / str(share))
         before = loss_of(trainer, seed)
         for _ in range(BRIEF.steps):
@@ -181,7 +182,7 @@ def test_unusable_settings_are_refused(tmp_path):
     [
         "rows",
         "length",
-        "rollout_rows",
+        "rollout_batch_size",
         "rollout_length",
         "save_every",
         "validate_every",
@@ -193,7 +194,7 @@ def test_counts_of_zero_are_refused(name):
         TrainConfig(**{name: 0})
 
 
-@pytest.mark.parametrize("network", ["tiny", "mlp", "gru"])
+@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
 def test_every_weight_has_one_optimizer(network, tmp_path):
     trainer = make_trainer(SCENE, replace(BRIEF, network=network), tmp_path)
     matrices, others = split_parameters(trainer.model.network)
@@ -214,18 +215,18 @@ def test_step_sizes_rise_and_fall_to_zero_in_both_phases(tmp_path):
     for trainer.step in range(config.total_steps):
         trainer.update()
         rates = [trainer.optimizers[n].param_groups[0]["lr"] for n in ("muon", "adamw")]
-        assert rates[0] / config.lr == pytest.approx(rates[1] / config.lr_other)
+        assert rates[0] / config.lr == pytest.approx(rates[1] / config.adamw_lr)
         sizes.append(rates[0] / config.lr)
     first, second = sizes[:30], sizes[30:]
     top = first.index(max(first))
     assert first[: top + 1] == sorted(first[: top + 1]) and 7 <= top <= 10
     assert first[top:] == sorted(first[top:], reverse=True) and first[-1] < 0.05
-    assert second[0] == pytest.approx(config.rollout_lr)
+    assert second[0] == pytest.approx(config.rollout_lr_ratio)
     assert second == sorted(second, reverse=True) and second[-1] < 0.02
 
 
 def test_rollouts_begin_anew_in_every_round(tmp_path):
-    config = replace(BRIEF, rollout_steps=6, rollout_rounds=3, rollout_lr=0.5)
+    config = replace(BRIEF, rollout_steps=6, rollout_restarts=3, rollout_lr_ratio=0.5)
     trainer = make_trainer(SCENE, config, tmp_path)
     rates = []
     for trainer.step in range(config.total_steps):

@@ -28,7 +28,7 @@ from torchrl_nerd.keys import (
     QVEL,
     TERRAIN,
 )
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import ContactFeatures, RobotCentric, StateDelta
 
 ROWS, FADE = 150, 0.25

@@ -10,7 +10,7 @@ from helpers import in_ground
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.keys import CONTACT_DEPTH, JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import ContactFeatures
 
 ROWS, GLANCES = 200, 5

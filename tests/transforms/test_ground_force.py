@@ -11,7 +11,7 @@ from helpers import HANDMADE, in_ground, make_scene
 
 from torchrl_nerd.geometry.frames import rotate_inverse
 from torchrl_nerd.keys import CONTACT_FORCE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import SCENES, load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import ContactFeatures, RobotCentric
 
 ROWS = 60

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd.geometry.manifold import HINGE
 from torchrl_nerd.keys import QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.transforms import RobotCentric
 
 ROWS = 50

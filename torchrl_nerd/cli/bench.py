@@ -9,7 +9,7 @@ from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.report import bench
 from torchrl_nerd.evaluation.bench.table import bench_table
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 
 @dataclass(frozen=True)

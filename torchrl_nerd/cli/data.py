@@ -15,10 +15,10 @@ from torchrl_nerd.cli.options import (
     run_name,
     scene_of,
 )
+from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.generate import (
     CARD,
-    DataConfig,
     Draw,
     draw_chunk,
     generate,
@@ -27,12 +27,12 @@ from torchrl_nerd.data.generate import (
 )
 from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.data.recorded import load_tosses, write_tosses
+from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.evaluation.data_report.page import write_page
 from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.policy_strategy import along_policy
-from torchrl_nerd.training.recipes import recipe_of
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class Data(Command):
         return self.out or Path("datasets") / run_name(self.scene, self.fine)
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
-        """What draws: the policy, or the scene's recipe."""
+        """What draws: the policy, or the scene's preset."""
         if self.policy is not None:
             return along_policy(scene, self.policy, self.noise)
-        return recipe_of(self.scene).draw(scene)
+        return preset_strategy(scene)
 
     def plan(self) -> list[str]:
         """How much would be drawn, and how much is there."""

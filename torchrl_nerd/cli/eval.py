@@ -13,13 +13,12 @@ from torchrl_nerd.cli.options import Positional, real_scene
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.nerd import Inference
-from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
 from torchrl_nerd.evaluation.toss_error import STATES
 from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
-from torchrl_nerd.evaluation.unseen_terrain import UNSEEN_TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import PRESETS, load_scene, protocol_of
+from torchrl_nerd.scenes import Scene
 
 
 @dataclass(frozen=True)
@@ -73,12 +72,13 @@ class Eval(DeviceCommand):
             raise ValueError(f"expected at least 2 rows, got {self.rows}")
         protocol = protocol_of(scene)
         if self.unseen_terrain:
-            if self.scene not in UNSEEN_TERRAIN:
-                known = ", ".join(UNSEEN_TERRAIN)
+            preset = PRESETS.get(self.scene)
+            if preset is None or preset.unseen_terrain is None:
+                known = ", ".join(n for n, p in PRESETS.items() if p.unseen_terrain)
                 raise ValueError(
                     f"no unseen terrain for '{self.scene}', expected one of {known}"
                 )
-            protocol = UNSEEN_TERRAIN[self.scene]()
+            protocol = preset.unseen_terrain()
         model = self._load(self.model or self.scene, scene)
         rows = []
         header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"

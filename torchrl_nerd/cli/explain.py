@@ -7,7 +7,7 @@ from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.explain.report import explain
 from torchrl_nerd.evaluation.explain.table import report_table
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Explain(Command):
     """Random states to ask the true solver about, and rows of the timing."""
     seed: int = 0
     """Of these states."""
-    network: str = "tiny"
+    network: str = "transformer-2x64"
     """What to time the compact input and the paper's with."""
     timing: bool = True
     """Time them."""

@@ -8,9 +8,9 @@ import tyro
 
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, real_scene
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import load_tosses
 from torchrl_nerd.files import writable_folder
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.finetune_run import finetune
 
 

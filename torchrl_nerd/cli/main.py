@@ -21,9 +21,9 @@ from torchrl_nerd.cli.replay import Replay
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
+from torchrl_nerd.robots import PRESETS, preset_of
 from torchrl_nerd.scenes import is_import
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training.recipes import RECIPES, recipe_of
 
 COMMANDS: dict[str, type[Command]] = {
     "data": Data,
@@ -94,17 +94,17 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
 
 
 def _default(kind: type[Command], args: list[str]) -> Any:
-    """Defaults of a command: a scene's recipe where the command has one."""
-    known = [arg for arg in args if arg in RECIPES]
+    """Defaults of a command: a scene's preset where the command has one."""
+    known = [arg for arg in args if arg in PRESETS]
     scene = next(
         (arg for arg in (*known, *args) if arg in known or is_import(arg)), None
     )
     if scene is None or kind not in (Data, Train):
         return tyro.MISSING_NONPROP
-    recipe = recipe_of(scene)
+    preset = preset_of(scene)
     if kind is Data:
-        return Data(scene, config=recipe.data)
-    return Train(scene, config=recipe.train)
+        return Data(scene, config=preset.data)
+    return Train(scene, config=preset.train)
 
 
 def _fail(sentence: str, status: int = 2) -> int:

@@ -4,7 +4,8 @@ import tyro
 
 from torchrl_nerd.data.recorded import REAL
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 
 Positional = tyro.conf.Positional
 Flat = tyro.conf.OmitArgPrefixes

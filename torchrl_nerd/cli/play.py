@@ -14,8 +14,8 @@ from torchrl_nerd.evaluation.render.viewer import check_display, view
 from torchrl_nerd.evaluation.rollout_error import unit_of
 from torchrl_nerd.evaluation.shipped_policies import shipped_policies
 from torchrl_nerd.files import folder_name
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import make_task
 
 SECONDS = 5.0  # of motion, where neither steps nor the task says less
 

@@ -8,12 +8,11 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.protocols import protocol_of
 from torchrl_nerd.evaluation.rollout_error import scene_of
 from torchrl_nerd.evaluation.trace_plot import plot_traces, plot_training
 from torchrl_nerd.evaluation.traces import Traces, compare_traces
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene, protocol_of
 from torchrl_nerd.settings import expect_at_least
 
 

@@ -18,7 +18,7 @@ from torchrl_nerd.evaluation.stability.run import (
     run_cases,
 )
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.settings import SettingError
 
 

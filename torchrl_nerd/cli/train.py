@@ -14,17 +14,17 @@ from torchrl_nerd.checkpoint import (
 )
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import CARD, generate, load_data_sets
-from torchrl_nerd.evaluation.protocols import protocol_of
+from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
+from torchrl_nerd.robots import preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName
-from torchrl_nerd.training.recipes import recipe_of
 from torchrl_nerd.training.start import begin_from
-from torchrl_nerd.training.train_config import TrainConfig
 from torchrl_nerd.training.trainer import STATE, Trainer
 
 
@@ -32,11 +32,11 @@ from torchrl_nerd.training.trainer import STATE, Trainer
 class Train(DeviceCommand):
     """Train a NeRD; without options, exactly as the shipped model of the scene.
 
-    Robots of others get one recipe for all, validated from their own sampling ranges.
+    Robots of others get one preset for all, validated from their own sampling ranges.
     Missing data are generated first. A killed run goes on where it stopped. On several
     processors or GPUs: torchrun --nproc-per-node 2 -m torchrl_nerd.cli train SCENE
 
-    Example: nerd train cartpole --out runs/cartpole --network mlp
+    Example: nerd train cartpole --out runs/cartpole --network mlp-4x64
 
     Example: nerd train ant --start ant --data datasets/ant datasets/ant_policy
     """
@@ -57,7 +57,7 @@ class Train(DeviceCommand):
     runs/SCENE-fine and datasets/SCENE-fine by default."""
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
-    """Copy the recipe's checkpoint, best or last, to this folder when done."""
+    """Copy the preset's checkpoint, best or last, to this folder when done."""
     logger: LoggerName = "tensorboard"
     """Where figures go beside log.csv: tensorboard, wandb, mlflow, or csv for nowhere."""
     threads: int | None = None
@@ -83,7 +83,7 @@ class Train(DeviceCommand):
         if start is not None:
             model = begin_from(start, scene, self.config.network)
         weights = sum(weight.numel() for weight in model.network.parameters())
-        count = recipe_of(self.scene).data.trajectories
+        count = preset_of(self.scene).data.trajectories
         return [
             f"draw {count} trajectories, to {folders[0]}"
             if _is_drawn(folders)
@@ -95,14 +95,14 @@ class Train(DeviceCommand):
         ]
 
     def run(self) -> dict[str, Any]:
-        """Train and return the card of the checkpoint that the recipe takes."""
+        """Train and return the card of the checkpoint that the preset takes."""
         scene = scene_of(self.scene, self.fine)
-        recipe, (out, folders) = recipe_of(self.scene), self.folders
+        preset, (out, folders) = preset_of(self.scene), self.folders
         start = self.begin(scene)
         writable_folder(out)
         ranks.join(torch.device(self.device))
         if ranks.rank() == 0 and _is_drawn(folders):
-            generate(scene, recipe.data, folders[0], self.quiet, recipe.draw(scene))
+            generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         ranks.wait()
         if self.threads:
             torch.set_num_threads(self.threads)
@@ -110,7 +110,7 @@ class Train(DeviceCommand):
         trainer = Trainer(
             scene,
             load_data_sets(scene, folders),
-            recipe.source(scene),
+            source_of(scene),
             self.config,
             out,
             self.device,
@@ -121,14 +121,14 @@ class Train(DeviceCommand):
             start=start,
         )
         trainer.run()
-        made = out / recipe.exports
+        made = out / preset.exports
         card = read_json(made / "card.json")
         is_first = ranks.rank() == 0
         ranks.leave()
         if is_first:
             if self.export is not None:
                 save_checkpoint(load_checkpoint(made, scene), self.export, card)
-            print(f"{recipe.exports} checkpoint in {made}: {_curve(card)}")
+            print(f"{preset.exports} checkpoint in {made}: {_curve(card)}")
         return card
 
 

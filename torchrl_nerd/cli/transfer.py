@@ -9,7 +9,7 @@ from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.evaluation.shipped_policies import shipped_policy
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 
 @dataclass(frozen=True)

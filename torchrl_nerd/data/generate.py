@@ -8,7 +8,7 @@ JSON card beside it.
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -20,6 +20,7 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from torchrl_nerd import __version__
+from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.store import (
     create_store,
@@ -33,7 +34,6 @@ from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torques
 from torchrl_nerd.seeds import stream
-from torchrl_nerd.settings import expect_at_least
 
 CHUNK = 2048  # trajectories stepped together; also what a kill can lose
 SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
@@ -50,28 +50,6 @@ Mapper = Callable[
     [Callable[[Chunk], TensorDict], Iterable[Chunk]], Iterable[TensorDict]
 ]
 """Python's ``map``, or what does the same elsewhere: results come in order."""
-
-
-@dataclass(frozen=True)
-class DataConfig:
-    """What to generate.
-
-    | field | meaning |
-    |---|---|
-    | ``trajectories`` | how many are drawn; broken ones are dropped and counted |
-    | ``steps`` | control steps of each |
-    | ``seed`` | every chunk of trajectories has a stream of its own |
-
-    Raises:
-        SettingError: fewer than one trajectory or step.
-    """
-
-    trajectories: int = 10_000
-    steps: int = 100
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        expect_at_least(1, trajectories=self.trajectories, steps=self.steps)
 
 
 def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> TensorDict:

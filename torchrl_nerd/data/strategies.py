@@ -11,6 +11,7 @@ from torchrl_nerd.data.generate import Draw, simulate
 from torchrl_nerd.data.policy_data import policy_data
 from torchrl_nerd.data.starts import Fallen, Nudged, Standing
 from torchrl_nerd.envs.actor import Actor
+from torchrl_nerd.robots import make_task, preset_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
@@ -92,3 +93,11 @@ def strategies(
         mixed.append(found["policy"])
     found["mixed"] = mix(*mixed)
     return {name: draw for name, draw in found.items() if draw is not None}
+
+
+def preset_strategy(scene: Scene) -> tuple[str, Draw] | None:
+    """The strategy of a scene's preset, by name, for `generate`; None: its own ranges."""
+    preset = preset_of(scene.name)
+    if preset.strategy is None or preset.task is None:
+        return None
+    return preset.strategy, strategies(scene, make_task(preset.task))[preset.strategy]

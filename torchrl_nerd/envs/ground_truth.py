@@ -14,8 +14,9 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.tasks import Task, make_task
+from torchrl_nerd.tasks import Task
 
 Engine = Literal["mujoco", "dm_control", "mujoco_warp"]
 ENGINES: dict[str, Callable[[Scene, torch.device | str], Dynamics]] = {

@@ -9,7 +9,8 @@ from torchrl_nerd.dynamics.guarded import Guard, GuardedDynamics
 from torchrl_nerd.dynamics.nerd import Inference, NeRDDynamics
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.tasks import Task, make_task
+from torchrl_nerd.robots import make_task
+from torchrl_nerd.tasks import Task
 
 
 class NeRDEnv(SceneEnv):

@@ -13,7 +13,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import ACTION, OBSERVATION
-from torchrl_nerd.tasks import Task, make_task
+from torchrl_nerd.robots import make_task
+from torchrl_nerd.tasks import Task
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "policy.safetensors", "policy.json"

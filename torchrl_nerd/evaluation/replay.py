@@ -11,7 +11,8 @@ from torch import Tensor
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 
 
 @dataclass(frozen=True)

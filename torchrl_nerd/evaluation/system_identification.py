@@ -10,8 +10,8 @@ from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.parameter_fit import CENTRE, fit_flight, fit_parameters
 from torchrl_nerd.evaluation.toss_error import STATES, toss_errors
+from torchrl_nerd.robots.cube.scene import cube_path
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.cube import cube_path
 from torchrl_nerd.scenes.penalty import set_penalty_contact
 
 # published: parameters of the ContactNets repository; stiffness and damping are not among

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrl_nerd.evaluation.plots import COLORS, STYLES, save_figure
 from torchrl_nerd.geometry.frames import orientation_error, rotate
-from torchrl_nerd.scenes.cube import HALF
+from torchrl_nerd.robots.cube.scene import HALF
 
 OUTLINES = 5  # cubes drawn along the measured path
 FACE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))

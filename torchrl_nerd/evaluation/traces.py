@@ -13,13 +13,13 @@ from torch import Tensor
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.evaluation.rollout_error import (
     Drive,
-    Source,
     action_drive,
     initial_states,
     position_errors,
     scene_of,
 )
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 
 NAMES = ("learned", "MuJoCo")

@@ -13,7 +13,7 @@ from torchrl_nerd.evaluation.policy_transfer import (
     transfer_table,
 )
 from torchrl_nerd.files import write_json
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 
 def report_transfer(

@@ -9,13 +9,13 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig | FreeConfig | Grounde
 
 NETWORKS: dict[str, NetworkConfig] = {
     **PRESETS,
-    "mlp-nano": MLPConfig(depth=1, width=16),
-    "mlp-micro": MLPConfig(depth=1, width=32),
-    "mlp-tiny": MLPConfig(depth=2, width=32),
-    "mlp": MLPConfig(),
-    "mlp-wide": MLPConfig(depth=4, width=120),
-    "mlp-large": MLPConfig(depth=4, width=128),
-    "mlp-larger": MLPConfig(depth=4, width=160),
+    "mlp-1x16": MLPConfig(depth=1, width=16),
+    "mlp-1x32": MLPConfig(depth=1, width=32),
+    "mlp-2x32": MLPConfig(depth=2, width=32),
+    "mlp-4x64": MLPConfig(),
+    "mlp-4x120": MLPConfig(depth=4, width=120),
+    "mlp-4x128": MLPConfig(depth=4, width=128),
+    "mlp-4x160": MLPConfig(depth=4, width=160),
     "gru": GRUConfig(),
 }
 """Those that answer for the whole change of state."""

@@ -255,9 +255,9 @@ class CausalTransformer(nn.Module):
 
 
 PRESETS = {
-    "tiny": TransformerConfig(2, 64, 4),
-    "wide": TransformerConfig(2, 96, 4),
-    "small": TransformerConfig(4, 128, 4),
+    "transformer-2x64": TransformerConfig(2, 64, 4),
+    "transformer-2x96": TransformerConfig(2, 96, 4),
+    "transformer-4x128": TransformerConfig(4, 128, 4),
     "paper": TransformerConfig(6, 192, 12),
     "paper-large": TransformerConfig(6, 384, 12),
 }

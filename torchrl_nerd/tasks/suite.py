@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
+from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.actuators import ActuatorController
 from torchrl_nerd.tasks.suite_judge import SuiteJudge
 from torchrl_nerd.tasks.task import State, Task
@@ -40,7 +41,7 @@ class SuiteTask(Task):
     num_uniforms = 1
 
     def __init__(self, name: str, steps_per_action: int = 1) -> None:
-        self.scene_name, self.steps_per_action = name, steps_per_action
+        self._name, self.steps_per_action = name, steps_per_action
         domain, _, task = name.removeprefix("dm_control/").partition("-")
         model = self.scene.model  # refuses what is not supported
         judge = SuiteJudge(domain, task)
@@ -51,6 +52,10 @@ class SuiteTask(Task):
         self._sizes = (model.nq, model.nv, width)
         self._forces, self._num_ctrl = judge.forces, model.nu
         self._start, self._judge = _RowMemo(judge.start), _RowMemo(judge)
+
+    def build_scene(self) -> Scene:
+        """The suite's robot and its ground."""
+        return import_scene(self._name)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """By the suite's ``initialize_episode``, seeded with u."""

@@ -6,7 +6,7 @@ from functools import cached_property
 
 from torch import Tensor
 
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.controllers import Controller
 
 State = Mapping[str, Tensor]
@@ -20,7 +20,6 @@ class Task(ABC):
 
     | attribute | meaning |
     |---|---|
-    | ``scene_name`` | the robot it is for |
     | ``horizon`` | control steps after which an episode is truncated |
     | ``num_uniforms`` | random numbers that one reset takes |
     | ``observation_size`` | width of the observation |
@@ -28,7 +27,6 @@ class Task(ABC):
     | ``parameters`` | row parameters drawn at a reset and kept, key -> width |
     """
 
-    scene_name: str
     horizon: int
     num_uniforms: int
     observation_size: int
@@ -37,8 +35,12 @@ class Task(ABC):
 
     @cached_property
     def scene(self) -> Scene:
-        """The robot and its ground."""
-        return load_scene(self.scene_name)
+        """The robot and its ground; the same object at every call."""
+        return self.build_scene()
+
+    @abstractmethod
+    def build_scene(self) -> Scene:
+        """What `scene` keeps; of a registered robot, the same object at every call."""
 
     @property
     def controller(self) -> Controller:

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.evaluation.parameter_fit import WINDOWS
 from torchrl_nerd.evaluation.toss_error import STATES
@@ -23,7 +24,6 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.convergence import converged, score
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.low_rank import add_low_rank, merge_low_rank
 from torchrl_nerd.training.physics_fit import fit_physics
 from torchrl_nerd.training.pose_loss import pose_loss, rollout
@@ -159,7 +159,7 @@ class FineTuner:
                 if len(order) == 0:
                     order = torch.randperm(len(self.starts), generator=generator)
                 pick, order = order[: config.rows], order[config.rows :]
-                is_short = update <= config.short_share * total
+                is_short = update <= config.short_history_fraction * total
                 length = max(1, config.length // 2) if is_short else config.length
                 rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
                 for group, peak in zip(

@@ -12,6 +12,7 @@ from torchrl_nerd.checkpoint import (
     save_checkpoint,
     shipped_models,
 )
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
@@ -19,7 +20,6 @@ from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tensor_files import write_tensors
 from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.toss_models import from_scratch, pretrain
 
 PRETRAINED_NAME = f"{SHIPPED}-pretrained"

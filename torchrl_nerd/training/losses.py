@@ -11,7 +11,7 @@ from torchrl_nerd.modules.nerd import TARGET, NeRD, Network
 RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root smooth
 
 
-def relative_error(errors: Tensor, size: Tensor, softening: float) -> Tensor:
+def relative_error(errors: Tensor, size: Tensor, loss_eps: float) -> Tensor:
     """Length of an error relative to what it is an error of, ``(*batch,)``.
 
     Not its square: impacts are few and their errors large, and squares leave free flight
@@ -20,20 +20,20 @@ def relative_error(errors: Tensor, size: Tensor, softening: float) -> Tensor:
     Args:
         errors: ``(*batch, D)``, normalised.
         size: mean square of the true change, ``(*batch,)``.
-        softening: added to it, so that samples at rest stay finite.
+        loss_eps: added to it, so that samples at rest stay finite.
     """
-    square = errors.square().mean(-1) / (size + softening)
+    square = errors.square().mean(-1) / (size + loss_eps)
     return (square + RESOLUTION**2).sqrt()
 
 
-def one_step_loss(outputs: Tensor, targets: Tensor, softening: float) -> Tensor:
+def one_step_loss(outputs: Tensor, targets: Tensor, loss_eps: float) -> Tensor:
     """Mean relative error of targets ``(*batch, D)``, for the square of NeRD eq. 2.
 
     Random torques set the scale of targets; without the division the quiet motions that
     decide a passive rollout vanish beside the violent ones.
     """
     size = targets.square().mean(-1)
-    return relative_error(outputs - targets, size, softening).mean()
+    return relative_error(outputs - targets, size, loss_eps).mean()
 
 
 def rollout_loss(
@@ -42,7 +42,7 @@ def rollout_loss(
     qvel: Tensor,
     joint_torque: Tensor,
     terrain: Tensor | None,
-    softening: float,
+    loss_eps: float,
 ) -> Tensor:
     """Error of the model's own trajectory, fed back, from an empty history.
 
@@ -55,7 +55,7 @@ def rollout_loss(
         qvel: true velocities ``(rows, K + 1, nv)``.
         joint_torque: ``(rows, K, num_actuated)``.
         terrain: ``(rows, terrain.size)`` or None.
-        softening: see `relative_error`.
+        loss_eps: see `relative_error`.
     """
     delta, layout = model.state_delta, model.scene.layout
     scale = model.normalize.std(TARGET)[: layout.nv]
@@ -73,4 +73,4 @@ def rollout_loss(
         errors.append(torch.cat((drift, slip), -1))
     change = (qvel[:, 1:] - qvel[:, :-1]) / scale
     size = change.square().mean((-1, -2))[:, None]
-    return relative_error(torch.stack(errors, 1), size, softening).mean().float()
+    return relative_error(torch.stack(errors, 1), size, loss_eps).mean().float()

@@ -3,6 +3,7 @@
 import torch
 from tensordict.utils import NestedKey
 
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.evaluation.system_identification import PUBLISHED
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
@@ -11,10 +12,9 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.robots.cube.scene import HALF
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.cube import HALF
 from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 from torchrl_nerd.training.sequences import cover
 from torchrl_nerd.training.simulated_tosses import simulate_tosses
 from torchrl_nerd.transforms import StateDelta, Stats
@@ -25,7 +25,7 @@ PRETRAINING = FinetuneConfig(
     update="all",
     epochs=0.4,
     length=12,
-    short_share=0.0,
+    short_history_fraction=0.0,
     physics_lr=0.0,
     validate_every=30,
     use_symmetry=True,

@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import open_loop
@@ -15,7 +16,6 @@ from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.pose_encoder import PoseEncoder
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.finetune_config import FinetuneConfig
 
 ARM = 0.1  # m: a camera's noise turns the cube as much as it moves a point so far out
 

@@ -13,14 +13,12 @@ from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import (
-    ErrorSummary,
-    Source,
-    passive_errors,
-)
+from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import stream
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
@@ -33,7 +31,6 @@ from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.run_state import like_packed, pack, unpack
 from torchrl_nerd.training.sequences import Sequences, Symmetry, cover
 from torchrl_nerd.training.start import begin_from, fingerprint, fresh_model
-from torchrl_nerd.training.train_config import TrainConfig
 
 STATE = "state.json"  # of a run that can go on
 VALIDATION_SEED = 1_000_003
@@ -87,7 +84,9 @@ class Trainer:
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.horizons, self.random_actions = horizons, random_actions
         self.quiet = quiet or ranks.rank() > 0
-        ranks.expect_shares(rows=config.rows, rollout_rows=config.rollout_rows)
+        ranks.expect_shares(
+            rows=config.rows, rollout_batch_size=config.rollout_batch_size
+        )
         longest = max(
             config.length, config.rollout_length if config.rollout_steps else 1
         )
@@ -112,7 +111,7 @@ class Trainer:
         if start is not None:
             self.model.coverage.widen(start.coverage)
         self.optimizers = self.make_optimizers()
-        self.peaks = {"muon": config.lr, "adamw": config.lr_other}
+        self.peaks = {"muon": config.lr, "adamw": config.adamw_lr}
         weights = dict(self.model.network.named_parameters())
         self.average = {name: w.detach().clone() for name, w in weights.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
@@ -129,7 +128,7 @@ class Trainer:
         matrices, others = split_parameters(self.model.network)
         return {
             "muon": Muon(matrices, lr=self.config.lr),
-            "adamw": adamw(others, self.config.lr_other),
+            "adamw": adamw(others, self.config.adamw_lr),
         }
 
     def run(self, until: int | None = None) -> NeRD:
@@ -183,15 +182,15 @@ class Trainer:
             if self.step < config.steps:
                 tokens, targets = map(ranks.share, self._batch(generator))
                 outputs = self.model.network(tokens).float()
-                loss = one_step_loss(outputs, targets, config.softening)
+                loss = one_step_loss(outputs, targets, config.loss_eps)
             else:
                 *states, terrain = self.sequences.rollout(
-                    config.rollout_rows, config.rollout_length, generator
+                    config.rollout_batch_size, config.rollout_length, generator
                 )
                 qpos, qvel, torque = map(ranks.share, cast(list[Tensor], states))
                 ground = None if terrain is None else ranks.share(terrain)
                 mine = qpos, qvel, torque, ground
-                loss = rollout_loss(self.model, *mine, config.softening)
+                loss = rollout_loss(self.model, *mine, config.loss_eps)
         loss.backward()
         parameters = list(self.model.network.parameters())
         loss = ranks.average_gradients(parameters, loss)
@@ -213,7 +212,7 @@ class Trainer:
         """
         config = self.config
         rows, length = config.rows, config.length
-        if torch.rand((), generator=generator) < config.single_share:
+        if torch.rand((), generator=generator) < config.single_step_fraction:
             rows, length = rows * length, 1
         return self.sequences.one_step(rows, length, generator)
 
@@ -224,11 +223,11 @@ class Trainer:
             return min(1.0, (step + 1) / max(config.warmup, 1)) * (
                 1 - step / config.steps
             )
-        done = config.rollout_rounds * (step - config.steps) / config.rollout_steps
-        return config.rollout_lr * (1.0 - done % 1.0)
+        done = config.rollout_restarts * (step - config.steps) / config.rollout_steps
+        return config.rollout_lr_ratio * (1.0 - done % 1.0)
 
     def _autocast(self) -> AbstractContextManager:
-        is_coarse = self.step < self.config.bf16_share * self.config.steps
+        is_coarse = self.step < self.config.bf16_fraction * self.config.steps
         if is_coarse or self.device.type == "cuda":
             return torch.autocast(self.device.type, torch.bfloat16)
         return nullcontext()

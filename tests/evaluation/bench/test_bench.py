@@ -33,21 +33,21 @@ from torchrl_nerd.evaluation.bench.plot import plot_race
 from torchrl_nerd.evaluation.bench.rates import states_on_the_way
 from torchrl_nerd.evaluation.bench.report import BenchReport, bench
 from torchrl_nerd.evaluation.bench.table import bench_table
-from torchrl_nerd.evaluation.protocols import PROTOCOLS
 from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.scenes import Scene, load_scene
+from torchrl_nerd.robots import PRESETS, load_scene
+from torchrl_nerd.scenes import Scene
 
 QUICK = ("cartpole", "franka", "cube")  # the fewest models, still one in contact
 
 
-@pytest.fixture(params=list(PROTOCOLS))
+@pytest.fixture(params=list(PRESETS))
 def name(request) -> str:
     """Each scene with a protocol."""
     return request.param
 
 
-@pytest.mark.parametrize("name", slow_but(QUICK, PROTOCOLS))
+@pytest.mark.parametrize("name", slow_but(QUICK, PRESETS))
 def test_a_whole_race(name, tmp_path, monkeypatch):
     monkeypatch.setattr(rates, "VISIT", 0.01)  # speeds need not be exact here
     scene = load_scene(name)
@@ -92,7 +92,7 @@ def test_a_robot_of_the_suite_races_with_a_model_of_ones_own(tmp_path, monkeypat
     """An untrained one here: it is slow and wrong, and says so."""
     monkeypatch.setattr(rates, "VISIT", 0.01)
     scene = load_scene("dm_control/hopper-stand")
-    model = make_model(scene, NETWORKS["mlp-micro"]).eval()
+    model = make_model(scene, NETWORKS["mlp-1x32"]).eval()
     folder = save_checkpoint(model, tmp_path / "hopper", make_card(model))
     words = "guarded", "bf16", "RK4", "implicitfast"
     report = brief_race(scene, without=words, models=[str(folder)])
@@ -122,7 +122,7 @@ def test_another_number_of_substeps_is_the_same_control_step(name, generator):
         assert other.control_step == pytest.approx(scene.control_step, rel=1e-12)
         assert other.substeps == substeps
     same = scene.with_substeps(scene.substeps)
-    task = next(iter(PROTOCOLS[name]().cases.values()))
+    task = next(iter(PRESETS[name].protocol().cases.values()))
     start = states_on_the_way(task, 5, 1)
     paths = [open_loop(MujocoDynamics(s), start, 3) for s in (task.scene, same)]
     torch.testing.assert_close(paths[0], paths[1], rtol=0, atol=1e-9)
@@ -130,7 +130,7 @@ def test_another_number_of_substeps_is_the_same_control_step(name, generator):
 
 def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
     """Without contact Euler's error is of first order."""
-    ground = courses(PROTOCOLS["cartpole"](), 16, seed, 1, steps=30)
+    ground = courses(PRESETS["cartpole"].protocol(), 16, seed, 1, steps=30)
     rows = {who.name: who for who in mujoco_contenders(ground[0].scene, 1)}
     coarse, fine = (
         contender_errors(rows[f"MuJoCo x{n}"], ground)["hinge"].mean for n in (2, 8)
@@ -143,7 +143,7 @@ def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
 @pytest.mark.parametrize("robot", ["cartpole", "franka"])
 def test_nothing_is_finer_than_a_truth_without_contact(robot, seed):
     """Of the error of the scene's own substeps, finer ones move it by a ten-thousandth."""
-    course = courses(PROTOCOLS[robot](), 8, seed, 1, steps=20)[0]
+    course = courses(PRESETS[robot].protocol(), 8, seed, 1, steps=20)[0]
     rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
     finer = MujocoDynamics(
         course.scene.fine.with_substeps(16 * course.scene.substeps, rk4)
@@ -154,7 +154,7 @@ def test_nothing_is_finer_than_a_truth_without_contact(robot, seed):
 
 
 def test_the_chaos_floor_is_as_high_as_the_push(seed):
-    ground = courses(PROTOCOLS["cartpole"](), 64, seed, 1, steps=2)
+    ground = courses(PRESETS["cartpole"].protocol(), 64, seed, 1, steps=2)
     floors = chaos_floor(ground, 1, seed).values()
     for size, errors in zip(PERTURBATIONS, floors, strict=True):
         for error in errors.values():  # mean of |N(0, 1)| is 0.8

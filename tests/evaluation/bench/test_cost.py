@@ -11,10 +11,10 @@ from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.transformer import HEAD_WIDTH
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 FREE = ("cartpole", "franka_gravity")  # no contact: the network's products alone
-KINDS = ("mlp", "mlp-micro", "gru", "tiny", "paper")
+KINDS = ("mlp-4x64", "mlp-1x32", "gru", "transformer-2x64", "paper")
 
 
 def closed_form(network: str, inputs: int, outputs: int) -> int:
@@ -60,7 +60,9 @@ def test_compiled_and_window_steps_are_counted_and_true_ones_are_not(generator):
     size = int(torch.randint(2, 12, (), generator=generator))
     width, layers = model.config.width, model.config.layers
     seen = 4 * (size**2 - size * (model.config.band - 1)) * width * layers
-    streamed = closed_form("tiny", model.tokens.size, model.state_delta.size)
+    streamed = closed_form(
+        "transformer-2x64", model.tokens.size, model.state_delta.size
+    )
     assert flop(inference="window", window=size) == size * streamed + seen
     guarded = step_cost(GuardedDynamics(NeRDDynamics(model)), state)
     assert guarded is not None
@@ -74,10 +76,10 @@ def test_memory_is_what_a_row_holds(name, generator):
     state = state_of(scene, 2, generator)
     window = int(torch.randint(1, 12, (), generator=generator))
     age = 8  # bytes of a counter
-    for network in ("mlp", "gru", "small"):
+    for network in ("mlp-4x64", "gru", "small"):
         model = NeRD(scene, NETWORKS[network])
         held = {
-            "mlp": 0,
+            "mlp-4x64": 0,
             "gru": 4 * 128,
             "small": age + 4 * (4 * 2 * 9 * 128),  # layers, keys and values, tokens
         }[network]

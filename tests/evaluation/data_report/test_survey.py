@@ -10,7 +10,7 @@ from dynamics_helpers import little_data
 
 from torchrl_nerd.evaluation.data_report.page import histogram, page
 from torchrl_nerd.evaluation.data_report.survey import survey
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 
 def test_every_column_is_described(scene):

@@ -12,7 +12,7 @@ from torchrl_nerd.evaluation.explain import paper_input as paper
 from torchrl_nerd.evaluation.explain.states import draw_states
 from torchrl_nerd.geometry.manifold import FREE
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 ROWS = 40
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))

@@ -25,7 +25,7 @@ def test_the_report_adds_up_and_the_table_tells_all(scene, seed):
 
 
 def test_timing_is_of_both_inputs_in_one_run(scene, seed):
-    report = explain(scene, 32, seed, network="mlp")
+    report = explain(scene, 32, seed, network="mlp-4x64")
     time = report.timing
     assert time is not None and time.network == "mlp"
     parts = (time.encode, time.step, time.paper_encode, time.paper_step, time.ratio)

@@ -14,7 +14,7 @@ from torchrl_nerd.evaluation.render.opengl import OpenGLRenderer, find_gl
 from torchrl_nerd.evaluation.render.outline import grid, patches, profile
 from torchrl_nerd.evaluation.render.pair import Pair
 from torchrl_nerd.evaluation.render.poser import Poser
-from torchrl_nerd.scenes import load_scene
+from torchrl_nerd.robots import load_scene
 
 SIZE = (240, 180)
 

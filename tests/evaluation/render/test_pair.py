@@ -5,7 +5,7 @@ import torch
 
 from torchrl_nerd.evaluation.policy import Policy, make_actor
 from torchrl_nerd.evaluation.render.pair import follow, idle, play_pair
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 STEPS = 8
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchrl_nerd.evaluation.render.pair import idle, play_pair
 from torchrl_nerd.evaluation.render.viewer import view
-from torchrl_nerd.tasks import make_task
+from torchrl_nerd.robots import make_task
 
 STEPS = 5
 

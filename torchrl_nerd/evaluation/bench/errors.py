@@ -9,11 +9,9 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.evaluation.bench.contenders import Contender, truth
-from torchrl_nerd.evaluation.protocols import Protocol
 from torchrl_nerd.evaluation.rollout_error import (
     Drive,
     ErrorSummary,
-    Source,
     action_drive,
     initial_states,
     open_loop,
@@ -23,6 +21,7 @@ from torchrl_nerd.evaluation.rollout_error import (
 )
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import QPOS
+from torchrl_nerd.robots import EvaluationProtocol, Source
 from torchrl_nerd.scenes import Scene
 
 Errors = dict[str, ErrorSummary]
@@ -76,7 +75,11 @@ class Course:
 
 
 def courses(
-    protocol: Protocol, rows: int, seed: int, threads: int, steps: int | None = None
+    protocol: EvaluationProtocol,
+    rows: int,
+    seed: int,
+    threads: int,
+    steps: int | None = None,
 ) -> list[Course]:
     """One course for each case of a protocol, over its longest published horizon."""
     published = {horizon for _, horizon, _ in protocol.published}

@@ -17,8 +17,9 @@ from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.bench.contenders import Contender
 from torchrl_nerd.evaluation.bench.cost import Cost
-from torchrl_nerd.evaluation.rollout_error import Source, initial_states, scene_of
+from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, TERRAIN
+from torchrl_nerd.robots import Source
 from torchrl_nerd.tasks import Task
 
 VISIT = 0.1  # s: one contender's turn lasts about as long

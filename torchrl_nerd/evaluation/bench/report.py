@@ -20,11 +20,11 @@ from torchrl_nerd.evaluation.bench.errors import (
 )
 from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
 from torchrl_nerd.evaluation.bench.rates import Rate, rates, states_on_the_way
-from torchrl_nerd.evaluation.protocols import Protocol, protocol_of
 from torchrl_nerd.evaluation.rollout_error import ErrorSummary
+from torchrl_nerd.robots import EvaluationProtocol, make_task, protocol_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import Task, make_task
+from torchrl_nerd.tasks import Task
 
 COUNTED = 8  # rows of the step whose arithmetic is counted
 
@@ -212,7 +212,7 @@ def bench(
     )
 
 
-def _task_of(scene: Scene, protocol: Protocol) -> Task:
+def _task_of(scene: Scene, protocol: EvaluationProtocol) -> Task:
     """Whose starts, observations, rewards and resets are timed; of the suite, its own."""
     tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
     if tasks:
@@ -237,7 +237,7 @@ def _device_name(device: torch.device | str) -> str:
     return torch.cuda.get_device_name(here) if here.type == "cuda" else here.type
 
 
-def _published(protocol: Protocol, horizon: int) -> dict[str, float]:
+def _published(protocol: EvaluationProtocol, horizon: int) -> dict[str, float]:
     """Means over the cases of what the paper published at this horizon."""
     found: dict[str, list[float]] = {}
     for (_, steps, quantity), error in protocol.published.items():

@@ -91,7 +91,10 @@ class SceneReport:
 
 
 def explain(
-    scene: Scene, rows: int = 1024, seed: int = 0, network: str | None = "tiny"
+    scene: Scene,
+    rows: int = 1024,
+    seed: int = 0,
+    network: str | None = "transformer-2x64",
 ) -> SceneReport:
     """Question a scene.
 

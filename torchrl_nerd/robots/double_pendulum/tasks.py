@@ -5,7 +5,12 @@ from torch import Tensor
 
 from torchrl_nerd.geometry.frames import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes.double_pendulum import GROUNDS, evaluation_ground
+from torchrl_nerd.robots.double_pendulum.scene import (
+    GROUNDS,
+    double_pendulum,
+    evaluation_ground,
+)
+from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.task import State, Task
 
 MAX_START_SPEED = 2.0  # rad/s
@@ -21,11 +26,14 @@ class DoublePendulumPassive(Task):
         ground: 0 (out of reach) to 6; None draws one per row.
     """
 
-    scene_name = "double_pendulum"
     horizon = 100
     num_uniforms = 5
     observation_size = 6
     parameters = {TERRAIN: 4}
+
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return double_pendulum()
 
     def __init__(self, ground: int | None = None) -> None:
         numbers = range(len(GROUNDS)) if ground is None else [ground]

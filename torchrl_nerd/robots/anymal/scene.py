@@ -1,5 +1,6 @@
 """ANYmal C of the NeRD paper: twelve joints, driven by springs to random targets."""
 
+from functools import cache
 from math import pi
 from pathlib import Path
 
@@ -41,12 +42,13 @@ RANDOM_KP = (30.0, 200.0)  # N m/rad; reference code, trajectory_sampler_anymal
 RANDOM_KD = (0.0, 1.0)  # N m s/rad
 
 
+@cache
 def anymal() -> Scene:
     """Build the scene. ``qpos`` = base position (m), quaternion, joints (rad).
 
     Joints in the order of `LEGS`, each HAA, HFE, KFE.
     """
-    path = Path(__file__).parent / "assets" / "anymal.xml"
+    path = Path(__file__).parent / "anymal.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
     set_penalty_contact(model, **CONTACT)
     for leg in LEGS:

@@ -1,5 +1,6 @@
 """Cartpole of the NeRD paper: a 50 kg cart on a rail, a 2.5 kg pole, 1500 N."""
 
+from functools import cache
 from math import pi
 from pathlib import Path
 
@@ -16,9 +17,10 @@ LIMIT_DAMPING = 10.0  # N s/m; limit_kd
 SUBSTEPS = 5  # of 1/300 s: control step 1/60 s; paper, appendix B
 
 
+@cache
 def cartpole() -> Scene:
     """Build the scene. ``qpos`` = (cart x, pole angle from upright)."""
-    path = Path(__file__).parent / "assets" / "cartpole.xml"
+    path = Path(__file__).parent / "cartpole.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
     set_penalty_limit(model, "slider", ke=LIMIT_STIFFNESS, kd=LIMIT_DAMPING)
     return Scene(

@@ -1,5 +1,6 @@
 """Ant of the NeRD paper: 117 kg, eight joints, 400 N m, over level ground."""
 
+from functools import cache
 from math import pi
 from pathlib import Path
 
@@ -34,9 +35,10 @@ HIP = 2 * pi / 9  # 40 deg
 ANKLE = (pi / 6, 5 * pi / 9)  # 30 to 100 deg; legs 2 and 3 mirror it
 
 
+@cache
 def ant() -> Scene:
     """Build the scene. ``qpos`` = torso position (m), quaternion, joints (rad)."""
-    path = Path(__file__).parent / "assets" / "ant.xml"
+    path = Path(__file__).parent / "ant.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
     set_penalty_contact(model, **CONTACT)
     for joint in JOINTS:

@@ -1,6 +1,7 @@
 """Double pendulum of the NeRD paper over a plane that differs from row to row."""
 
 from collections.abc import Callable
+from functools import cache
 from math import cos, pi, sin
 from pathlib import Path
 
@@ -35,9 +36,10 @@ GROUNDS = (
 )
 
 
-ASSET = Path(__file__).parent / "assets" / "double_pendulum.xml"
+ASSET = Path(__file__).parent / "double_pendulum.xml"
 
 
+@cache
 def double_pendulum() -> Scene:
     """Build the scene. ``qpos`` = hinge angles; zero is both links along +x."""
     return _scene(mujoco.MjModel.from_xml_path(str(ASSET)), ground=sample_ground)

@@ -5,8 +5,17 @@ from torch import Tensor
 
 from torchrl_nerd.geometry.frames import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes.cube import CLEARANCE, START, UP, cube_reach
-from torchrl_nerd.scenes.cube_slope import slope_beneath
+from torchrl_nerd.robots.cube.scene import (
+    CLEARANCE,
+    START,
+    UP,
+    cube,
+    cube_reach,
+    cube_real,
+    cube_slope,
+    slope_beneath,
+)
+from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import angular_velocity
 from torchrl_nerd.tasks.task import State, Task
 
@@ -18,10 +27,13 @@ class CubeToss(Task):
     velocity, both in world axes.
     """
 
-    scene_name = "cube"
     horizon = 74  # 0.5 s
     num_uniforms = 13
     observation_size = 11
+
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return cube()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Tosses of the training ranges.
@@ -59,15 +71,20 @@ class CubeToss(Task):
 class RealCubeToss(CubeToss):
     """The same with the real cube's mass."""
 
-    scene_name = "cube_real"
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return cube_real()
 
 
 class SlopeToss(CubeToss):
     """The same over a plane of its own in every row, up to 20 degrees steep."""
 
-    scene_name = "cube_slope"
     num_uniforms = CubeToss.num_uniforms + 2
     parameters = {TERRAIN: 4}
+
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return cube_slope()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Tosses of the training ranges, as far above the slope as above level ground.

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes.anymal import ACTION_SCALE, KD, KP, STANDING_POSE
+from torchrl_nerd.robots.anymal.scene import ACTION_SCALE, KD, KP, STANDING_POSE, anymal
 from torchrl_nerd.scenes.controllers import PDController
+from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import angular_velocity, base_observation, symmetric
 from torchrl_nerd.tasks.task import State, Task
 
@@ -31,12 +32,15 @@ class Anymal(Task):
     base or knees come within 1 cm of the ground.
     """
 
-    scene_name = "anymal"
     horizon = 1000
     num_uniforms = 24
     observation_size = 37
     velocity: ClassVar[tuple[float, float]]
     """Wanted velocity, m/s, forward and to the left."""
+
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return anymal()
 
     @property
     def controller(self) -> PDController:

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes.ant import STANDING_POSE
+from torchrl_nerd.robots.ant.scene import STANDING_POSE, ant
+from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import (
     angular_velocity,
     base_observation,
@@ -31,10 +32,13 @@ class Ant(Task):
     here as in the paper.
     """
 
-    scene_name = "ant"
     horizon = 500
     num_uniforms = 29
     observation_size = 29
+
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return ant()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Above the ground, tilted up to 30 degrees, near the standing pose."""

@@ -15,10 +15,11 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
-from torchrl_nerd.evaluation.protocols import Protocol
 from torchrl_nerd.keys import TERRAIN
-from torchrl_nerd.scenes.double_pendulum import double_pendulum_over
-from torchrl_nerd.tasks.double_pendulum import DoublePendulumPassive
+from torchrl_nerd.robots.double_pendulum.scene import double_pendulum_over
+from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
+from torchrl_nerd.robots.robot import EvaluationProtocol
+from torchrl_nerd.scenes import Scene
 
 
 class DoublePendulumOver(DoublePendulumPassive):
@@ -32,7 +33,11 @@ class DoublePendulumOver(DoublePendulumPassive):
 
     def __init__(self, add_ground: Callable[[mujoco.MjSpec], None]) -> None:
         super().__init__(ground=0)
-        self.scene = double_pendulum_over(add_ground)
+        self._add_ground = add_ground
+
+    def build_scene(self) -> Scene:
+        """The robot over that ground."""
+        return double_pendulum_over(self._add_ground)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """``qpos`` and ``qvel (*batch, 2)`` as over planes, without a row's ground."""
@@ -82,15 +87,11 @@ def _add_field(spec: mujoco.MjSpec, heights: np.ndarray, base: float) -> None:
     )
 
 
-def double_pendulum() -> Protocol:
+def unseen_terrain() -> EvaluationProtocol:
     """Four grounds, 100 passive steps; the paper has none of them."""
     grounds = (two_planes, box_edge, height_field, flat_field)
     cases = {
         ground.__name__.replace("_", " "): DoublePendulumOver(ground)
         for ground in grounds
     }
-    return Protocol(cases, (100,), {})
-
-
-UNSEEN_TERRAIN: dict[str, Callable[[], Protocol]] = {"double_pendulum": double_pendulum}
-"""Protocols over unseen ground, by scene."""
+    return EvaluationProtocol(cases, (100,))

@@ -8,8 +8,9 @@ from torch import Tensor
 from torchrl_nerd.geometry.frames import wrap_angle
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
+from torchrl_nerd.robots.franka.scene import GAIN, HOME, franka, franka_gravity
 from torchrl_nerd.scenes.controllers import PDController
-from torchrl_nerd.scenes.franka import GAIN, HOME
+from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import symmetric
 from torchrl_nerd.tasks.task import State, Task
 
@@ -29,11 +30,14 @@ class FrankaReachTorque(Task):
     the goal; no velocities. Never terminated. 128 actions.
     """
 
-    scene_name = "franka"
     horizon = 128
     num_uniforms = 10
     observation_size = 13
     parameters = {GOAL: 3}
+
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return franka()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """At rest near home; the goal is uniform in a box before the robot."""
@@ -101,7 +105,9 @@ class FrankaReach(FrankaReachTorque):
 class FrankaGravityReachTorque(FrankaReachTorque):
     """The torque task with the real arm's inertials, under gravity; not in the paper."""
 
-    scene_name = "franka_gravity"
+    def build_scene(self) -> Scene:
+        """The robot and its ground."""
+        return franka_gravity()
 
 
 def _peak(x: Tensor) -> Tensor:

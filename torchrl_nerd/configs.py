@@ -1,0 +1,194 @@
+"""Configurations of data, training, fine-tuning and policy learning: pure data."""
+
+from dataclasses import asdict, dataclass
+from typing import Literal, get_args
+
+from torchrl_nerd.settings import SettingError, expect_at_least
+
+COUNTS = (
+    *("rows", "length", "rollout_batch_size", "rollout_length"),
+    *("save_every", "validate_every", "rollout_restarts"),
+)
+
+Update = Literal["physics", "all", "head", "low-rank"]
+Observe = Literal["states", "poses"]
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What to generate.
+
+    | field | meaning |
+    |---|---|
+    | ``trajectories`` | how many are drawn; broken ones are dropped and counted |
+    | ``steps`` | control steps of each |
+    | ``seed`` | every chunk of trajectories has a stream of its own |
+
+    Raises:
+        SettingError: fewer than one trajectory or step.
+    """
+
+    trajectories: int = 10_000
+    steps: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        expect_at_least(1, trajectories=self.trajectories, steps=self.steps)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train.
+
+    | field | meaning |
+    |---|---|
+    | ``network`` | name in `NETWORKS`, or ``free``, see `FreeNeRD`, or ``grounded``, see
+      `GroundedNeRD` |
+    | ``steps`` | updates on one-step targets |
+    | ``rollout_steps`` | further updates on the model's own rollouts |
+    | ``rows``, ``length`` | sequences per update and tokens of each |
+    | ``single_step_fraction`` | share of updates on as many single states instead |
+    | ``flies`` | have rows that nothing pushes move along the free motion, see `Flight` |
+    | ``use_symmetry`` | show each sample as a random one of its mirror images |
+    | ``rollout_batch_size``, ``rollout_length`` | the same for rollouts |
+    | ``lr``, ``adamw_lr`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
+    | ``rollout_lr_ratio`` | share of the peak at which the rollout updates begin |
+    | ``rollout_restarts`` | how often, in equal parts of them, they begin there anew |
+    | ``warmup`` | updates over which the step size rises from zero |
+    | ``bf16_fraction`` | share of the one-step updates, the first ones, whose matrices are
+      multiplied in bfloat16: faster on processors that have it; all updates on CUDA |
+    | ``loss_eps`` | of the relative loss; see `losses.relative_error` |
+    | ``clip`` | largest norm of the gradient |
+    | ``ema`` | decay of the averaged weights, which are the ones saved |
+    | ``save_every`` | updates between saves: what a kill can lose |
+    | ``validate_every`` | updates between rollouts in true physics |
+    | ``seed`` | of weights and batches |
+
+    Raises:
+        SettingError: an unknown network, or a number that is too small.
+    """
+
+    network: str = "transformer-2x64"
+    steps: int = 20_000
+    rollout_steps: int = 2_000
+    rows: int = 64
+    length: int = 16
+    single_step_fraction: float = 0.75
+    flies: bool = False
+    use_symmetry: bool = False
+    rollout_batch_size: int = 128
+    rollout_length: int = 8
+    lr: float = 0.01
+    adamw_lr: float = 3e-3
+    rollout_lr_ratio: float = 0.1
+    rollout_restarts: int = 1
+    warmup: int = 200
+    bf16_fraction: float = 0.0
+    loss_eps: float = 0.01
+    clip: float = 1.0
+    ema: float = 0.995
+    save_every: int = 1_000
+    validate_every: int = 2_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if name != "network":
+                expect_at_least(1 if name in COUNTS else 0, **{name: value})
+
+    @property
+    def total_steps(self) -> int:
+        """Updates of both kinds."""
+        return self.steps + self.rollout_steps
+
+
+@dataclass(frozen=True)
+class FinetuneConfig:
+    """How to fine-tune.
+
+    | field | meaning |
+    |---|---|
+    | ``update`` | physics alone, without gradients, or all, head, low-rank weights too |
+    | ``evaluations`` | of physics, in each of two stages |
+    | ``epochs`` | at most; an epoch shows every training window once |
+    | ``rows`` | windows per update |
+    | ``length`` | steps of a rollout |
+    | ``short_history_fraction`` | share of updates, the first ones, at half of it |
+    | ``rank`` | of low-rank changes |
+    | ``lr`` | peak step size of the network |
+    | ``physics_lr`` | peak step size of a simulator's parameters, if there is one |
+    | ``noise`` | m, added to starts: of a position, and of corners that turns move |
+    | ``use_symmetry`` | show each window as a random one of its mirror images |
+    | ``clip`` | largest norm of the network's gradient |
+    | ``validate_every`` | updates between rollouts of the validation tosses |
+    | ``patience`` | validations without progress, at full length, before it stops |
+    | ``observe`` | whole states, or poses alone: a window encoder finds the start |
+    | ``every`` | control steps between observed poses |
+    | ``pose_noise`` | m, added to every observed pose: a worse camera |
+    | ``poses`` | in the encoder's window |
+    | ``seed`` | of batches and fresh weights |
+
+    Raises:
+        SettingError: a value that cannot be.
+    """
+
+    update: Update = "physics"
+    evaluations: int = 90
+    epochs: float = 2.0
+    rows: int = 384
+    length: int = 24
+    short_history_fraction: float = 0.5
+    rank: int = 4
+    lr: float = 1e-3
+    physics_lr: float = 1e-2
+    noise: float = 2e-5
+    use_symmetry: bool = False
+    clip: float = 0.3
+    validate_every: int = 20
+    patience: int = 4
+    observe: Observe = "states"
+    every: int = 1
+    pose_noise: float = 0.0
+    poses: int = 3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, kinds in (("update", Update), ("observe", Observe)):
+            if getattr(self, name) not in get_args(kinds):
+                known = ", ".join(get_args(kinds))
+                raise SettingError(
+                    f"expected {name} of {known}, got '{getattr(self, name)}'"
+                )
+        if self.observe == "states" and (self.every > 1 or self.pose_noise > 0.0):
+            raise SettingError("expected observe 'poses' with every or pose_noise")
+        counts = ("evaluations", "every", "rows", "length", "rank", "validate_every")
+        expect_at_least(
+            1, **{name: getattr(self, name) for name in (*counts, "patience")}
+        )
+        for name in (
+            "epochs",
+            "lr",
+            "physics_lr",
+            "noise",
+            "clip",
+            "short_history_fraction",
+        ):
+            expect_at_least(0, **{name: getattr(self, name)})
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation: Schulman et al., https://arxiv.org/abs/1707.06347."""
+
+    total_frames: int = 3_000_000  # actions to learn from
+    num_envs: int = 1024  # rows stepped together
+    horizon: int = 32  # actions of every row between two updates
+    epochs: int = 5  # passes over those actions
+    minibatch: int = 2048  # actions per gradient
+    lr: float = 3e-3  # Adam's step size at the start; falls linearly to zero
+    gamma: float = 0.99  # discount per action
+    lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
+    clip: float = 0.2  # how far an action's probability ratio counts
+    std: float = 1.0  # of actions at the start, before they are squashed
+    memory: int = 1  # last observations that policy and critic see
+    widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic

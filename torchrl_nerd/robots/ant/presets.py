@@ -1,0 +1,51 @@
+"""Presets of the Ant: data, training, test rollouts, PPO."""
+
+from dataclasses import replace
+
+from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
+from torchrl_nerd.robots.ant.tasks import AntRun
+from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
+
+
+def protocol() -> EvaluationProtocol:
+    """Paper, Fig. 3."""
+    published = {
+        ("passive", 500, "base_position"): 0.057,
+        ("passive", 500, "base_orientation"): 0.095,
+        ("passive", 500, "joints"): 0.077,
+    }
+    return EvaluationProtocol({"passive": AntRun()}, (100, 500), published)
+
+
+PRESETS = {
+    "ant": Preset(
+        protocol,
+        DataConfig(trajectories=20_000, steps=100),
+        TrainConfig(
+            network="grounded-halves",
+            steps=20_000,
+            rollout_steps=0,
+            single_step_fraction=1.0,
+            loss_eps=0.02,
+            validate_every=4_000,
+            bf16_fraction=0.85,
+        ),
+        task="ant/run",
+        exports="last",  # passive starts, which validate, say little about driven motion
+    )
+}
+# As in the paper's reference code (rl_games), except that its step size follows the
+# policy's KL divergence; here it falls linearly.
+_ANT = PPOConfig(
+    total_frames=32_800_000,
+    num_envs=2048,
+    minibatch=16_384,
+    lr=3e-4,
+    widths=(128, 64, 32),
+)
+PPO = {
+    "ant/run": _ANT,
+    "ant/spin": _ANT,
+    # to keep to a rate takes a wider policy
+    "ant/spin_track": replace(_ANT, widths=(256, 128, 64)),
+}

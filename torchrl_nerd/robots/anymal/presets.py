@@ -1,0 +1,39 @@
+"""Presets of ANYmal: data, training, test rollouts, PPO."""
+
+from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
+from torchrl_nerd.robots.anymal.tasks import AnymalForward
+from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
+
+
+def protocol() -> EvaluationProtocol:
+    """A PD controller holds the nominal pose for an episode; nothing is published."""
+    return EvaluationProtocol({"standing": AnymalForward()}, (100, 1000))
+
+
+PRESETS = {
+    "anymal": Preset(
+        protocol,
+        DataConfig(trajectories=20_000, steps=100),
+        TrainConfig(
+            network="grounded-halves",
+            steps=20_000,
+            rollout_steps=0,
+            single_step_fraction=1.0,
+            loss_eps=0.02,
+            validate_every=4_000,
+            bf16_fraction=0.8,
+        ),
+        task="anymal/forward",
+        exports="last",  # passive starts, which validate, say little about driven motion
+    )
+}
+# As in the paper's reference code (rl_games), except that its step size follows the
+# policy's KL divergence; here it falls linearly.
+_ANYMAL = PPOConfig(
+    total_frames=65_500_000,
+    num_envs=2048,
+    minibatch=16_384,
+    lr=3e-4,
+    widths=(128, 64, 32),
+)
+PPO = {"anymal/forward": _ANYMAL, "anymal/sideways": _ANYMAL}

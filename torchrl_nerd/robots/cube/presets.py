@@ -1,0 +1,54 @@
+"""Presets of the cubes: data, training, test rollouts."""
+
+from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.robots.cube.tasks import CubeToss, RealCubeToss, SlopeToss
+from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
+
+STEPS = 80  # of a toss, as in the paper's appendix C.4, whose results are of real ones
+
+
+def protocol() -> EvaluationProtocol:
+    """Tosses onto level ground."""
+    return EvaluationProtocol({"toss": CubeToss()}, (STEPS,))
+
+
+def real_protocol() -> EvaluationProtocol:
+    """As `protocol`, with the measured cube's mass."""
+    return EvaluationProtocol({"toss": RealCubeToss()}, (STEPS,))
+
+
+def slope_protocol() -> EvaluationProtocol:
+    """As `protocol`, over slopes."""
+    return EvaluationProtocol({"toss": SlopeToss()}, (STEPS,))
+
+
+_DATA = DataConfig(trajectories=8_000, steps=100)
+_TRAIN = TrainConfig(
+    network="grounded",
+    steps=10_000,
+    rollout_steps=0,
+    single_step_fraction=1.0,
+    loss_eps=0.02,
+    validate_every=5_000,
+)
+PRESETS = {
+    "cube": Preset(
+        protocol,
+        _DATA,
+        _TRAIN,
+        task="cube/toss",
+        strategy="resting",
+        exports="last",
+    ),
+    "cube_real": Preset(
+        real_protocol, _DATA, _TRAIN, task="cube_real/toss", exports="last"
+    ),
+    "cube_slope": Preset(
+        slope_protocol,
+        _DATA,
+        _TRAIN,
+        task="cube_slope/toss",
+        strategy="resting",
+        exports="last",
+    ),
+}
