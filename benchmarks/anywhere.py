@@ -26,7 +26,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     scene_of,
 )
 from torchrl_nerd.files import write_json
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import PRESETS, Source
 from torchrl_nerd.scenes import Scene

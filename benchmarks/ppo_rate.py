@@ -24,7 +24,7 @@ from torchrl.collectors import Collector
 
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import shipped_models
-from torchrl_nerd.envs.memory import remember
+from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.policy import make_actor
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import PPO_CONFIGS
@@ -77,7 +77,7 @@ class Learner:
         torch.manual_seed(cfg.seed)
         self.cfg, self.frames = cfg, cfg.num_envs * cfg.horizon
         env = make_env(cfg.task, cfg.dynamics, cfg.num_envs, cfg.seed, compile=compile)
-        env = remember(env, cfg.memory)
+        env = stack_frames(env, cfg.frame_stack)
         policy, critic = make_policy_and_critic(env, cfg)
         actor = make_actor(policy)
         self.learning = make_learning(actor, critic, cfg)

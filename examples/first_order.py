@@ -24,7 +24,7 @@ from tqdm import trange
 
 from torchrl_nerd import NeRDEnv, from_pretrained, make_env
 from torchrl_nerd.configs import PPOConfig
-from torchrl_nerd.envs.memory import recall, remember
+from torchrl_nerd.envs.frame_stack import append_frame, stack_frames
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import (
     ReturnSummary,
@@ -62,8 +62,8 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
     if cfg.start is not None:
         return load_policy(cfg.start, env.task)
     ppo = PPO_CONFIGS.get(cfg.task, PPOConfig())
-    seen = remember(env, ppo.memory)
-    return Policy.for_env(seen, cfg.episode, ppo.widths, memory=ppo.memory)
+    seen = stack_frames(env, ppo.frame_stack)
+    return Policy.for_env(seen, cfg.episode, ppo.widths, frame_stack=ppo.frame_stack)
 
 
 def measure(cfg: Config, policy: Policy) -> ReturnSummary:
@@ -98,7 +98,9 @@ def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]
             optimizer.step()
         schedule.step()
         rewards.append(float(reward.detach()))
-        now, recent = go_on(env, recent, policy.memory, (update + turn) % windows == 0)
+        now, recent = go_on(
+            env, recent, policy.frame_stack, (update + turn) % windows == 0
+        )
         if update % cfg.evaluate_every == 0 or update == cfg.updates:
             earned = measure(cfg, policy)
             progress.set_postfix(earned=earned.mean, best=best.mean)
@@ -136,12 +138,12 @@ def window_reward(
         env: learned dynamics that are differentiable.
         policy: what acts.
         now: what the env gave last.
-        recent: ``(num_envs, memory * D)``, what the policy saw last; None at the start.
+        recent: ``(num_envs, frame_stack * D)``, what it saw last; None at first.
         steps: how many actions.
     """
     total = torch.zeros(())
     for _ in range(steps):
-        recent = recall(recent, now["observation"], policy.memory)
+        recent = append_frame(recent, now["observation"], policy.frame_stack)
         mean, _ = policy(recent)
         if mean.requires_grad:
             mean.register_hook(bound_rows)
@@ -164,7 +166,7 @@ def bound_rows(gradient: Tensor, times: float = 4.0) -> Tensor:
 
 
 def go_on(
-    env: NeRDEnv, recent: Tensor | None, memory: int, ended: Tensor
+    env: NeRDEnv, recent: Tensor | None, frame_stack: int, ended: Tensor
 ) -> tuple[TensorDictBase, Tensor | None]:
     """Where the window ended, without its graph; rows ``ended (num_envs,)`` begin anew."""
     state = env.state.detach()
@@ -173,7 +175,7 @@ def go_on(
         state = env.state.where(ended, state)
     now = env.reset(state, set_state=True)
     if recent is not None:
-        first = recall(None, now["observation"], memory)
+        first = append_frame(None, now["observation"], frame_stack)
         recent = torch.where(ended[:, None], first, recent)
     return now, recent
 

@@ -45,7 +45,7 @@ class Config:
 class HeldSwingup(CartpoleSwingup):
     """The swing-up with each action held: a quarter of the decisions."""
 
-    steps_per_action = 4
+    frame_skip = 4
     horizon = CartpoleSwingup.horizon // 4
 
 

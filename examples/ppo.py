@@ -27,7 +27,7 @@ from tqdm import tqdm
 from torchrl_nerd import make_env
 from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.envs.memory import remember
+from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.plots import plot_learning_curve
 from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
 from torchrl_nerd.evaluation.policy_transfer import mean_returns
@@ -60,7 +60,7 @@ def parse(kind: type[Run] = Run) -> Run:
 
 def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperator]:
     """Both see observations standardised by all that were met, by random actions first."""
-    policy = Policy.for_env(env, cfg.horizon, cfg.widths, cfg.std, cfg.memory)
+    policy = Policy.for_env(env, cfg.horizon, cfg.widths, cfg.std, cfg.frame_stack)
     critic = nn.Sequential(policy.standardize, mlp((policy.sizes[0], *cfg.widths, 1)))
     return policy, ValueOperator(critic)
 
@@ -116,7 +116,7 @@ def train(
     """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
     task = task or cfg.task
     env = make_env(task, cfg.dynamics, cfg.num_envs, seed=cfg.seed, compile=cfg.compile)
-    env = remember(env, cfg.memory)
+    env = stack_frames(env, cfg.frame_stack)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
     advantage, loss, optimizer = make_learning(actor, critic, cfg)

@@ -24,7 +24,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_nerd import make_env
-from torchrl_nerd.envs.memory import remember
+from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.settings import expect_at_least
 
 
@@ -42,7 +42,7 @@ def make_worker_env(cfg: Run, rows: int, seed: int) -> EnvBase:
     os.environ.setdefault("NERD_THREADS", "1")
     torch.manual_seed(seed)
     env = make_env(cfg.task, dynamics=cfg.dynamics, num_envs=rows, seed=seed)
-    return remember(env, cfg.memory)
+    return stack_frames(env, cfg.frame_stack)
 
 
 def make_collector(

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.scenes import Scene
@@ -133,7 +133,7 @@ def in_ground(scene: Scene, rows: int, generator: Generator) -> TensorDict:
     depth = 0.05 * torch.rand(rows, dtype=torch.float64, generator=generator)
     if scene.base.is_floating:
         state = {QPOS: drawn[QPOS], QVEL: drawn[QVEL]}
-        scene.set_down(state, -depth)
+        scene.place_on_terrain(state, -depth)
         drawn[QPOS] = state[QPOS]
     elif scene.terrain.is_per_row:
         gap = scene.clearances(drawn[QPOS], drawn[TERRAIN]).amin(-1)

@@ -11,8 +11,8 @@ from helpers import moved_rows, random_transitions
 from tensordict import TensorDict
 
 from torchrl_nerd.data.generate import is_sound, simulate
-from torchrl_nerd.geometry.frames import quat_conjugate, quat_multiply
 from torchrl_nerd.geometry.manifold import differentiate_pos
+from torchrl_nerd.geometry.rotations import quat_conjugate, quat_multiply
 from torchrl_nerd.keys import (
     CONTACT_NORMAL,
     NEXT_QPOS,

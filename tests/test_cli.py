@@ -83,7 +83,7 @@ def test_help_shows_the_recipe_of_the_scene(command, scene, capsys):
     [
         ("data cartpole --trajectories 300 --steps 7", "draw 300 trajectories of"),
         ("train cartpole --network mlp-4x64", "begin a run in runs/cartpole"),
-        ("train cartpole --fine", "to datasets/cartpole-fine"),
+        ("train cartpole --reference rk4", "to datasets/cartpole-rk4"),
         ("eval cartpole --rows 77", "rows                77"),
         ("stability cube --cases resting", "('resting',)"),
         ("doctor --json out.json", "out.json"),

@@ -54,7 +54,7 @@ def prepared(tmp_path, monkeypatch):
     sizes = ["--trajectories", "8", "--steps", "20", "--quiet", "--out", "set"]
     assert main(["data", "cartpole", *sizes]) == 0
     save_policy(Policy((4, 8, 1)), tmp_path / "policy")
-    env = make_env("cartpole/swingup", fault_folder=tmp_path / "faults")
+    env = make_env("cartpole/swingup", dump_dir=tmp_path / "faults")
     start = env.reset()
     env.step(start.set(ACTION, torch.full_like(env.action_spec.zero(), torch.nan)))
 

@@ -139,7 +139,7 @@ def test_a_new_users_commands_work_one_after_the_other(
             ppo.main(ppo.Run(episodes=2, **sizes))
         elif words[:1] == ["nerd"]:
             if words[1] == "train":  # else it draws all that the preset asks for
-                fine = [word for word in words if word == "--fine"]
+                fine = [w for w in words if w in ("--reference", "rk4")]
                 assert main(within_budget(["data", words[2], *fine])) == 0
             assert main(within_budget(words[1:])) == 0, capsys.readouterr().err
             ran += 1

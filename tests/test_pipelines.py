@@ -50,7 +50,7 @@ def test_sac_learns_from_the_asked_share_of_true_transitions(example, share):
 def step_error(dynamics: str, rows: TensorDict) -> float:
     """How far from what they say these first steps of episodes lead in ``dynamics``.
 
-    Of first steps alone, since learned dynamics may remember what came before.
+    Of first steps alone, since learned dynamics may stack_frames what came before.
     """
     env = make_env("cartpole/swingup", dynamics, len(rows))
     env.reset(rows.select("qpos", "qvel"), set_state=True)
@@ -294,7 +294,7 @@ def test_windows_go_on_where_the_last_one_ended(example, generator):
         part, recent = first_order.window_reward(env, policy, now, recent, 3)
         parts.append(part)
         ended = torch.zeros(4, dtype=torch.bool)
-        now, recent = first_order.go_on(env, recent, policy.memory, ended)
+        now, recent = first_order.go_on(env, recent, policy.frame_stack, ended)
     torch.testing.assert_close(sum(parts) / 2, whole)
     gradients = torch.autograd.grad(whole, list(policy.mlp.parameters()))
     assert all(gradient.any() for gradient in gradients)
@@ -307,14 +307,14 @@ def test_rows_whose_episode_ended_begin_anew_and_the_others_go_on(example, seed)
     policy = first_order.make_policy(first_order.Config(num_envs=6), env)
     _, recent = first_order.window_reward(env, policy, env.reset(), None, 4)
     before, ended = env.state, torch.arange(6) % 2 == 0
-    now, seen = first_order.go_on(env, recent, policy.memory, ended)
+    now, seen = first_order.go_on(env, recent, policy.frame_stack, ended)
     assert not any(x.requires_grad for x in now.values(True, True))
     assert torch.equal(now["qpos"][~ended], before["qpos"][~ended])
     assert torch.equal(now["goal"][~ended], before["goal"][~ended])
     assert torch.equal(seen[~ended], recent[~ended])
     assert not now["qvel"][ended].any()  # at rest, as episodes of this task begin
     assert (now["goal"] != before["goal"])[ended].all()
-    first = now["observation"].tile(policy.memory)
+    first = now["observation"].tile(policy.frame_stack)
     assert torch.equal(seen[ended], first[ended])
 
 

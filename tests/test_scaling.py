@@ -30,7 +30,7 @@ def test_contacts_are_those_of_mujoco(generator):
     low = torch.rand(rows, generator=generator) < 0.5
     state, _ = scene.sample_initial(rows, generator)
     state["qpos"][:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0]).double()
-    scene.set_down(state, torch.where(low, -1e-4, 0.5).double())
+    scene.place_on_terrain(state, torch.where(low, -1e-4, 0.5).double())
     found = scaling.mean_contacts(scene, TensorDict(state, [rows]))
     assert found == pytest.approx(4.0 * float(low.double().mean()))
 

@@ -90,7 +90,7 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
         "format": 1,
         "scene": scene.name,
         "scene_hash": scene.hash,
-        "refinement": scene.refinement,
+        "reference_ratio": scene.reference_ratio,
         "control_step": scene.control_step,
         "foresees_forces": scene.foresees_forces,
         "foresees_free_motion": scene.foresees_free_motion,
@@ -219,7 +219,7 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
 
 def _teacher(card: dict[str, Any], scene: Scene) -> Scene:
     """The scene as the model's data were stepped."""
-    return scene.fine if card.get("refinement", 1) != 1 else scene
+    return scene.reference if card.get("reference_ratio", 1) != 1 else scene
 
 
 def _network_config(

@@ -190,5 +190,5 @@ class PPOConfig:
     lmbda: float = 0.95  # advantage estimation: 0 trusts the critic, 1 the rewards
     clip: float = 0.2  # how far an action's probability ratio counts
     std: float = 1.0  # of actions at the start, before they are squashed
-    memory: int = 1  # last observations that policy and critic see
+    frame_stack: int = 1  # last observations that policy and critic see
     widths: tuple[int, ...] = (64, 64)  # hidden layers of policy and critic

@@ -6,7 +6,7 @@ PARTS = 24  # bits: as many parts a seed has room for
 GOLDEN = 0x9E3779B1  # 2**32 over the golden ratio, odd: spreads what does not fit
 
 
-def stream(seed: int, number: int) -> Generator:
+def fold_in(seed: int, number: int) -> Generator:
     """The generator of part ``number`` of what ``seed`` seeds.
 
     torch's generator on a processor takes no more than 32 bits of a seed, without a word:

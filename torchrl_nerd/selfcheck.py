@@ -47,7 +47,7 @@ def stored_steps(model: NeRD, scene: Scene) -> dict[str, Tensor]:
 
     Args:
         model: the weights' owner.
-        scene: its own, as the data were stepped, see `Scene.fine`.
+        scene: its own, as the data were stepped, see `Scene.reference`.
     """
     start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
     high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
@@ -65,7 +65,7 @@ def self_check(
 
     Args:
         model: as it was loaded.
-        scene: its own, as the data were stepped, see `Scene.fine`.
+        scene: its own, as the data were stepped, see `Scene.reference`.
         tensors: that were stored with its weights; others than steps are passed over.
         where: they were read from, for the sentence.
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.evaluation.explain.paper_input import BaseFrame, PaperInput
-from torchrl_nerd.geometry.frames import matrix_from_quat, rotate, wrap_angle
+from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate, wrap_angle
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_FORCE,

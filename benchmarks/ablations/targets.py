@@ -5,7 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import (
+from torchrl_nerd.geometry.manifold import FREE
+from torchrl_nerd.geometry.rotations import (
     quat_exp,
     quat_log,
     quat_normalize,
@@ -13,7 +14,6 @@ from torchrl_nerd.geometry.frames import (
     rotate_inverse,
     wrap_angle,
 )
-from torchrl_nerd.geometry.manifold import FREE
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import RobotCentric, StateDelta
 

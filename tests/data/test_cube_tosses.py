@@ -14,7 +14,7 @@ from torchrl_nerd.data.cube_tosses import (
     split_tosses,
 )
 from torchrl_nerd.data.recorded import read_transitions, write_tosses
-from torchrl_nerd.geometry.frames import quat_exp, quat_multiply
+from torchrl_nerd.geometry.rotations import quat_exp, quat_multiply
 
 
 def test_csv_and_npz_give_the_same_tosses(log, tmp_path):

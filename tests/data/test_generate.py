@@ -18,7 +18,7 @@ from torchrl_nerd.data.generate import (
 )
 from torchrl_nerd.files import read_json
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.seeds import stream
+from torchrl_nerd.seeds import fold_in
 
 SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 STATE = ("qpos", "qvel")
@@ -109,9 +109,9 @@ def test_passive_and_quiet_rows_have_their_shares(scene, generator):
     relative = data["next", "joint_torque"] / torch.tensor(scene.sampling.torque)
     peak = relative.abs().amax((1, 2))
     passive = peak == 0.0
-    assert abs(passive.double().mean() - scene.sampling.passive_share) < 0.07
+    assert abs(passive.double().mean() - scene.sampling.zero_torque_fraction) < 0.07
     calm = (peak > 0.0) & (peak < 0.7)  # a loud row peaks above 0.7, but for 0.7^30
-    share = scene.sampling.quiet_share * 0.72
+    share = scene.sampling.low_torque_fraction * 0.72
     assert abs(calm.double().mean() - share) < 0.07
     speed = data["qvel"][:, 0].abs().mean(-1)
     assert 0.35 < speed[passive].mean() / speed[peak > 0.9].mean() < 0.75
@@ -119,7 +119,7 @@ def test_passive_and_quiet_rows_have_their_shares(scene, generator):
 
 def test_shares_of_none_and_all(generator):
     for passive, quiet in ((1.0, 0.0), (0.0, 0.0), (0.0, 1.0)):
-        shares = {"passive_share": passive, "quiet_share": quiet}
+        shares = {"zero_torque_fraction": passive, "low_torque_fraction": quiet}
         scene = replace(SCENE, sampling=replace(SCENE.sampling, **shares))
         torque = simulate(scene, 200, 40, generator)["next", "joint_torque"]
         peak = (torque / torch.tensor(scene.sampling.torque)).abs().amax((1, 2))
@@ -159,7 +159,7 @@ def test_broken_trajectories_are_dropped_and_counted(scene, tmp_path, seed):
     if scene.sampling.drive or not scene.actuated:
         return  # nothing to be made stronger
     strong = tuple(1e9 * torque for torque in scene.sampling.torque)
-    ranges = {"torque": strong, "passive_share": 0.5, "quiet_share": 0.0}
+    ranges = {"torque": strong, "zero_torque_fraction": 0.5, "low_torque_fraction": 0.0}
     wild = replace(scene, sampling=replace(scene.sampling, **ranges))
     config = DataConfig(trajectories=60, steps=2, seed=seed)
     data = load_data(wild, generate(wild, config, tmp_path, quiet=True))
@@ -168,7 +168,7 @@ def test_broken_trajectories_are_dropped_and_counted(scene, tmp_path, seed):
     assert 10 < len(data) < 50
     assert is_sound(data).all()
     assert (data["next", "joint_torque"] == 0.0).all()
-    drawn = simulate(wild, 60, 2, stream(seed, 0))
+    drawn = simulate(wild, 60, 2, fold_in(seed, 0))
     assert not unequal(data, drawn[is_sound(drawn)])
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_nerd.data.physics_checks import check_log
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 
 XYZW = [1, 2, 3, 0]
 

@@ -134,7 +134,7 @@ def test_another_configuration_is_refused_and_nothing_lost(name, value, tmp_path
 def test_another_robot_or_other_ranges_are_refused(tmp_path):
     generate(SCENE, CONFIG, tmp_path, quiet=True)
     before = snapshot(tmp_path)
-    calm = replace(SCENE, sampling=replace(SCENE.sampling, passive_share=1.0))
+    calm = replace(SCENE, sampling=replace(SCENE.sampling, zero_torque_fraction=1.0))
     for scene in (OTHER, calm):
         with pytest.raises(ValueError, match=f"{tmp_path} already holds"):
             generate(scene, CONFIG, tmp_path, quiet=True)

@@ -21,18 +21,18 @@ from torchrl_nerd.data.generate import (
     simulate,
 )
 from torchrl_nerd.data.policy_data import policy_data
-from torchrl_nerd.data.starts import Fallen, Nudged, Standing
+from torchrl_nerd.data.starts import PerturbedRestStates, SettledStates, TaskResets
 from torchrl_nerd.data.strategies import mix, resample, strategies
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import GroundTruthEnv
-from torchrl_nerd.envs.memory import recall
+from torchrl_nerd.envs.frame_stack import append_frame
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import PRESETS, load_scene, make_task
 from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
-from torchrl_nerd.seeds import stream
+from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tasks import Task
 
 STATE = ("qpos", "qvel")
@@ -41,10 +41,10 @@ STATE = ("qpos", "qvel")
 class Linear:
     """A policy: squashed sums of what it sees."""
 
-    def __init__(self, task: Task, seed: int, memory: int = 1) -> None:
+    def __init__(self, task: Task, seed: int, frame_stack: int = 1) -> None:
         generator = Generator().manual_seed(seed)
-        size = (memory * task.observation_size, task.controller.num_actions)
-        self.memory = memory
+        size = (frame_stack * task.observation_size, task.controller.num_actions)
+        self.frame_stack = frame_stack
         self.weight = 0.3 * torch.randn(size, generator=generator)
 
     def __call__(self, td: TensorDict) -> TensorDict:
@@ -107,7 +107,7 @@ def test_torques_keep_as_long_as_asked_and_stay_uniform(scene, generator):
         return
     dt, rows, steps = scene.control_step, 1500, 60
     tau = dt * float(torch.empty(()).uniform_(2.0, 12.0, generator=generator))
-    sampling = replace(scene.sampling, correlation=(tau, tau))
+    sampling = replace(scene.sampling, correlation_time=(tau, tau))
     one = torch.ones(rows, 1, dtype=torch.float64)
     torque = sample_torques(sampling, one, steps, dt, generator)
     share = (torque / torch.tensor(sampling.torque))[..., 0]
@@ -124,7 +124,7 @@ def test_torques_keep_as_long_as_asked_and_stay_uniform(scene, generator):
 
 def test_each_row_has_a_correlation_time_of_its_own(generator):
     scene = load_scene("cartpole")
-    sampling = replace(scene.sampling, correlation=(1e-3, 1e3))
+    sampling = replace(scene.sampling, correlation_time=(1e-3, 1e3))
     one = torch.ones(2000, 1, dtype=torch.float64)
     torque = sample_torques(sampling, one, 40, scene.control_step, generator)[..., 0]
     turns = (torque.diff(dim=1).abs() / sampling.torque[0]).mean(1)
@@ -133,7 +133,11 @@ def test_each_row_has_a_correlation_time_of_its_own(generator):
 
 
 def test_scales_are_as_likely_in_each_octave(generator):
-    shares = {"passive_share": 0.2, "quiet_share": 0.0, "least_scale": 1e-3}
+    shares = {
+        "zero_torque_fraction": 0.2,
+        "low_torque_fraction": 0.0,
+        "min_torque_scale": 1e-3,
+    }
     sampling = replace(load_scene("cartpole").sampling, **shares)
     scale, speed = (x[:, 0] for x in sample_scale(sampling, 5000, generator))
     assert abs((scale == 0.0).double().mean() - 0.2) < 0.03
@@ -146,11 +150,14 @@ def test_scales_are_as_likely_in_each_octave(generator):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"least_scale": 0.0}, "least_scale above 0 and up to 1, got 0.0"),
-        ({"least_scale": 2.0}, "least_scale above 0 and up to 1, got 2.0"),
-        ({"correlation": (0.0, 1.0)}, r"above 0 s, the lower first, got \(0.0, 1.0\)"),
-        ({"correlation": (2.0, 1.0)}, "the lower first"),
-        ({"correlation": (1.0, 2.0), "drive": torch.add}, "a drive, got both"),
+        ({"min_torque_scale": 0.0}, "min_torque_scale above 0 and up to 1, got 0.0"),
+        ({"min_torque_scale": 2.0}, "min_torque_scale above 0 and up to 1, got 2.0"),
+        (
+            {"correlation_time": (0.0, 1.0)},
+            r"above 0 s, the lower first, got \(0.0, 1.0\)",
+        ),
+        ({"correlation_time": (2.0, 1.0)}, "the lower first"),
+        ({"correlation_time": (1.0, 2.0), "drive": torch.add}, "a drive, got both"),
     ],
 )
 def test_impossible_sampling_is_refused(change, words):
@@ -160,7 +167,7 @@ def test_impossible_sampling_is_refused(change, words):
 
 def test_standing_starts_are_the_tasks_over_the_scenes_ground(scene, seed):
     task = task_of(scene)
-    standing = resample(scene, starts=Standing(task))
+    standing = resample(scene, starts=TaskResets(task))
     start, _ = standing.sample_initial(40, seeded(seed))
     size = (40, task.num_uniforms)
     u = torch.rand(size, dtype=torch.float64, generator=seeded(seed))
@@ -172,7 +179,7 @@ def test_standing_starts_are_the_tasks_over_the_scenes_ground(scene, seed):
 
 def test_fallen_starts_end_passive_trajectories(scene, seed):
     seconds, rows = 0.25, 6
-    end = Fallen(scene, seconds)(rows, seeded(seed))
+    end = SettledStates(scene, seconds)(rows, seeded(seed))
     state, _ = scene.sample_initial(rows, seeded(seed))
     terrain = state.pop("terrain", None)
     steps = round(seconds / scene.control_step)
@@ -188,24 +195,24 @@ def test_fallen_starts_end_passive_trajectories(scene, seed):
 def test_the_ant_has_fallen_and_lies_still(generator):
     scene = load_scene("ant")
     start, _ = scene.sample_initial(24, generator)
-    end = Fallen(scene)(24, generator)
+    end = SettledStates(scene)(24, generator)
     assert (end["qpos"][:, 2] < start["qpos"][:, 2].min()).all()
     fast, slow = (x["qvel"].norm(dim=-1).median() for x in (start, end))
     assert slow < 0.1 * fast  # the median: one may still be rolling
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_policy_data_is_what_the_env_does(task_id, memory, seed):
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_policy_data_is_what_the_env_does(task_id, frame_stack, seed):
     task, rows, steps = make_task(task_id), 4, 6
-    actor = Linear(task, seed, memory)
+    actor = Linear(task, seed, frame_stack)
     data = policy_data(task, actor, rows, steps, seeded(seed), 0.0)
     size = (rows, task.num_uniforms)
     u = torch.rand(size, dtype=torch.float64, generator=seeded(seed))
     env = GroundTruthEnv(task, num_envs=rows)
     td = env.reset(TensorDict(task.initial_state(u), [rows]), set_state=True)
-    every, recent = task.steps_per_action, None
+    every, recent = task.frame_skip, None
     for step in range(every - 1, steps, every):
-        recent = recall(recent, td["observation"], memory)
+        recent = append_frame(recent, td["observation"], frame_stack)
         td = env.step(actor(td.set("observation", recent)))["next"]
         for key in (*STATE, "joint_torque"):
             assert torch.equal(data["next", key][:, step], td[key])
@@ -244,10 +251,10 @@ def test_a_mixture_has_equal_shares_in_order(generator):
 
 def test_a_folder_holds_one_strategy(tmp_path, seed):
     scene, config = load_scene("cartpole"), DataConfig(9, 4, seed)
-    calm = partial(simulate, resample(scene, passive_share=1.0))
+    calm = partial(simulate, resample(scene, zero_torque_fraction=1.0))
     generate(scene, config, tmp_path, quiet=True, strategy=("calm", calm))
     data = load_data(scene, tmp_path)
-    assert_equal(TensorDict(dict(data.items()), [9, 4]), calm(9, 4, stream(seed, 0)))
+    assert_equal(TensorDict(dict(data.items()), [9, 4]), calm(9, 4, fold_in(seed, 0)))
     for other in (None, ("wild", partial(simulate, scene))):
         with pytest.raises(ValueError, match=f"{tmp_path} already holds.*strategy"):
             generate(scene, config, tmp_path, quiet=True, strategy=other)
@@ -262,7 +269,7 @@ def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
     assert (
         card["ranges"] == json.loads(json.dumps(model["training_ranges"])) == expected
     )
-    assert {"torque", "passive_share"} <= set(ranges)
+    assert {"torque", "zero_torque_fraction"} <= set(ranges)
     assert not {"ground", "drive", "starts"} & set(ranges)
     card["ranges"] |= {
         "ground": None,
@@ -276,22 +283,22 @@ def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
 
 def test_nudged_robots_are_stopped_where_they_fell_and_pushed(scene, generator):
     seed, rows = int(torch.randint(2**31, (), generator=generator)), 64
-    fallen = Fallen(scene, 0.2)
+    fallen = SettledStates(scene, 0.2)
     rest = fallen(rows, seeded(seed))
-    nudged = Nudged(fallen)(rows, seeded(seed))
+    nudged = PerturbedRestStates(fallen)(rows, seeded(seed))
     push = nudged["qvel"].abs().amax(-1)
     assert push.max() < 3.0 * 6.0  # six deviations of the largest unit
     assert push.min() > 0.0
     assert push.quantile(0.25) < 0.1 * push.quantile(0.75)  # over decades
     moved = differentiate_pos(scene.layout, rest["qpos"], nudged["qpos"])
     assert moved.abs().max() < 0.03 * 6.0
-    stopped = Nudged(fallen, 1e-9)(rows, seeded(seed))
+    stopped = PerturbedRestStates(fallen, 1e-9)(rows, seeded(seed))
     assert stopped["qvel"].abs().amax(-1).min() < 1e-4
 
 
 def test_a_cube_stopped_on_a_steep_slope_begins_to_slide_anew(generator):
     scene, rows, steps = load_scene("cube_slope"), 24, 148
-    start = Nudged(Fallen(scene))(rows, generator)
+    start = PerturbedRestStates(SettledStates(scene))(rows, generator)
     steep = start["terrain"][:, 2].acos() > math.atan(0.25)  # friction: 0.15
     torque = torch.zeros(rows, steps, 0, dtype=torch.float64)
     state = TensorDict({key: start[key] for key in STATE}, [rows])

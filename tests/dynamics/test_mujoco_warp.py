@@ -28,7 +28,7 @@ def grounded_drive(scene, generator, depth=0.005):
     """A random drive from starts so deep (m) in the ground, where there is one."""
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
     if terrain is None:
-        scene.set_down(start, torch.full((ROWS,), -depth, dtype=torch.float64))
+        scene.place_on_terrain(start, torch.full((ROWS,), -depth, dtype=torch.float64))
     else:
         terrain[:, 3] += scene.clearances(start["qpos"], terrain).amin(-1) + depth
     return start, torques, terrain

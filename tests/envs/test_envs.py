@@ -52,7 +52,7 @@ def test_every_step_records_what_happened(task_id, dynamics, generator):
         after = act(env, action)
         reward = env.task.reward(state, action, after)[:, None]
         is_end = env.task.terminated(after)[:, None]
-        if env.task.steps_per_action == 1:
+        if env.task.frame_skip == 1:
             assert torch.equal(after["joint_torque"], torque)
         assert torch.equal(after["reward"], reward.float())
         assert torch.equal(after["terminated"], is_end)
@@ -69,7 +69,7 @@ def test_an_env_steps_its_dynamics(task_id, dynamics, generator):
     bare.reset(state)
     for action in random_actions(env, 5, generator):
         expected, torque = state, None
-        for _ in range(env.task.steps_per_action):
+        for _ in range(env.task.frame_skip):
             torque = env.task.controller(action, expected["qpos"], expected["qvel"])
             expected = bare.step(expected, torque, state.get("terrain", None))
         state = act(env, action)

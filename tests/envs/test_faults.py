@@ -137,9 +137,9 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     make = EnvMaker("ant/run", dynamics, generator)
     model = make.model
     if model is None:
-        env = GroundTruthEnv("ant/run", dynamics, ROWS, fault_folder=tmp_path)
+        env = GroundTruthEnv("ant/run", dynamics, ROWS, dump_dir=tmp_path)
     else:
-        env = NeRDEnv("ant/run", model, ROWS, inference=dynamics, fault_folder=tmp_path)
+        env = NeRDEnv("ant/run", model, ROWS, inference=dynamics, dump_dir=tmp_path)
     env.reset()
     actions = random_actions(env, 5, generator)
     row = int(torch.randint(ROWS, (), generator=generator))
@@ -166,7 +166,7 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
 
 
 def test_the_command_replays_a_dump(generator, tmp_path, capsys):
-    env = GroundTruthEnv("cartpole/swingup", num_envs=2, fault_folder=tmp_path)
+    env = GroundTruthEnv("cartpole/swingup", num_envs=2, dump_dir=tmp_path)
     env.reset()
     act(env, torch.full(env.action_spec.shape, torch.inf))
     assert main(["replay", str(tmp_path / "fault_action.safetensors")]) == 0

@@ -19,7 +19,7 @@ TOSSES, STATES = 12, 16
 def made(scene, step, generator, height):
     """Tosses of a cube whose lowest corner starts that high, m."""
     state = scene.sample_initial(TOSSES, generator)[0]
-    scene.set_down(state, torch.full((TOSSES,), height, dtype=torch.float64))
+    scene.place_on_terrain(state, torch.full((TOSSES,), height, dtype=torch.float64))
     path = [(state["qpos"], state["qvel"])]
     with torch.no_grad():
         for _ in range(STATES - 1):

@@ -113,13 +113,13 @@ def test_hardest_episode_begins_in_one_state(policy: Policy) -> None:
     assert abs(true["qpos"][0, 1]) > 0.9 * angle.max()
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_policy_survives_disk(memory: int, tmp_path) -> None:
-    policy = Policy((4 * memory, 16, 16, 1), memory=memory)
-    policy.standardize.fit(torch.randn(50, 4 * memory) * 3.0 + 1.0)
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_policy_survives_disk(frame_stack: int, tmp_path) -> None:
+    policy = Policy((4 * frame_stack, 16, 16, 1), frame_stack=frame_stack)
+    policy.standardize.fit(torch.randn(50, 4 * frame_stack) * 3.0 + 1.0)
     save_policy(policy, tmp_path / "policy", {"task": TASK})
     loaded = load_policy(tmp_path / "policy", make_task(TASK))
-    observation = torch.randn(7, 4 * memory)
+    observation = torch.randn(7, 4 * frame_stack)
     for one, other in zip(policy(observation), loaded(observation), strict=True):
         assert torch.equal(one, other)
 
@@ -142,7 +142,7 @@ def test_changes_have_a_spread_of_their_own() -> None:
         + 0.01 * torch.arange(3)[:, None] * speed[:, None]
     )
     seen = path.double().flatten(1)
-    shown = Standardize(6, memory=3).double().fit(seen)(seen)
+    shown = Standardize(6, frame_stack=3).double().fit(seen)(seen)
     torch.testing.assert_close(shown.std(0), torch.ones(6).double(), rtol=0, atol=0.01)
     for change in (shown[:, 2:4], shown[:, 4:]):  # speed, and nothing else
         matched = torch.corrcoef(torch.stack((change[:, 0], speed[:, 0].double())))
@@ -157,7 +157,7 @@ def test_actions_stay_in_the_spec(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage", ["missing", "truncated", "sizes", "card", "memory", "task"]
+    "damage", ["missing", "truncated", "sizes", "card", "frame_stack", "task"]
 )
 def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> None:
     save_policy(policy, tmp_path)
@@ -170,8 +170,8 @@ def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> Non
         card.write_text('{"sizes": [4, 8, 1]}')
     elif damage == "card":
         card.write_text('{"sizes": "many"}')
-    elif damage == "memory":
-        card.write_text('{"sizes": [4, 16, 16, 1], "memory": 3}')
+    elif damage == "frame_stack":
+        card.write_text('{"sizes": [4, 16, 16, 1], "frame_stack": 3}')
     task = make_task("double_pendulum/passive") if damage == "task" else None
     with pytest.raises(ValueError, match=str(tmp_path)):
         load_policy(tmp_path, task)

@@ -51,7 +51,7 @@ def test_errors_are_metres_and_radians(tosses):
     qpos = tosses.qpos[:5]
     half = math.sin(0.05)
     turn = torch.tensor([math.cos(0.05), half, 0.0, 0.0]).double()
-    from torchrl_nerd.geometry.frames import quat_multiply
+    from torchrl_nerd.geometry.rotations import quat_multiply
 
     moved = torch.cat((qpos[:, :3] + 0.03, quat_multiply(qpos[:, 3:], turn)), 1)
     distance, angle = path_errors(moved, qpos)
@@ -104,7 +104,7 @@ def test_mujocos_centre_of_mass_falls_freely(real_cube, generator):
     step = PenaltyStep(real_cube, substeps=SUBSTEPS)
     step.set_values(values)
     state = real_cube.sample_initial(8, generator)[0]
-    real_cube.set_down(state, torch.ones(8, dtype=torch.float64))
+    real_cube.place_on_terrain(state, torch.ones(8, dtype=torch.float64))
     start = TensorDict(state, [8])
     truth.reset(start)
     expected = truth.step(start, start["qpos"][:, :0])

@@ -44,7 +44,7 @@ def free_acceleration(scene, rows, period=0.0, torque=None):
         rows[QPOS], rows[QVEL][:0]
     )
     count = len(axes.bodies)
-    mount = map(torch.as_tensor, scene.mount)
+    mount = map(torch.as_tensor, scene.fixed_base_pose)
     rotation = base_pose(scene.base, rows[QPOS], *mount)[1]
     corners, places = points[:, count:], points[:, :count]
     where = rotation, corners, places

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import random_quats
 
-from torchrl_nerd.geometry.frames import matrix_from_quat, rotate, rotate_inverse
+from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate, rotate_inverse
 from torchrl_nerd.geometry.surfaces import (
     SHAPES,
     into_frame,

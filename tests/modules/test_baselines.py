@@ -25,7 +25,7 @@ def randn(generator: Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-def stream(
+def fold_in(
     network: nn.Module, tokens: Tensor, cleared: Tensor, when: int
 ) -> tuple[Tensor, Tensor]:
     """Outputs before and after the step at which ``cleared`` rows forget."""
@@ -47,7 +47,7 @@ def test_stepping_equals_the_full_sequence(config, dtype, tolerance, generator):
     tokens = randn(generator, ROWS, STEPS, INPUTS).to(dtype)
     rows = torch.tensor([False, True, False, True])
     with torch.no_grad():
-        before, after = stream(network, tokens, rows, 6)
+        before, after = fold_in(network, tokens, rows, 6)
         whole, restarted = network(tokens), network(tokens[:, 6:])
     close = {"atol": tolerance, "rtol": tolerance}
     torch.testing.assert_close(before, whole[:, :6], **close)
@@ -63,8 +63,8 @@ def test_nothing_of_a_cleared_history_leaks(config, generator):
     junk = tokens.clone()
     junk[1, :6] = torch.nan
     with torch.no_grad():
-        _, polluted = stream(network, junk, rows, 6)
-        _, clean = stream(network, tokens, rows, 6)
+        _, polluted = fold_in(network, junk, rows, 6)
+        _, clean = fold_in(network, tokens, rows, 6)
     assert torch.equal(polluted, clean)
 
 
@@ -73,7 +73,7 @@ def test_gradients_through_stepping_equal_the_full_sequence(config, generator):
     network = build(config, generator)
     tokens = randn(generator, ROWS, STEPS, INPUTS).requires_grad_()
     rows = torch.tensor([False, True, False, True])
-    before, after = stream(network, tokens, rows, 6)
+    before, after = fold_in(network, tokens, rows, 6)
     whole, restarted = network(tokens), network(tokens[:, 6:])
     later = torch.where(rows[:, None, None], restarted, whole[:, 6:])
     wanted = [tokens, *network.parameters()]

@@ -151,7 +151,7 @@ def test_it_comes_back_from_disk(scene, network, inference, generator, tmp_path)
 def test_it_keeps_the_substeps_that_it_learned_from(generator, tmp_path):
     """RK4 has no error of its substeps to share, and the plain scene's Euler has."""
     scene = load_scene("cartpole")
-    model = lively(scene.fine, "free", generator)
+    model = lively(scene.reference, "free", generator)
     assert model.free_step.lag == 0.0 < fresh(scene, "free").free_step.lag
     save_checkpoint(model, tmp_path, make_card(model))
     loaded = load_checkpoint(tmp_path, scene)

@@ -18,7 +18,7 @@ from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.ground_step import GroundStep
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.scenes.penalty import set_penalty_contact
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 
 ROWS = 256
 BALL = """<mujoco><option cone="{cone}" timestep="0.001"/><worldbody>
@@ -48,7 +48,7 @@ def errors(scene, rows, looks=2, parts=1):
 
 def teacher(scene, looks):
     """Whose next state that many looks lead to."""
-    return scene.fine if looks == 3 else scene
+    return scene.reference if looks == 3 else scene
 
 
 def touching(scene, generator, looks=2):
@@ -232,7 +232,7 @@ def test_a_rolling_ball_is_turned_by_its_rim():
     ("scene", "sentence"),
     [
         (load_scene("franka"), "expected a ground to step on, got scene 'franka'"),
-        (GROUNDED[0].fine, "expected substeps of mjINT_EULER, got mjINT_RK4"),
+        (GROUNDED[0].reference, "expected substeps of mjINT_EULER, got mjINT_RK4"),
         (ball("pyramidal"), "expected elliptic friction cones, got pyramidal ones"),
     ],
 )

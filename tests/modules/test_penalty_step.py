@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.parameter_fit import CENTRE
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.modules.penalty_step import PARAMETERS, PenaltyStep
 
 ROWS = 32
@@ -19,7 +19,7 @@ def falling(scene, generator, height=0.0):
     """Random states whose lowest corner is that high, m."""
     state = scene.sample_initial(ROWS, generator)[0]
     gap = torch.full((ROWS,), height, dtype=torch.float64)
-    scene.set_down(state, gap)
+    scene.place_on_terrain(state, gap)
     return state["qpos"], state["qvel"]
 
 

@@ -94,7 +94,7 @@ def test_merged_points_never_part(rng):
 
 def test_the_papers_contacts_follow_from_the_pendulums_features(generator):
     scene = load_scene("double_pendulum")
-    model, points, root = scene.model, scene.contacts, scene.mount[0]
+    model, points, root = scene.model, scene.contacts, scene.fixed_base_pose[0]
     rows = random_transitions(scene, 400, generator)
     qpos, planes = rows[QPOS].numpy(), rows[TERRAIN].numpy()
     transform = ContactFeatures(scene)

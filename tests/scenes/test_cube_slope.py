@@ -26,7 +26,7 @@ def test_setting_down_leaves_the_gap_asked_for(generator):
     start = starts(SCENE, ROWS, generator)
     gap = 0.1 * torch.rand(ROWS, dtype=torch.float64, generator=generator)
     state = {key: start[key] for key in ("qpos", "terrain")}
-    SCENE.set_down(state, gap)
+    SCENE.place_on_terrain(state, gap)
     found = SCENE.clearances(state["qpos"], state["terrain"]).amin(-1)
     torch.testing.assert_close(found, gap, rtol=0.0, atol=1e-12)
 

@@ -24,8 +24,8 @@ from torchrl_nerd.modules.networks import network_config
 
 @every_scene
 def test_it_is_another_truth_of_the_same_scene(scene):
-    fine = scene.fine
-    assert fine.fine is fine and fine.hash != scene.hash
+    fine = scene.reference
+    assert fine.reference is fine and fine.hash != scene.hash
     assert fine.control_step == pytest.approx(scene.control_step, rel=1e-12)
     models = (
         NeRD(s, network_config("transformer-2x64")).state_dict() for s in (scene, fine)
@@ -41,10 +41,10 @@ def test_it_is_a_hundred_times_nearer_to_the_limit(name, generator):
     start, torque, terrain = random_drive(scene, 8, 10, generator)
     if terrain is not None:
         terrain = terrain - torch.tensor([0.0, 0.0, 0.0, 100.0])  # deep below
-    limit = scene.fine.with_substeps(8 * scene.fine.substeps)
+    limit = scene.reference.with_substeps(8 * scene.reference.substeps)
     ends = [
         roll(MujocoDynamics(s, num_threads=1), start, torque, terrain)[QPOS][:, -1]
-        for s in (scene, scene.fine, limit)
+        for s in (scene, scene.reference, limit)
     ]
     coarse, fine = ((end - ends[2]).abs().max() for end in ends[:2])
     assert 100 * fine < coarse
@@ -52,7 +52,7 @@ def test_it_is_a_hundred_times_nearer_to_the_limit(name, generator):
 
 @every_scene
 def test_its_model_serves_the_scene(scene, generator, tmp_path):
-    model = random_model(scene.fine, generator)
+    model = random_model(scene.reference, generator)
     save_checkpoint(model, tmp_path, make_card(model))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -64,13 +64,13 @@ def test_its_model_serves_the_scene(scene, generator, tmp_path):
     torch.testing.assert_close(
         *(roll(NeRDDynamics(m), *drive)[QVEL] for m in (model, mine)), rtol=0, atol=0
     )
-    edit_card(tmp_path, refinement=1)
+    edit_card(tmp_path, reference_ratio=1)
     with pytest.warns(UserWarning, match="scene_hash is"):
         load_checkpoint(tmp_path, scene)
 
 
 def test_its_model_runs_in_an_env(generator, tmp_path):
-    model = random_model(load_scene("cartpole").fine, generator)
+    model = random_model(load_scene("cartpole").reference, generator)
     save_checkpoint(model, tmp_path, make_card(model))
     env = make_env("cartpole/swingup", tmp_path, num_envs=2)
     assert env.rollout(3)["next", QPOS].isfinite().all()
@@ -78,7 +78,7 @@ def test_its_model_runs_in_an_env(generator, tmp_path):
 
 def test_its_data_are_not_taken_for_the_scenes_own(tmp_path):
     scene, config = load_scene("cartpole"), DataConfig(trajectories=4, steps=3)
-    generate(scene.fine, config, tmp_path, quiet=True)
-    assert len(load_data(scene.fine, tmp_path)) == 4
+    generate(scene.reference, config, tmp_path, quiet=True)
+    assert len(load_data(scene.reference, tmp_path)) == 4
     with pytest.raises(ValueError, match="are of scene 'cartpole'"):
         load_data(scene, tmp_path)

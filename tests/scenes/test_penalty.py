@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.scenes.penalty import set_penalty_contact, set_penalty_limit
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact, set_penalty_limit
 
 RADIUS = 0.1  # m
 SLIDES = "".join(

@@ -122,7 +122,7 @@ def test_initial_states_fill_the_published_ranges(name, generator):
         reach = torch.stack((state[key].amin(0) / low, state[key].amax(0) / high))
         assert reach.min() > 0.97
     is_passive = float((torque_scale == 0.0).double().mean())
-    assert abs(is_passive - scene.sampling.passive_share) < 0.05
+    assert abs(is_passive - scene.sampling.zero_torque_fraction) < 0.05
     assert float((torque_scale == 1.0).double().mean()) > 0.4
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_nerd.geometry.frames import rotate
+from torchrl_nerd.geometry.rotations import rotate
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.robots.double_pendulum.scene import (
     GROUNDS,

@@ -11,7 +11,7 @@ from helpers import make_scene, random_quats
 from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import DMControlDynamics, MujocoDynamics
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.transforms import ContactFeatures
 

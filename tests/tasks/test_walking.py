@@ -6,7 +6,7 @@ import torch
 from helpers import random_quats, yaw_quat
 from tensordict import TensorDict
 
-from torchrl_nerd.geometry.frames import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.robots.ant.scene import STANDING_POSE as ANT_POSE
 from torchrl_nerd.robots.anymal.scene import STANDING_POSE as ANYMAL_POSE

@@ -68,7 +68,7 @@ def mujoco_contacts(scene, row):
         distances.append(plane[:3] @ world - plane[3])
         velocities.append(jacobian @ data.qvel)
     turn = data.xmat[scene.base.body].reshape(3, 3)
-    turn = turn if scene.base.is_floating else scene.mount[1]
+    turn = turn if scene.base.is_floating else scene.fixed_base_pose[1]
     return np.array(distances), np.array(velocities), plane[:3], turn
 
 

@@ -49,7 +49,7 @@ def test_depths_are_those_of_the_untouched_robot(scene, generator):
     """With as many substeps as glances, for points that touch from the beginning on."""
     model = copy.copy(scene.model)
     model.opt.timestep = scene.control_step / GLANCES
-    scene = replace(scene, model=model, substeps=GLANCES, refinement=1)
+    scene = replace(scene, model=model, substeps=GLANCES, reference_ratio=1)
     rows = in_ground(scene, ROWS, generator)
     want, errors = untouched(scene, rows), {}
     touches = want[..., 0] > 0.0

@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers import HANDMADE, in_ground, make_scene
 
-from torchrl_nerd.geometry.frames import rotate_inverse
+from torchrl_nerd.geometry.rotations import rotate_inverse
 from torchrl_nerd.keys import CONTACT_FORCE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import ContactFeatures, RobotCentric

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -55,9 +55,9 @@ class Data(Command):
     or an MJCF file."""
     out: Path | None = None
     """Folder of the data set; datasets/SCENE by default."""
-    fine: bool = False
-    """A finer teacher: MuJoCo's RK4 at four times the scene's substeps, in
-    datasets/SCENE-fine."""
+    reference: Literal["rk4"] | None = None
+    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
+    substeps."""
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
@@ -77,7 +77,7 @@ class Data(Command):
     @property
     def folder(self) -> Path:
         """Where drawn data go."""
-        return self.out or Path("datasets") / run_name(self.scene, self.fine)
+        return self.out or Path("datasets") / run_name(self.scene, self.reference)
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
         """What draws: the policy, or the scene's preset."""
@@ -90,7 +90,7 @@ class Data(Command):
         if self.recorded is not None:
             tosses, _ = load_tosses(self.recorded, real_scene(self.scene))
             return [f"take over {len(tosses)} recorded tosses"]
-        scene, out = scene_of(self.scene, self.fine), self.folder
+        scene, out = scene_of(self.scene, self.reference), self.folder
         _, draw = self.strategy(scene) or plain_strategy(scene)
         one = draw_chunk(draw, self.config, (0, 1)).bytes()
         wanted, there = self.config.trajectories, 0
@@ -119,7 +119,7 @@ class Data(Command):
             print("\n".join(card["checks"]))
             print(f"{card['trajectories']} recorded tosses in {out}: they fit physics")
             return card
-        scene = scene_of(self.scene, self.fine)
+        scene = scene_of(self.scene, self.reference)
         out = self.folder
         draw = self.strategy(scene)
         mapper = partial(ray_map, address=self.ray) if self.ray else ahead

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
@@ -45,8 +45,9 @@ class Eval(DeviceCommand):
     """streaming, or window: the paper's recomputation."""
     bf16: bool = False
     """Network in bfloat16, state in float64: for processors that multiply in it."""
-    fine: bool = False
-    """Against MuJoCo's RK4 at four times the scene's substeps."""
+    reference: Literal["rk4"] | None = None
+    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
+    substeps."""
     unseen_terrain: bool = False
     """Over grounds of kinds that no training data have, in place of the paper's."""
     data: Path | None = None
@@ -87,11 +88,11 @@ class Eval(DeviceCommand):
         bar = tqdm(total=steps, desc=self.scene, leave=False, disable=self.quiet)
         for case, source in protocol.cases.items():
             place = scene_of(source)
-            here = model if place is scene else model.over(place)
+            here = model if place is scene else model.with_terrain(place)
             errors = passive_errors(
                 source,
                 NeRDDynamics(here, inference=self.inference),
-                MujocoDynamics(place.fine if self.fine else place),
+                MujocoDynamics(place.reference if self.reference else place),
                 list(protocol.horizons),
                 self.rows,
                 self.seed,
@@ -110,7 +111,11 @@ class Eval(DeviceCommand):
                     bar.write(f"{line}  {paper if paper is not None else '-'}")
         bar.close()
         settings = {"rows": self.rows, "seed": self.seed}
-        settings |= {"inference": self.inference, "fine": self.fine, "bf16": self.bf16}
+        settings |= {
+            "inference": self.inference,
+            "reference": self.reference,
+            "bf16": self.bf16,
+        }
         return {"scene": self.scene, **settings, "errors": rows}
 
     def _load(self, name: Path | str, scene: Scene) -> NeRD:

@@ -11,15 +11,15 @@ Positional = tyro.conf.Positional
 Flat = tyro.conf.OmitArgPrefixes
 
 
-def scene_of(name: str, fine: bool) -> Scene:
-    """A scene by its name, as it is or with the finer teacher, see `Scene.fine`."""
+def scene_of(name: str, reference: str | None) -> Scene:
+    """A scene by its name, with its own or the reference solver, see `Scene.reference`."""
     scene = load_scene(name)
-    return scene.fine if fine else scene
+    return scene.reference if reference else scene
 
 
-def run_name(name: str, fine: bool) -> str:
+def run_name(name: str, reference: str | None) -> str:
     """The folder under ``datasets`` and ``runs`` that belongs to it."""
-    return folder_name(name) + "-fine" * fine
+    return "-".join((folder_name(name), *((reference,) if reference else ())))
 
 
 def real_scene(name: str) -> Scene:

@@ -68,19 +68,19 @@ class Play(DeviceCommand):
         check_display() if out is None else check_movie(out)
         if self.slow <= 0.0:
             raise ValueError(f"expected slow above 0, got {self.slow}")
-        size = task.scene.control_step * task.steps_per_action
+        size = task.scene.control_step * task.frame_skip
         steps = min(task.horizon, round(SECONDS / size))
         if self.steps is not None:
             expect_at_least(1, steps=self.steps)
             steps = self.steps
-        memory, folder = 1, self.policy
+        frame_stack, folder = 1, self.policy
         if folder is None and self.actions is None:
             folder = shipped_policies().get(self.task)
         if folder is None:
             act = idle(task, steps, self.seed, self.actions or "random")
         else:
             policy = load_policy(folder, task).to(self.device)
-            act, memory = follow(make_actor(policy)), policy.memory
+            act, frame_stack = follow(make_actor(policy)), policy.frame_stack
         pair = play_pair(
             self.task,
             self.model,
@@ -89,7 +89,7 @@ class Play(DeviceCommand):
             self.seed,
             self.own_actions,
             self.device,
-            memory,
+            frame_stack,
         )
         drawn = None
         if out is None:

@@ -79,7 +79,7 @@ class Plot(DeviceCommand):
         model = from_pretrained(self.model or self.what, scene).to(self.device)
         traces = compare_traces(
             source,
-            NeRDDynamics(model if place is scene else model.over(place)),
+            NeRDDynamics(model if place is scene else model.with_terrain(place)),
             MujocoDynamics(place),
             steps,
             self.rows,

@@ -14,7 +14,7 @@ from torchrl_nerd.evaluation.replay import read_dump, replay
 class Replay(DeviceCommand):
     """The steps that led to a fault, again in learned and true dynamics.
 
-    Envs with a fault_folder leave dumps: make_env(..., fault_folder=Path("faults")).
+    Envs with a dump_dir leave dumps: make_env(..., dump_dir=Path("faults")).
 
     Example: nerd replay faults/fault_diverged.safetensors
     """

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -52,9 +52,9 @@ class Train(DeviceCommand):
     start: str | None = None
     """Begin with the weights and statistics of a shipped model, by name, or of a checkpoint
     folder."""
-    fine: bool = False
-    """Learn from a finer teacher: MuJoCo's RK4 at four times the scene's substeps;
-    runs/SCENE-fine and datasets/SCENE-fine by default."""
+    reference: Literal["rk4"] | None = None
+    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
+    substeps."""
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
     """Copy the preset's checkpoint, best or last, to this folder when done."""
@@ -68,7 +68,7 @@ class Train(DeviceCommand):
     @property
     def folders(self) -> tuple[Path, tuple[Path, ...]]:
         """Of the run and of its data sets."""
-        name = run_name(self.scene, self.fine)
+        name = run_name(self.scene, self.reference)
         return self.out or Path("runs") / name, self.data or (Path("datasets") / name,)
 
     def begin(self, scene: Scene) -> NeRD | None:
@@ -77,7 +77,7 @@ class Train(DeviceCommand):
 
     def plan(self) -> list[str]:
         """What would be trained on what, and what is there."""
-        scene, (out, folders) = scene_of(self.scene, self.fine), self.folders
+        scene, (out, folders) = scene_of(self.scene, self.reference), self.folders
         model = make_model(scene, network_config(self.config.network))
         start = self.begin(scene)
         if start is not None:
@@ -96,7 +96,7 @@ class Train(DeviceCommand):
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the preset takes."""
-        scene = scene_of(self.scene, self.fine)
+        scene = scene_of(self.scene, self.reference)
         preset, (out, folders) = preset_of(self.scene), self.folders
         start = self.begin(scene)
         writable_folder(out)

@@ -26,7 +26,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import (
+from torchrl_nerd.geometry.rotations import (
     quat_conjugate,
     quat_log,
     quat_multiply,

@@ -33,7 +33,7 @@ from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torques
-from torchrl_nerd.seeds import stream
+from torchrl_nerd.seeds import fold_in
 
 CHUNK = 2048  # trajectories stepped together; also what a kill can lose
 SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
@@ -110,7 +110,7 @@ def plain_strategy(scene: Scene) -> tuple[None, Draw]:
 def draw_chunk(draw: Draw, config: DataConfig, chunk: Chunk) -> TensorDict:
     """One chunk's trajectories; seed and number decide them, not who draws them."""
     number, rows = chunk
-    generator = stream(config.seed, number)
+    generator = fold_in(config.seed, number)
     return draw(rows, config.steps, generator)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.data.cube_tosses import TossLog, backward_differences
-from torchrl_nerd.geometry.frames import quat_normalize, rotate
+from torchrl_nerd.geometry.rotations import quat_normalize, rotate
 from torchrl_nerd.scenes import Scene
 
 UNIT_ERROR = 1e-3  # of a quaternion's length

@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_nerd.data.generate import as_transitions
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.envs.memory import memory_of, recall
+from torchrl_nerd.envs.frame_stack import append_frame, frame_stack_of
 from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
 from torchrl_nerd.tasks import Task
 
@@ -51,9 +51,9 @@ def policy_data(
     recent = None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for step in range(steps):
-            if step % task.steps_per_action == 0:
+            if step % task.frame_skip == 0:
                 seen = task.observation(row.update(state)).float()
-                recent = recall(recent, seen, memory_of(actor))
+                recent = append_frame(recent, seen, frame_stack_of(actor))
                 shown = TensorDict({OBSERVATION: recent}, [rows])
                 mean = actor(shown)[ACTION].double()
                 kick = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)

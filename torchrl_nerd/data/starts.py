@@ -16,7 +16,7 @@ from torchrl_nerd.tasks import Task
 
 
 @dataclass(frozen=True)
-class Standing:
+class TaskResets:
     """Starts of a task's episodes: on their feet, where there are any.
 
     Without the task's grounds, which may be those that a model is tested on: where the
@@ -34,7 +34,7 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Fallen:
+class SettledStates:
     """Where a robot left alone comes to rest: the ends of passive trajectories.
 
     | field | meaning |
@@ -63,7 +63,7 @@ class Fallen:
 
 
 @dataclass(frozen=True)
-class Nudged:
+class PerturbedRestStates:
     """Fallen robots, stopped and pushed a little: what a model must know to come to rest.
 
     Without them nothing near rest is in the data but rest itself, and whatever small
@@ -74,16 +74,16 @@ class Nudged:
 
     | field | meaning |
     |---|---|
-    | ``fallen`` | where they lie |
+    | ``settled`` | where they lie |
     | ``least`` | smallest push as a share of the largest: 1 m/s, 3 rad/s, 1 cm, 0.03 rad |
     """
 
-    fallen: Fallen
+    settled: SettledStates
     least: float = 1e-4
 
     def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
         """See `Starts`."""
-        start, scene = self.fallen(rows, generator), self.fallen.scene
+        start, scene = self.settled(rows, generator), self.settled.scene
         size = log_uniform(self.least, 1.0, 2 * rows, generator).reshape(2, rows, 1)
         shape = (2, rows, scene.model.nv)
         push = size * torch.randn(shape, dtype=torch.float64, generator=generator)

@@ -9,7 +9,7 @@ from torch import Generator
 
 from torchrl_nerd.data.generate import Draw, simulate
 from torchrl_nerd.data.policy_data import policy_data
-from torchrl_nerd.data.starts import Fallen, Nudged, Standing
+from torchrl_nerd.data.starts import PerturbedRestStates, SettledStates, TaskResets
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.robots import make_task, preset_of
 from torchrl_nerd.scenes import Scene
@@ -68,10 +68,15 @@ def strategies(
         task: of the same scene; says what standing is.
         explorer: the policy that explores.
     """
-    calm = {"least_scale": LEAST_SCALE, "passive_share": PASSIVE, "quiet_share": 0.0}
-    held = {"correlation": (scene.control_step, LONGEST)}
+    calm = {
+        "min_torque_scale": LEAST_SCALE,
+        "zero_torque_fraction": PASSIVE,
+        "low_torque_fraction": 0.0,
+    }
+    held = {"correlation_time": (scene.control_step, LONGEST)}
     can_hold = scene.sampling.drive is None
-    standing, fallen = {"starts": Standing(task)}, {"starts": Fallen(scene)}
+    standing, fallen = {"starts": TaskResets(task)}, {"starts": SettledStates(scene)}
+    perturbed = PerturbedRestStates(SettledStates(scene))
     both = calm | held if can_hold else calm
 
     def along(**ranges: Any) -> Draw:
@@ -79,13 +84,13 @@ def strategies(
 
     level = scene.sampling.level_ground
     found = {
-        "uniform": along(passive_share=0.0, quiet_share=0.0),
+        "uniform": along(zero_torque_fraction=0.0, low_torque_fraction=0.0),
         "shares": along(),
         "scales": along(**calm),
         "correlated": along(**held) if can_hold else None,
         "starts": mix(along(), along(**standing), along(**fallen)),
         "level": mix(along(), along(), along(ground=level)) if level else None,
-        "resting": mix(along(), along(), along(starts=Nudged(Fallen(scene)))),
+        "resting": mix(along(), along(), along(starts=perturbed)),
     }
     mixed = [along(**both), along(**both, **standing), along(**both, **fallen)]
     if explorer is not None:

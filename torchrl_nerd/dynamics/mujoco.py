@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
-from torchrl_nerd.scenes.quiet import quiet_mujoco
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.silence import silence_mujoco
 
 STATE: Any = mujoco.mjtState
 CONTROL = int(
@@ -174,7 +174,7 @@ class MujocoDynamics:
         start[:, 1 + qpos.shape[1] : 1 + qpos.shape[1] + qvel.shape[1]] = qvel
         if len(self._warmstart) != rows:
             self._warmstart = np.zeros((rows, self._model.nv))
-        with quiet_mujoco():
+        with silence_mujoco():
             states, felt = self._pool.rollout(
                 self._model,
                 self._data,

@@ -5,4 +5,5 @@ from collections.abc import Callable
 from tensordict import TensorDictBase
 
 Actor = Callable[[TensorDictBase], TensorDictBase]
-"""Any TorchRL policy: reads ``observation``, writes ``action``; see `memory_of`, too."""
+"""Any TorchRL policy: reads ``observation``, writes ``action``; see
+`frame_stack_of`."""

@@ -48,7 +48,7 @@ class SceneEnv(EnvBase):
         num_envs: rows.
         seed: of the resets.
         device: where states, observations and rewards live.
-        fault_folder: where faults leave dumps for `nerd replay`; none are written without.
+        dump_dir: where faults leave dumps for `nerd replay`; none are written without.
 
     Raises:
         ValueError: no rows, a dynamics of another scene, or a folder that cannot be
@@ -68,7 +68,7 @@ class SceneEnv(EnvBase):
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str = "cpu",
-        fault_folder: Path | None = None,
+        dump_dir: Path | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"expected num_envs of at least 1, got {num_envs}")
@@ -84,11 +84,11 @@ class SceneEnv(EnvBase):
         self._transit = self._transition.step
         self._restart = self._transition.restart
         self.recorder: FaultRecorder | None = None
-        if fault_folder is not None:
+        if dump_dir is not None:
             name = type(dynamics).__name__
             learned = self._learned
             model = None if learned is None else learned.model
-            where = fault_folder, self.scene.name
+            where = dump_dir, self.scene.name
             self.recorder = FaultRecorder(*where, name, model)
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.long, device=self.device)

@@ -38,7 +38,7 @@ class GroundTruthEnv(SceneEnv):
         seed: of the resets.
         device: where states, observations and rewards live, and where MuJoCo Warp runs;
             the others run on the CPU.
-        fault_folder: see `SceneEnv`.
+        dump_dir: see `SceneEnv`.
 
     Raises:
         ValueError: an unknown engine, or one that cannot step this scene.
@@ -57,7 +57,7 @@ class GroundTruthEnv(SceneEnv):
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str = "cpu",
-        fault_folder: Path | None = None,
+        dump_dir: Path | None = None,
     ) -> None:
         if engine not in ENGINES:
             raise ValueError(
@@ -65,4 +65,4 @@ class GroundTruthEnv(SceneEnv):
             )
         task = make_task(task) if isinstance(task, str) else task
         dynamics = ENGINES[engine](task.scene, device)
-        super().__init__(task, dynamics, num_envs, seed, device, fault_folder)
+        super().__init__(task, dynamics, num_envs, seed, device, dump_dir)

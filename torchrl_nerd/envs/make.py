@@ -24,7 +24,7 @@ def make_env(
     seed: int = 0,
     device: torch.device | str = "cpu",
     guard: Guard | None = None,
-    fault_folder: Path | None = None,
+    dump_dir: Path | None = None,
     compile: bool = False,
     differentiable: bool = False,
 ) -> SceneEnv:
@@ -39,7 +39,7 @@ def make_env(
         device: where all tensors live.
         guard: what to do with steps that the model was not trained for, see
             `GuardedDynamics`; true dynamics have nothing to guard against.
-        fault_folder: where the first fault of each kind leaves a dump for `nerd replay`.
+        dump_dir: where the first fault of each kind leaves a dump for `nerd replay`.
         compile: make one compiled piece of controller, learned dynamics, reward and
             observation, see `SceneEnv.compile`; true dynamics stay as they are.
         differentiable: record gradients through every step of learned dynamics.
@@ -54,7 +54,7 @@ def make_env(
                 f"expected learned dynamics for gradients, got '{dynamics}'"
             )
         engine = cast(Engine, dynamics)
-        return GroundTruthEnv(task, engine, num_envs, seed, device, fault_folder)
+        return GroundTruthEnv(task, engine, num_envs, seed, device, dump_dir)
     model = None if dynamics == "nerd" else dynamics
     if model is not None and not Path(model).is_dir():
         raise ValueError(
@@ -68,7 +68,7 @@ def make_env(
         seed,
         device,
         guard=guard,
-        fault_folder=fault_folder,
+        dump_dir=dump_dir,
         differentiable=differentiable,
     )
     return env.compile() if compile else env

@@ -25,7 +25,7 @@ class NeRDEnv(SceneEnv):
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
         guard: what to do with steps far from the training data, see `GuardedDynamics`;
             None steps all alike.
-        fault_folder: see `SceneEnv`.
+        dump_dir: see `SceneEnv`.
         differentiable: record gradients through every step, to actions and states, and to
             the weights where they ask for them.
 
@@ -46,7 +46,7 @@ class NeRDEnv(SceneEnv):
         device: torch.device | str = "cpu",
         inference: Inference = "streaming",
         guard: Guard | None = None,
-        fault_folder: Path | None = None,
+        dump_dir: Path | None = None,
         differentiable: bool = False,
     ) -> None:
         task = make_task(task) if isinstance(task, str) else task
@@ -58,4 +58,4 @@ class NeRDEnv(SceneEnv):
             differentiable=differentiable,
         )
         dynamics = learned if guard is None else GuardedDynamics(learned, guard)
-        super().__init__(task, dynamics, num_envs, seed, device, fault_folder)
+        super().__init__(task, dynamics, num_envs, seed, device, dump_dir)

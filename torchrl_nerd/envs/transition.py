@@ -63,7 +63,7 @@ class Transition:
         given = torch.where(torch.all(action.isfinite(), -1, keepdim=True), action, 0.0)
         moved, torque = self._control_step(state, given, state.get(TERRAIN))
         trust = moved.get(TRUST)
-        for _ in range(self.task.steps_per_action - 1):
+        for _ in range(self.task.frame_skip - 1):
             torch._dynamo.graph_break()  # two steps in one piece take minutes to compile
             moved, torque = self._control_step(moved, given, state.get(TERRAIN))
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])

@@ -47,15 +47,15 @@ class Standardize(nn.Module):
 
     Args:
         size: of all observations together.
-        memory: how many they are.
+        frame_stack: how many they are.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, size: int, memory: int = 1) -> None:
+    def __init__(self, size: int, frame_stack: int = 1) -> None:
         super().__init__()
-        self.memory, self.count = memory, 0
+        self.frame_stack, self.count = frame_stack, 0
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("std", torch.ones(size))
 
@@ -79,9 +79,9 @@ class Standardize(nn.Module):
         return x.clamp(-FURTHEST, FURTHEST)
 
     def _last_and_changes(self, observations: Tensor) -> Tensor:
-        if self.memory == 1:
+        if self.frame_stack == 1:
             return observations
-        each = observations.unflatten(-1, (self.memory, -1))
+        each = observations.unflatten(-1, (self.frame_stack, -1))
         return torch.cat((each[..., -1:, :], each.diff(dim=-2)), -2).flatten(-2)
 
 
@@ -94,13 +94,15 @@ class Policy(nn.Module):
     Args:
         sizes: D, the widths of the hidden layers, A.
         std: what the standard deviation begins at.
-        memory: how many observations D holds, see `remember`.
+        frame_stack: how many observations D holds, see `stack_frames`.
     """
 
-    def __init__(self, sizes: Sequence[int], std: float = 1.0, memory: int = 1) -> None:
+    def __init__(
+        self, sizes: Sequence[int], std: float = 1.0, frame_stack: int = 1
+    ) -> None:
         super().__init__()
-        self.sizes, self.memory = tuple(sizes), memory
-        self.standardize = Standardize(self.sizes[0], memory)
+        self.sizes, self.frame_stack = tuple(sizes), frame_stack
+        self.standardize = Standardize(self.sizes[0], frame_stack)
         self.mlp = mlp(self.sizes, last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((self.sizes[-1],), math.log(std)))
 
@@ -112,20 +114,20 @@ class Policy(nn.Module):
         steps: int,
         widths: Sequence[int],
         std: float = 1.0,
-        memory: int = 1,
+        frame_stack: int = 1,
     ) -> "Policy":
         """A fresh one, standardised by the observations that random actions meet.
 
         Args:
-            env: shows ``memory`` observations side by side, see `remember`.
+            env: shows ``frame_stack`` observations side by side, see `stack_frames`.
             steps: of each row under random actions.
             widths: of the hidden layers.
             std: what the standard deviation begins at.
-            memory: how many observations it sees.
+            frame_stack: how many observations it sees.
         """
         seen = env.rollout(steps, break_when_any_done=False)[OBSERVATION]
         sizes = (seen.shape[-1], *widths, env.action_spec.shape[-1])
-        policy = cls(sizes, std, memory)
+        policy = cls(sizes, std, frame_stack)
         policy.standardize.fit(seen)
         return policy
 
@@ -138,7 +140,7 @@ class Policy(nn.Module):
 def make_actor(policy: Policy) -> ProbabilisticActor:
     """The policy as TorchRL knows it: ``observation`` -> ``action`` in [-1, 1].
 
-    Its ``memory`` says how many observations it is to be shown, see `memory_of`.
+    Its ``frame_stack`` says how many observations it is to be shown, see `frame_stack_of`.
     """
     actor = ProbabilisticActor(
         TensorDictModule(policy, [OBSERVATION], ["loc", "scale"]),
@@ -147,7 +149,7 @@ def make_actor(policy: Policy) -> ProbabilisticActor:
         distribution_class=TanhNormal,
         return_log_prob=True,
     )
-    vars(actor)["memory"] = policy.memory
+    vars(actor)["frame_stack"] = policy.frame_stack
     return actor
 
 
@@ -163,7 +165,11 @@ def save_policy(
     """
     folder = writable_folder(folder)
     write_tensors(folder / WEIGHTS, policy.state_dict())
-    shape = {"format": 1, "sizes": list(policy.sizes), "memory": policy.memory}
+    shape = {
+        "format": 1,
+        "sizes": list(policy.sizes),
+        "frame_stack": policy.frame_stack,
+    }
     write_json(folder / CARD, {**shape, **(card or {})})
     return folder
 
@@ -179,29 +185,31 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
         ValueError: in one sentence, what is missing, broken or of another shape.
     """
     card = _read_card(folder)
-    found, memory = card.get("sizes"), card.get("memory", 1)
+    found, frame_stack = card.get("sizes"), card.get("frame_stack", 1)
     sizes = found if isinstance(found, list) else []
     if not 2 <= len(sizes) <= MOST_LAYERS or not all(
         type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes
     ):
         raise ValueError(f"expected the layer sizes in {folder / CARD}, got {found!r}")
-    if type(memory) is not int or memory < 1 or sizes[0] % memory:
+    if type(frame_stack) is not int or frame_stack < 1 or sizes[0] % frame_stack:
         raise ValueError(
-            f"expected how many observations make {sizes[0]} inputs as memory in "
-            f"{folder / CARD}, got {memory!r}"
+            f"expected how many observations make {sizes[0]} inputs as frame_stack in "
+            f"{folder / CARD}, got {frame_stack!r}"
         )
     if task is not None:
-        expected = (memory * task.observation_size, task.controller.num_actions)
+        expected = (frame_stack * task.observation_size, task.controller.num_actions)
         if (sizes[0], sizes[-1]) != expected:
             raise ValueError(
                 f"the policy in {folder} has {sizes[0]} observations and {sizes[-1]} "
                 f"actions, the task has {expected[0]} and {expected[1]}"
             )
     tensors = read_tensors(folder / WEIGHTS)
-    with torch.device("meta"):  # shapes alone, whatever memory the sizes would take
-        expected = Policy(sizes, memory=memory).state_dict()
+    with torch.device(
+        "meta"
+    ):  # shapes alone, whatever frame_stack the sizes would take
+        expected = Policy(sizes, frame_stack=frame_stack).state_dict()
     expect_fit(tensors, expected, f"weights in {folder}", f"layers of {sizes}")
-    policy = Policy(sizes, memory=memory)
+    policy = Policy(sizes, frame_stack=frame_stack)
     policy.load_state_dict(tensors)
     return policy.eval()
 

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.memory import memory_of, remember
+from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
 from torchrl_nerd.tasks import Task
 
 TRUTH = "mujoco"
@@ -52,7 +52,7 @@ def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
     A row that ends early earns nothing after its end. Actions are the policy's mean; it
     is shown as many observations as it remembers.
     """
-    env = remember(env, memory_of(actor))
+    env = stack_frames(env, frame_stack_of(actor))
     tensordict = env.reset()
     is_running = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
     returns = torch.zeros(*env.batch_size, 1, dtype=torch.float64, device=env.device)
@@ -162,7 +162,7 @@ def hardest_episode(
     episodes, row = {}, 0
     for name in dict.fromkeys(map(str, dynamics)):
         env = make_env(task, dynamics=name, num_envs=64, seed=seed)
-        env = remember(env, memory_of(actor))
+        env = stack_frames(env, frame_stack_of(actor))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             steps = env.rollout(env.task.horizon, actor, break_when_any_done=False)[
                 "next"

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics
-from torchrl_nerd.geometry.frames import orientation_error, wrap_angle
+from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task

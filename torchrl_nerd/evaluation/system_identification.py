@@ -12,7 +12,7 @@ from torchrl_nerd.evaluation.parameter_fit import CENTRE, fit_flight, fit_parame
 from torchrl_nerd.evaluation.toss_error import STATES, toss_errors
 from torchrl_nerd.robots.cube.scene import cube_path
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.penalty import set_penalty_contact
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 
 # published: parameters of the ContactNets repository; stiffness and damping are not among
 # them, and are the springs of the scene's board

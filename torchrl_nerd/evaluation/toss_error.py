@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.evaluation.rollout_error import open_loop
-from torchrl_nerd.geometry.frames import orientation_error
+from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import QPOS
 
 STATES = 80  # of a sub-trajectory, the start among them; the shortest toss has as many

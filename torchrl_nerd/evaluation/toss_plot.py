@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.evaluation.plots import COLORS, STYLES, save_figure
-from torchrl_nerd.geometry.frames import orientation_error, rotate
+from torchrl_nerd.geometry.rotations import orientation_error, rotate
 from torchrl_nerd.robots.cube.scene import HALF
 
 OUTLINES = 5  # cubes drawn along the measured path

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.frames import matrix_from_quat, quat_matrix
 from torchrl_nerd.geometry.manifold import FREE
+from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Base:
         return cls(roots[0], True, q, v)
 
 
-def mount_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
+def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
     """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base's mount."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -82,7 +82,7 @@ class BasePose(nn.Module):
 
     Args:
         base: of the robot.
-        mount: position ``(3,)``, m, and rotation ``(3, 3)``, see `mount_pose`.
+        mount: position ``(3,)``, m, and rotation ``(3, 3)``, see `fixed_base_pose`.
     """
 
     position: Tensor

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.elimination import solve, times
-from torchrl_nerd.geometry.frames import quat_matrix
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import cross
+from torchrl_nerd.geometry.rotations import quat_matrix
 
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float)
 

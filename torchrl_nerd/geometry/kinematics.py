@@ -14,8 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.frames import matrix_from_quat, quat_matrix, quat_normalize
 from torchrl_nerd.geometry.manifold import BALL, FREE, SLIDE
+from torchrl_nerd.geometry.rotations import (
+    matrix_from_quat,
+    quat_matrix,
+    quat_normalize,
+)
 
 Motion = tuple[Tensor, Tensor, Tensor, Tensor]
 """Of n bodies in N rows: origins ``(3, n, N)`` m, rotations ``(3, 3, n, N)``, angular

@@ -12,7 +12,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import (
+from torchrl_nerd.geometry.rotations import (
     quat_conjugate,
     quat_exp,
     quat_log,

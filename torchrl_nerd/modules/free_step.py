@@ -62,12 +62,15 @@ class FreeStep(nn.Module):
         bodies = axes.bodies + self.motion.bodies
         positions = np.concatenate((axes.positions, self.motion.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
-        self.pose, self.layout = BasePose(scene.base, scene.mount), scene.layout
+        self.pose, self.layout = (
+            BasePose(scene.base, scene.fixed_base_pose),
+            scene.layout,
+        )
         is_limited = model.jnt_limited[axes.joints] != 0
         self.stops, self.parts = None, 1
         if is_limited.any() and not scene.base.is_floating:
             # the scene's own, so that a model of a finer teacher is the same in both
-            own = scene.control_step / (scene.substeps // scene.refinement)
+            own = scene.control_step / (scene.substeps // scene.reference_ratio)
             self.stops = JointStops(model, axes, own)
             self.parts = self.stops.parts(self.period)
         low, high = model.jnt_range[axes.joints].T

@@ -43,9 +43,9 @@ class GroundStep(nn.Module):
 
     Args:
         scene: a robot of hinges and slides, on a free base or a fixed one, over a ground,
-            whose contacts and limits are springs and dampers, see `scenes.penalty`.
+            whose contacts and limits are springs and dampers, see `scenes.penalty_law`.
         looks: one or two; three for the state that the finer teacher leads to, see
-            `Scene.fine`.
+            `Scene.reference`.
         stride: how many of MuJoCo's substeps are made as one.
         parts: of a control step, which are made one after the other.
 
@@ -69,7 +69,7 @@ class GroundStep(nn.Module):
                 f"expected substeps of mjINT_EULER, got {found} in scene "
                 f"'{scene.name}' (a finer teacher takes three looks: grounded-fine)"
             )
-        own = (scene.fine if is_fine else scene).substeps
+        own = (scene.reference if is_fine else scene).substeps
         substeps = max(1, own // stride)
         if parts < 1 or substeps % parts:
             raise ValueError(

@@ -64,7 +64,7 @@ class LookAt(nn.Module):
         places = points.positions, axes.positions, self.motion.positions
         places = np.concatenate(places)
         self.kinematics = PointKinematics(model, scene.base, bodies, places)
-        self.pose = BasePose(scene.base, scene.mount)
+        self.pose = BasePose(scene.base, scene.fixed_base_pose)
         self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
         self.whole = 3 * scene.base.is_floating  # rates that turn all there is
         # rims of several bodies in one place push together, each turned by its own joints

@@ -37,7 +37,7 @@ class March(nn.Module):
     """Substeps of a robot at the springs of its ground and limits.
 
     Args:
-        scene: whose contacts and limits are springs and dampers, see `scenes.penalty`.
+        scene: whose contacts and limits are springs and dampers, see `scenes.penalty_law`.
         axes: its joints.
         look_at: what looked at it.
         step_size: s, of a substep.

@@ -160,7 +160,7 @@ class NeRD(nn.Module):
         after = self.state_delta.integrate(qpos, qvel, delta, limit)
         return self.coverage.stay((qpos, qvel), self.coverage.stop_joints(*after))
 
-    def over(self, scene: Scene) -> "NeRD":
+    def with_terrain(self, scene: Scene) -> "NeRD":
         """The same weights for the same robot over another ground.
 
         Raises:

@@ -2,10 +2,10 @@
 
 Each contact point that is in the ground is pushed out by a spring and a damper and held
 back by friction, ``min(kf * slip, mu * normal force)``: the law of the paper's engine, see
-`scenes.penalty`. Two things are added that real bodies have: a centre of mass that is not
-where the body's frame is, and friction that fades under load, ``mu / (1 + normal force *
-fading)``, as elastic asperities' does (J. F. Archard, "Elastic deformation and the laws of
-friction", 1957). A few substeps with a backward Euler spring are stable at any stiffness.
+`scenes.penalty_law`. Two things are added that real bodies have: a centre of mass that
+is not where the body's frame is, and friction that fades under load, ``mu / (1 + normal
+force * fading)``, as elastic asperities' does (J. F. Archard, "Elastic deformation and
+the laws of friction", 1957). A few substeps with a backward Euler spring are stable at any stiffness.
 Every operation is differentiable, and so are the physical parameters: a rollout through it
 fits them to recordings.
 """
@@ -13,8 +13,8 @@ fits them to recordings.
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.frames import quat_normalize
-from torchrl_nerd.scenes.penalty import PenaltyLaw
+from torchrl_nerd.geometry.rotations import quat_normalize
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw
 from torchrl_nerd.scenes.scene import Scene
 
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.frames import rotate, rotate_inverse
 from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
+from torchrl_nerd.geometry.rotations import rotate, rotate_inverse
 from torchrl_nerd.scenes.scene import Scene
 
 WIDTH = 64

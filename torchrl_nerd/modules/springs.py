@@ -1,6 +1,6 @@
 """What springs and dampers push with, at contacts and at joints' limits, in torch.
 
-The law that MuJoCo's soft constraints become at small impedance, see `scenes.penalty`.
+The law that MuJoCo's soft constraints become at small impedance, see `scenes.penalty_law`.
 Friction is its elliptic cone: a contact that slides is the point of the cone that is
 nearest to what spring and dampers would push without one, which is a little more normal
 force than they would.
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.scenes.penalty import PenaltyLaw, limit_springs
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw, limit_springs
 from torchrl_nerd.scenes.scene import Scene
 
 SLOWEST = 1e-6  # m/s: keeps the direction of slip defined at rest

@@ -15,10 +15,10 @@ import mujoco
 import numpy as np
 
 from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.frames import quat_matrix
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes.quiet import quiet_mujoco
+from torchrl_nerd.scenes.silence import silence_mujoco
 from torchrl_nerd.scenes.support import unit_gravity
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
@@ -204,7 +204,7 @@ def _largest_change(
         moved = copy.copy(data)
         move(moved, rng)
         size = abs(data.qvel).max()
-        with quiet_mujoco():
+        with silence_mujoco():
             change, moved_change = (
                 _change(model, d, substeps, base) for d in (data, moved)
             )

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from torchrl_nerd.geometry.frames import quat_multiply, random_tilt, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, random_tilt, rotate
 
 GroundSampler = Callable[[Tensor, Generator], Tensor]
 """``(qpos (n, nq), generator) -> terrain (n, terrain.size)``."""
@@ -76,13 +76,13 @@ class Sampling:
     | ``level_ground`` | draws grounds that the robot hits head-on, see `strategies` |
     | ``drive`` | torques that depend on the state, in place of uniform ones |
     | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
-    | ``passive_share`` | share of trajectories with no torque at all |
-    | ``quiet_share`` | share whose torque and velocity are scaled down by U(0, 1) |
+    | ``zero_torque_fraction`` | share of trajectories with no torque at all |
+    | ``low_torque_fraction`` | share whose torque and velocity are scaled down by U(0, 1) |
     | ``starts`` | draws the initial states, in place of the ranges |
-    | ``least_scale`` | torque scales of the other rows log-uniform from this to 1, not 1 |
-    | ``correlation`` | lowest and highest time, s, that a row's torques keep |
+    | ``min_torque_scale`` | torque scales of the other rows: log-uniform from this to 1 |
+    | ``correlation_time`` | lowest and highest time, s, that a row's torques keep |
 
-    Without a ``correlation`` torques are drawn anew at every step.
+    Without a ``correlation_time`` torques are drawn anew at every step.
 
     Raises:
         ValueError: a scale or times that are not positive and in order, or a correlation
@@ -99,23 +99,24 @@ class Sampling:
     level_ground: GroundSampler | None = None
     drive: Drive | None = None
     clearance: float | None = None
-    passive_share: float = 0.25
-    quiet_share: float = 0.25
+    zero_torque_fraction: float = 0.25
+    low_torque_fraction: float = 0.25
     starts: Starts | None = None
-    least_scale: float | None = None
-    correlation: tuple[float, float] | None = None
+    min_torque_scale: float | None = None
+    correlation_time: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.least_scale is not None and not 0.0 < self.least_scale <= 1.0:
+        if self.min_torque_scale is not None and not 0.0 < self.min_torque_scale <= 1.0:
             raise ValueError(
-                f"expected a least_scale above 0 and up to 1, got {self.least_scale}"
+                "expected a min_torque_scale above 0 and up to 1, got "
+                f"{self.min_torque_scale}"
             )
-        if self.correlation is not None:
-            low, high = self.correlation
+        if self.correlation_time is not None:
+            low, high = self.correlation_time
             if not 0.0 < low <= high:
                 raise ValueError(
                     f"expected two correlation times above 0 s, the lower first, got "
-                    f"{self.correlation}"
+                    f"{self.correlation_time}"
                 )
             if self.drive is not None:
                 raise ValueError(
@@ -162,9 +163,9 @@ def sample_torques(
     An Ornstein-Uhlenbeck process of each row's correlation time, put through its own
     distribution function: at every single step a torque is as uniform as without.
     """
-    if sampling.correlation is None:
+    if sampling.correlation_time is None:
         return sample_torque(sampling, scale, steps, generator)
-    time = log_uniform(*sampling.correlation, len(scale), generator)
+    time = log_uniform(*sampling.correlation_time, len(scale), generator)
     keep = torch.exp(-control_step / time)
     size = (steps, len(scale), len(sampling.torque))
     noise = torch.randn(size, dtype=torch.float64, generator=generator)
@@ -186,16 +187,16 @@ def sample_scale(
 ) -> tuple[Tensor, Tensor]:
     """How violent each trajectory is: scales of torque and velocity ``(rows, 1)``.
 
-    Both 1 for most rows (torque log-uniform from ``least_scale`` to 1, if that is set);
-    torque 0 for the passive share; both U(0, 1) for the quiet one.
+    Both 1 for most rows (torque log-uniform from ``min_torque_scale`` to 1, if set);
+    torque 0 in the zero-torque fraction; both U(0, 1) in the low-torque one.
     """
     draw = torch.rand(2, rows, 1, dtype=torch.float64, generator=generator)
     one = torch.ones_like(draw[0])
-    is_passive = draw[0] < sampling.passive_share
-    is_quiet = draw[0] > 1.0 - sampling.quiet_share
+    is_passive = draw[0] < sampling.zero_torque_fraction
+    is_quiet = draw[0] > 1.0 - sampling.low_torque_fraction
     speed = torch.where(is_quiet | is_passive, draw[1], one)
     loud = one
-    if sampling.least_scale is not None:
-        loud = log_uniform(sampling.least_scale, 1.0, rows, generator)
+    if sampling.min_torque_scale is not None:
+        loud = log_uniform(sampling.min_torque_scale, 1.0, rows, generator)
     torque = torch.where(is_passive, 0.0 * one, torch.where(is_quiet, draw[1], loud))
     return torque, speed

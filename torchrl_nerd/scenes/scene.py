@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Generator
 
-from torchrl_nerd.geometry.base import Base, BasePose, mount_pose
-from torchrl_nerd.geometry.frames import quat_normalize
+from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
+from torchrl_nerd.geometry.rotations import quat_normalize
 from torchrl_nerd.scenes.actuators import driven_dofs
 from torchrl_nerd.scenes.contact_points import (
     ContactPoints,
@@ -41,7 +41,7 @@ from torchrl_nerd.scenes.terrain import Terrain
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
 LARGEST_REDRAWS = 300  # of starts that are not clear of the ground
-REFINEMENT = 4  # of a finer teacher: its substeps in one of the scene's own
+REFERENCE_RATIO = 4  # of a finer teacher: its substeps in one of the scene's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +55,9 @@ class Scene:
     | ``substeps`` | MuJoCo steps per control step |
     | ``controller`` | turns actions into joint torques |
     | ``sampling`` | ranges of training states and torques |
-    | ``refinement`` | substeps in one of the robot's own, see `fine`; else 1 |
+    | ``reference_ratio`` | substeps in one of the robot's own, see `fine`; else 1 |
     | ``foresees_forces`` | whether the forces of its springs, at limits and contacts (see
-      `scenes.penalty`), are among the features: where they decide most steps |
+      `scenes.penalty_law`), are among the features: where they decide most steps |
     | ``foresees_free_motion`` | whether contacts are foreseen along the way that the robot
       takes if nothing touches it, not at constant velocity: where onsets decide |
 
@@ -70,7 +70,7 @@ class Scene:
     substeps: int
     controller: Controller
     sampling: Sampling
-    refinement: int = 1
+    reference_ratio: int = 1
     foresees_forces: bool = False
     foresees_free_motion: bool = False
 
@@ -149,17 +149,17 @@ class Scene:
         return replace(self, model=model, substeps=substeps)
 
     @cached_property
-    def fine(self) -> "Scene":
+    def reference(self) -> "Scene":
         """A finer teacher: MuJoCo's RK4, four substeps in one of the scene's own.
 
         A model that learned from it steps as fast as any other and is not bound to the
         error of the scene's own solver. To the model both are the same scene.
         """
-        if self.refinement > 1:
+        if self.reference_ratio > 1:
             return self
         rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-        fine = self.with_substeps(REFINEMENT * self.substeps, rk4)
-        return replace(fine, refinement=REFINEMENT)
+        fine = self.with_substeps(REFERENCE_RATIO * self.substeps, rk4)
+        return replace(fine, reference_ratio=REFERENCE_RATIO)
 
     @cached_property
     def layout(self) -> JointLayout:
@@ -172,12 +172,12 @@ class Scene:
         return Base.from_model(self.model)
 
     @cached_property
-    def mount(self) -> tuple[np.ndarray, np.ndarray]:
+    def fixed_base_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base."""
-        return mount_pose(self.model, self.base)
+        return fixed_base_pose(self.model, self.base)
 
     @cached_property
-    def down(self) -> tuple[float, float, float]:
+    def gravity_direction(self) -> tuple[float, float, float]:
         """Unit vector of gravity in the world; where there is none, against z."""
         x, y, z = unit_gravity(self.model).tolist()
         return x, y, z
@@ -312,7 +312,9 @@ class Scene:
         """
         return self._ground(qpos, terrain)[0]
 
-    def set_down(self, state: dict[str, torch.Tensor], gap: torch.Tensor) -> None:
+    def place_on_terrain(
+        self, state: dict[str, torch.Tensor], gap: torch.Tensor
+    ) -> None:
         """Move floating bases, in place, to ``gap (rows,)`` m over the ground.
 
         Along its normal at the lowest contact point; fixed bases and robots without contact
@@ -348,7 +350,7 @@ class Scene:
     # constants as tensors that stay: compiled code would make them anew of arrays
     @cached_property
     def _pose(self) -> BasePose:
-        return BasePose(self.base, self.mount)
+        return BasePose(self.base, self.fixed_base_pose)
 
     @cached_property
     def _radii(self) -> torch.Tensor:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import quat_conjugate, quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_conjugate, quat_multiply, rotate
 from torchrl_nerd.geometry.surfaces import PLANE_PARAMETERS, SHAPES
 
 PLANE, HEIGHT_FIELD = (

@@ -7,7 +7,7 @@ reference code's axes are y up; here z is up, x forward and y to the left (its -
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import random_tilt, rotate
+from torchrl_nerd.geometry.rotations import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.tasks.task import State
 

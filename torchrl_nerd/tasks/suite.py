@@ -11,7 +11,7 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.actuators import ActuatorController
-from torchrl_nerd.tasks.suite_judge import SuiteJudge
+from torchrl_nerd.tasks.suite_reward import SuiteReward
 from torchrl_nerd.tasks.task import State, Task
 
 
@@ -26,7 +26,7 @@ class SuiteTask(Task):
 
     Args:
         name: such as ``"dm_control/cheetah-run"``.
-        steps_per_action: control steps over which an action is held; only the last of
+        frame_skip: control steps over which an action is held; only the last of
             them is judged.
 
     Raises:
@@ -40,12 +40,12 @@ class SuiteTask(Task):
 
     num_uniforms = 1
 
-    def __init__(self, name: str, steps_per_action: int = 1) -> None:
-        self._name, self.steps_per_action = name, steps_per_action
+    def __init__(self, name: str, frame_skip: int = 1) -> None:
+        self._name, self.frame_skip = name, frame_skip
         domain, _, task = name.removeprefix("dm_control/").partition("-")
         model = self.scene.model  # refuses what is not supported
-        judge = SuiteJudge(domain, task)
-        self.horizon = ceil(judge.horizon / steps_per_action)
+        judge = SuiteReward(domain, task)
+        self.horizon = ceil(judge.horizon / frame_skip)
         self.observation_size = judge.observation_size
         width = 3 * len(judge.targets)
         self.parameters = {TARGET: width} if width else {}

@@ -23,14 +23,14 @@ class Task(ABC):
     | ``horizon`` | control steps after which an episode is truncated |
     | ``num_uniforms`` | random numbers that one reset takes |
     | ``observation_size`` | width of the observation |
-    | ``steps_per_action`` | control steps over which an action is held |
+    | ``frame_skip`` | control steps over which an action is held |
     | ``parameters`` | row parameters drawn at a reset and kept, key -> width |
     """
 
     horizon: int
     num_uniforms: int
     observation_size: int
-    steps_per_action: int = 1
+    frame_skip: int = 1
     parameters: Mapping[str, int] = {}
 
     @cached_property

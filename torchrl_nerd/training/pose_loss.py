@@ -5,7 +5,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import quat_conjugate, quat_multiply
+from torchrl_nerd.geometry.rotations import quat_conjugate, quat_multiply
 from torchrl_nerd.modules.nerd import NeRD, Network
 
 POSITION_SCALE = 0.05  # m that weigh as much as ...

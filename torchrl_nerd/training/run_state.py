@@ -1,4 +1,4 @@
-"""Weights, their averages and what optimisers remember, as tensors by name."""
+"""Weights, their averages and what optimisers stack_frames, as tensors by name."""
 
 from torch import Tensor, nn, tensor
 from torch.optim import Optimizer

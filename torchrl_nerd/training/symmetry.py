@@ -17,8 +17,8 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.geometry.frames import quat_multiply
 from torchrl_nerd.geometry.manifold import SLIDE
+from torchrl_nerd.geometry.rotations import quat_multiply
 from torchrl_nerd.geometry.surfaces import PLANE_PARAMETERS
 from torchrl_nerd.keys import (
     JOINT_TORQUE,
@@ -153,7 +153,7 @@ def _candidates(scene: Scene) -> Iterator[Isometry]:
     if scene.base.is_floating:
         data.qpos[3] = 1.0
     mujoco.mj_kinematics(model, data)
-    center = np.zeros(3) if scene.base.is_floating else scene.mount[0]
+    center = np.zeros(3) if scene.base.is_floating else scene.fixed_base_pose[0]
     has_ball = model.nv - model.njnt != 5 * scene.base.is_floating
     for order, sign in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         body = np.eye(3)[list(order)] * np.array(sign)[:, None]
@@ -250,6 +250,6 @@ def states_in_contact(scene: Scene, rows: int, deepest: float) -> TensorDict:
     generator = Generator().manual_seed(0)
     state, scale = scene.sample_initial(rows, generator)
     draw = torch.rand(rows, dtype=torch.float64, generator=generator)
-    scene.set_down(state, -deepest * draw)
+    scene.place_on_terrain(state, -deepest * draw)
     torque = sample_torque(scene.sampling, scale, 1, generator)
     return TensorDict(state, [rows]).set(JOINT_TORQUE, torque[:, 0])

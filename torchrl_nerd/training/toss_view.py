@@ -11,7 +11,7 @@ from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.evaluation.toss_error import STATES, path_errors, toss_errors
-from torchrl_nerd.geometry.frames import quat_exp, quat_multiply
+from torchrl_nerd.geometry.rotations import quat_exp, quat_multiply
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.pose_encoder import PoseEncoder

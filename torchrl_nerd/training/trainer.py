@@ -20,7 +20,7 @@ from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.seeds import stream
+from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
@@ -171,7 +171,7 @@ class Trainer:
     def update(self) -> Tensor:
         """One update and its loss, ``()``; the batch depends on seed and step alone."""
         config = self.config
-        generator = stream(config.seed, self.step)
+        generator = fold_in(config.seed, self.step)
         rate = self._rate()
         for name, optimizer in self.optimizers.items():
             for group in optimizer.param_groups:

@@ -40,7 +40,7 @@ class ComingDepth(nn.Module):
         points = scene.contacts
         self.base, self.layout = scene.base, scene.layout
         self.period = scene.control_step
-        self.substeps = scene.substeps // scene.refinement
+        self.substeps = scene.substeps // scene.reference_ratio
         self.ground, self.pose = ground, pose
         self.kinematics = PointKinematics(
             scene.model, scene.base, points.bodies, points.positions
@@ -103,4 +103,4 @@ class ComingDepth(nn.Module):
 
 def num_glances(scene: Scene) -> int:
     """K: at how many times of the step."""
-    return min(scene.substeps // scene.refinement, MAX_GLANCES)
+    return min(scene.substeps // scene.reference_ratio, MAX_GLANCES)

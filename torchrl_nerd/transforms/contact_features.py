@@ -90,7 +90,8 @@ class ContactFeatures(FeatureTransform):
                 sizes[CONTACT_FORCE] = scene.layout.nv
             plane = terrain.fixed_plane
             is_level = (
-                plane is not None and abs(float(plane[:3] @ scene.down)) > 1.0 - 1e-12
+                plane is not None
+                and abs(float(plane[:3] @ scene.gravity_direction)) > 1.0 - 1e-12
             )
             if plane is None or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count
@@ -117,7 +118,7 @@ class ContactFeatures(FeatureTransform):
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
         self.count, self.num_known = count, count + self.num_places
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
-        self.pose = BasePose(scene.base, scene.mount)
+        self.pose = BasePose(scene.base, scene.fixed_base_pose)
         self.coming_depth = ComingDepth(scene, self.ground, self.pose)
         keep_constants(self, radii=points.radii, margins=points.margins)
 

@@ -1,7 +1,7 @@
 """What the ground's springs and dampers push every joint with, foreseen along the step.
 
 The contacts of the paper's engine are an explicit law of depth and speed (see
-`scenes.penalty`). What it says on the way that every point would take if the velocities
+`scenes.penalty_law`). What it says on the way that every point would take if the velocities
 stayed is no more than a guess at the step's forces, since stiff springs change velocities
 within the step; but it puts many points, their gaps and their levers into one number per
 degree of freedom, which a network would have to work out by itself.
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.scenes.penalty import PenaltyLaw
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw
 from torchrl_nerd.scenes.scene import Scene
 
 SLOWEST = 1e-9  # m/s: keeps the direction of slip defined at rest

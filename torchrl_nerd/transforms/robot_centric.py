@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import matrix_from_quat, rotate_inverse
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
+from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
-from torchrl_nerd.scenes.penalty import limit_springs
+from torchrl_nerd.scenes.penalty_law import limit_springs
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
@@ -59,7 +59,7 @@ class RobotCentric(FeatureTransform):
         super().__init__([QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
         self.base = scene.base
         self.joints = joints
-        self.down = scene.down
+        self.down = scene.gravity_direction
 
     def state_features(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """``robot_state`` in the dtype of the inputs, ``(*batch, D)``."""

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_nerd.geometry.frames import quat_exp, rotate, rotate_inverse
 from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
+from torchrl_nerd.geometry.rotations import quat_exp, rotate, rotate_inverse
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, STATE_DELTA
 from torchrl_nerd.scenes.scene import Scene
 

@@ -146,7 +146,7 @@ def test_nothing_is_finer_than_a_truth_without_contact(robot, seed):
     course = courses(PRESETS[robot].protocol(), 8, seed, 1, steps=20)[0]
     rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
     finer = MujocoDynamics(
-        course.scene.fine.with_substeps(16 * course.scene.substeps, rk4)
+        course.scene.reference.with_substeps(16 * course.scene.substeps, rk4)
     )
     own = course.errors(MujocoDynamics(course.scene))
     for name, error in course.errors(finer).items():

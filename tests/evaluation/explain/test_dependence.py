@@ -13,7 +13,7 @@ from torchrl_nerd.evaluation.explain.dependence import (
 )
 from torchrl_nerd.evaluation.explain.features import feature_kinds, token_slices
 from torchrl_nerd.evaluation.explain.states import draw_states
-from torchrl_nerd.geometry.frames import quat_exp
+from torchrl_nerd.geometry.rotations import quat_exp
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.scene_tokens import SceneTokens
 

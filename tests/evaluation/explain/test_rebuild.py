@@ -17,7 +17,7 @@ from torchrl_nerd.evaluation.explain.rebuild import (
     rebuild_errors,
 )
 from torchrl_nerd.evaluation.explain.states import draw_states
-from torchrl_nerd.geometry.frames import matrix_from_quat
+from torchrl_nerd.geometry.rotations import matrix_from_quat
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.scene_tokens import SceneTokens
 

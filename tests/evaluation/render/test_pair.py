@@ -10,19 +10,19 @@ from torchrl_nerd.robots import make_task
 STEPS = 8
 
 
-def policy_of(task_id: str, memory: int):
+def policy_of(task_id: str, frame_stack: int):
     task = make_task(task_id)
-    sizes = (memory * task.observation_size, 8, task.controller.num_actions)
-    policy = Policy(sizes, memory=memory)
+    sizes = (frame_stack * task.observation_size, 8, task.controller.num_actions)
+    policy = Policy(sizes, frame_stack=frame_stack)
     torch.nn.init.normal_(policy.mlp[-1].weight)
     return follow(make_actor(policy.eval()))
 
 
 def test_equal_dynamics_have_no_error(task_id, seed):
     acts = {0: idle(make_task(task_id), STEPS, seed, "random")}
-    acts |= {memory: policy_of(task_id, memory) for memory in (1, 3)}
-    for memory, act in acts.items():
-        how = {"own_actions": memory > 0, "memory": max(memory, 1)}
+    acts |= {frame_stack: policy_of(task_id, frame_stack) for frame_stack in (1, 3)}
+    for frame_stack, act in acts.items():
+        how = {"own_actions": frame_stack > 0, "frame_stack": max(frame_stack, 1)}
         pair = play_pair(task_id, "mujoco", act, STEPS, seed, **how)
         assert torch.equal(pair.learned, pair.truth)
         assert max(float(error.max()) for error in pair.errors.values()) < 1e-6

@@ -120,7 +120,7 @@ def learned_contenders(
 
 def _learned(name: str, model: NeRD, **how: object) -> Contender:
     def make(scene: Scene) -> NeRDDynamics:
-        here = model if scene is model.scene else model.over(scene)
+        here = model if scene is model.scene else model.with_terrain(scene)
         return NeRDDynamics(here, **how)  # pyright: ignore
 
     return Contender(name, True, make)
@@ -136,7 +136,7 @@ def truth(scene: Scene, threads: int) -> MujocoDynamics:
 
     RK4 where nothing touches; impacts leave it no order to gain, and take more substeps.
     """
-    finest = scene.fine
+    finest = scene.reference
     if scene.terrain is not None:
         finest = scene.with_substeps(max(FINEST, 4 * scene.substeps))
     return MujocoDynamics(finest, num_threads=threads)

@@ -82,8 +82,8 @@ def _tiles(survey: Survey, card: Mapping[str, Any]) -> str:
         "dropped": f"{card.get('dropped', 0):,}",
         "not finite": f"{survey.not_finite:,}",
     }
-    if survey.passive_share is not None:
-        tiles["without torque"] = f"{survey.passive_share:.1%}"
+    if survey.zero_torque_fraction is not None:
+        tiles["without torque"] = f"{survey.zero_torque_fraction:.1%}"
     if survey.contact_share is not None:
         tiles["states in contact"] = f"{survey.contact_share:.1%}"
     inner = "".join(

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.evaluation.plots import dof_names, qpos_names
-from torchrl_nerd.geometry.frames import wrap_angle
+from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 
@@ -67,7 +67,7 @@ class Survey:
     | ``near_share`` | within a contact point's margin, where it has features |
     | ``point_shares`` | of states in which each contact point touches, by its name |
     | ``gaps`` | histogram of the smallest gap, m: counts and edges |
-    | ``passive_share`` | of trajectories without any torque |
+    | ``zero_torque_fraction`` | of trajectories without any torque |
     """
 
     trajectories: int
@@ -78,7 +78,7 @@ class Survey:
     contact_share: float | None
     near_share: float | None
     point_shares: dict[str, float]
-    passive_share: float | None
+    zero_torque_fraction: float | None
     outliers: tuple[Outlier, ...] = field(default=())
     gaps: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -109,7 +109,7 @@ def survey(scene: Scene, data: TensorDictBase, seed: int = 0) -> Survey:
         steps=steps,
         not_finite=int(sum((~f).sum() for f in finite)),
         columns=tuple(_column(*table) for table in tables),
-        passive_share=float((torque == 0).all(-1).all(-1).double().mean())
+        zero_torque_fraction=float((torque == 0).all(-1).all(-1).double().mean())
         if has_torque
         else None,
         outliers=_outliers(tables, picks),

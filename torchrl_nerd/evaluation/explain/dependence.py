@@ -20,13 +20,13 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.explain import features as kinds
-from torchrl_nerd.geometry.frames import (
+from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.geometry.rotations import (
     matrix_from_quat,
     quat_exp,
     quat_multiply,
     rotate,
 )
-from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
@@ -264,7 +264,7 @@ def carried(
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     parent = int(model.body_parentid[base.body])
-    position, rotation = scene.mount
+    position, rotation = scene.fixed_base_pose
     moved = turn.numpy() @ (position - pivot.numpy()) + to.numpy()
     axes = data.xmat[parent].reshape(3, 3)
     model.body_pos[base.body] = axes.T @ (moved - data.xpos[parent])

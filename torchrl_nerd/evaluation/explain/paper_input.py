@@ -74,7 +74,7 @@ class PaperInput(nn.Module):
         self.register_buffer("margins", margins, persistent=False)
         self.count = len(bodies) if scene.terrain is not None else 0
         self.frame = BaseFrame(scene)
-        down = torch.tensor(scene.down, dtype=torch.float64)
+        down = torch.tensor(scene.gravity_direction, dtype=torch.float64)
         self.register_buffer("down", down, persistent=False)
         if self.count:
             self.kinematics = PointKinematics(model, scene.base, bodies, positions)

@@ -35,7 +35,7 @@ from torchrl_nerd.evaluation.explain.paper_input import (
     contact_pieces,
     see_ground,
 )
-from torchrl_nerd.geometry.frames import rotate, wrap_angle
+from torchrl_nerd.geometry.rotations import rotate, wrap_angle
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
@@ -139,7 +139,7 @@ def recover_state(scene: Scene, part: dict[str, Tensor]) -> tuple[Tensor, Tensor
         qvel[:, joints.velocities] = part[SPEED]
     if GRAVITY in part:
         q, v = scene.base.qpos_address, scene.base.dof_address
-        down = part[GRAVITY].new_tensor(scene.down)
+        down = part[GRAVITY].new_tensor(scene.gravity_direction)
         matrix = _upright(down).mT @ _upright(part[GRAVITY])
         quat = quat_from_matrix(matrix)
         qpos[:, q : q + 3], qpos[:, q + 3 : q + 7] = 0.0, quat

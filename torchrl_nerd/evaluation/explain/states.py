@@ -28,7 +28,7 @@ def draw_states(scene: Scene, rows: int, generator: Generator) -> TensorDict:
     """
     start, scale = scene.sample_initial(rows, generator)
     draw = torch.rand(rows, dtype=torch.float64, generator=generator)
-    scene.set_down(start, (NEAR + DEEP) * draw - DEEP)
+    scene.place_on_terrain(start, (NEAR + DEEP) * draw - DEEP)
     terrain = start.pop(TERRAIN, None)
     state = TensorDict(start, batch_size=[rows])
     torque = sample_torque(scene.sampling, scale, STEPS + 1, generator)

@@ -81,7 +81,7 @@ def aim(poser: Poser, path: Tensor, step_size: float, aspect: float) -> Camera:
     if poser.scene.base.is_floating:
         lookat = _smooth(np.array(bases), min(1.0, step_size / SMOOTHING))
     else:
-        lows[0], highs[0] = _with(poser.scene.mount[0], lows[0], highs[0])
+        lows[0], highs[0] = _with(poser.scene.fixed_base_pose[0], lows[0], highs[0])
         lookat = np.broadcast_to((lows.min(0) + highs.max(0)) / 2.0, lows.shape)
     azimuth, elevation, is_side = _view(poser.common_axis())
     camera = Camera(lookat, 1.0, azimuth, elevation, is_side)

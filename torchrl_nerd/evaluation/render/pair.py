@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.memory import remember
+from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.keys import ACTION, QPOS, TERRAIN
 from torchrl_nerd.scenes import Scene
@@ -83,7 +83,7 @@ def play_pair(
     seed: int = 0,
     own_actions: bool = False,
     device: torch.device | str = "cpu",
-    memory: int = 1,
+    frame_stack: int = 1,
 ) -> Pair:
     """Both dynamics from one start of the task, until the true episode ends.
 
@@ -96,13 +96,13 @@ def play_pair(
         own_actions: show each dynamics' own state and act on it, so that a policy can
             mend what the model gets wrong; by default both get the same actions.
         device: of the envs, and of what ``act`` is shown.
-        memory: how many observations ``act`` is shown, see `remember`.
+        frame_stack: how many observations ``act`` is shown, see `stack_frames`.
 
     Returns:
         The episode, on the processor.
     """
     learned, truth = (
-        remember(make_env(task, name, 1, seed, device), memory)
+        stack_frames(make_env(task, name, 1, seed, device), frame_stack)
         for name in (model, "mujoco")
     )
     shown = [learned.reset(), truth.reset()]  # one seed, one start
@@ -125,7 +125,7 @@ def play_pair(
     scene = truth.scene
     return Pair(
         scene=scene,
-        step_size=scene.control_step * truth.task.steps_per_action,
+        step_size=scene.control_step * truth.task.frame_skip,
         learned=positions[0],
         truth=positions[1],
         terrain=None if terrain is None else terrain[0].cpu(),

@@ -9,7 +9,7 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.scenes.controllers import TorqueController
-from torchrl_nerd.scenes.penalty import set_penalty_contact, set_penalty_limit
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact, set_penalty_limit
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling
 from torchrl_nerd.scenes.scene import Scene
 
@@ -76,8 +76,8 @@ def anymal() -> Scene:
             torque=GAIN,
             base=base,
             drive=random_pd,
-            passive_share=0.1,
-            quiet_share=0.4,
+            zero_torque_fraction=0.1,
+            low_torque_fraction=0.4,
         ),
         foresees_forces=True,
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 
 from torchrl_nerd.scenes.controllers import TorqueController
-from torchrl_nerd.scenes.penalty import set_penalty_limit
+from torchrl_nerd.scenes.penalty_law import set_penalty_limit
 from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.scene import Scene
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import wrap_angle
+from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.cartpole.scene import cartpole
 from torchrl_nerd.scenes.scene import Scene

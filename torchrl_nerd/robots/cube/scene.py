@@ -8,9 +8,9 @@ import mujoco
 import torch
 from torch import Generator, Tensor
 
-from torchrl_nerd.geometry.frames import matrix_from_quat
+from torchrl_nerd.geometry.rotations import matrix_from_quat
 from torchrl_nerd.scenes.controllers import TorqueController
-from torchrl_nerd.scenes.penalty import set_penalty_contact
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 from torchrl_nerd.scenes.sampling import BaseSampling, GroundSampler, Sampling
 from torchrl_nerd.scenes.scene import Scene
 

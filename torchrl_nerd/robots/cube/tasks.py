@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import random_tilt, rotate
+from torchrl_nerd.geometry.rotations import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots.cube.scene import (
     CLEARANCE,

@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.scenes.controllers import TorqueController
-from torchrl_nerd.scenes.penalty import set_penalty_contact
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 from torchrl_nerd.scenes.sampling import GroundSampler, Sampling
 from torchrl_nerd.scenes.scene import Scene
 

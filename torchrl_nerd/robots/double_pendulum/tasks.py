@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import wrap_angle
+from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots.double_pendulum.scene import (
     GROUNDS,

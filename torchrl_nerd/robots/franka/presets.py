@@ -53,7 +53,7 @@ _FRANKA = PPOConfig(
     minibatch=4096,
     lr=2e-3,
     std=0.7,
-    memory=3,  # its observation has no velocities, and the policy must brake
+    frame_stack=3,  # its observation has no velocities, and the policy must brake
 )
 PPO = {
     "franka/reach": _FRANKA,

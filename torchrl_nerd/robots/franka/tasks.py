@@ -5,8 +5,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.frames import wrap_angle
 from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
 from torchrl_nerd.robots.franka.scene import GAIN, HOME, franka, franka_gravity
 from torchrl_nerd.scenes.controllers import PDController
@@ -85,7 +85,7 @@ class FrankaReach(FrankaReachTorque):
     position at each of them.
     """
 
-    steps_per_action = 2
+    frame_skip = 2
 
     @property
     def controller(self) -> PDController:

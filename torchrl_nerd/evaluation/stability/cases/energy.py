@@ -41,7 +41,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
         LATE: largest(drift.mean(0)),
     }
     if world.is_true:  # the scene's own integrator may not keep it: physics does
-        fine = DynamicsWorld(MujocoDynamics(scene.fine))
+        fine = DynamicsWorld(MujocoDynamics(scene.reference))
         path = fine.roll(start, min(steps, EARLY), every=EVERY)
         figures[FINE] = largest(_drift(scene, path).mean(0))
     return figures

@@ -9,7 +9,7 @@ from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.measures import largest
 from torchrl_nerd.evaluation.stability.states import starts
 from torchrl_nerd.evaluation.stability.world import World
-from torchrl_nerd.geometry.frames import quat_exp, quat_multiply
+from torchrl_nerd.geometry.rotations import quat_exp, quat_multiply
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.transforms import StateDelta
 

@@ -76,7 +76,7 @@ def _on_slope(world: World, turn: Tensor) -> World:
         return world
     slope = ground_turned(world.scene, turn)
     if isinstance(world.dynamics, NeRDDynamics):
-        return DynamicsWorld(NeRDDynamics(world.dynamics.model.over(slope)))
+        return DynamicsWorld(NeRDDynamics(world.dynamics.model.with_terrain(slope)))
     return DynamicsWorld(MujocoDynamics(slope))
 
 

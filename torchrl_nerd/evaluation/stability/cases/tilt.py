@@ -13,7 +13,7 @@ from torchrl_nerd.evaluation.stability.states import (
     turned,
 )
 from torchrl_nerd.evaluation.stability.world import DynamicsWorld, World
-from torchrl_nerd.geometry.frames import rotate
+from torchrl_nerd.geometry.rotations import rotate
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
 

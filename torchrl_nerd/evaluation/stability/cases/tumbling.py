@@ -10,7 +10,7 @@ from torchrl_nerd.evaluation.stability.case import Case, Figures
 from torchrl_nerd.evaluation.stability.measures import largest
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, starts
 from torchrl_nerd.evaluation.stability.world import World
-from torchrl_nerd.geometry.frames import quat_matrix
+from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
 

@@ -12,47 +12,49 @@ from torchrl_nerd.keys import OBSERVATION
 from torchrl_nerd.settings import expect_at_least
 
 
-def memory_of(actor: Actor) -> int:
-    """How many observations an actor wants to be shown: its ``memory``, or 1."""
-    return getattr(actor, "memory", 1)
+def frame_stack_of(actor: Actor) -> int:
+    """How many observations an actor wants to be shown: its ``frame_stack``, or 1."""
+    return getattr(actor, "frame_stack", 1)
 
 
-def remember(env: SceneEnv, memory: int) -> SceneEnv:
+def stack_frames(env: SceneEnv, frame_stack: int) -> SceneEnv:
     """An env whose ``observation`` is its last ones side by side, the oldest first.
 
     The first one after a reset stands for those before it.
 
     Args:
-        env: what to remember.
-        memory: how many observations, the present one included; 1 gives ``env`` itself.
+        env: whose observations to stack.
+        frame_stack: how many observations, the present one included; 1: ``env`` itself.
 
     Raises:
         ValueError: no observation at all.
 
     Examples:
         >>> from torchrl_nerd.envs import make_env
-        >>> env = remember(make_env("franka/reach", num_envs=4), memory=3)
+        >>> env = stack_frames(make_env("franka/reach", num_envs=4), frame_stack=3)
         >>> env.rollout(5)["observation"].shape  # 13 numbers each
         torch.Size([4, 5, 39])
     """
-    expect_at_least(1, memory=memory)
-    if memory == 1:
+    expect_at_least(1, frame_stack=frame_stack)
+    if frame_stack == 1:
         return env
-    stacked = TransformedEnv(env, CatFrames(memory, -1, [OBSERVATION]))
+    stacked = TransformedEnv(env, CatFrames(frame_stack, -1, [OBSERVATION]))
     return cast(SceneEnv, stacked)  # which hands every other attribute on
 
 
-def recall(recent: Tensor | None, observation: Tensor, memory: int) -> Tensor:
-    """What `remember` shows, for a loop without an env.
+def append_frame(
+    recent: Tensor | None, observation: Tensor, frame_stack: int
+) -> Tensor:
+    """What `stack_frames` shows, for a loop without an env.
 
     Args:
         recent: what this function gave one action ago; None at the start.
         observation: ``(*batch, D)``.
-        memory: how many observations.
+        frame_stack: how many observations.
 
     Returns:
-        ``(*batch, memory * D)``.
+        ``(*batch, frame_stack * D)``.
     """
     if recent is None:
-        return observation.tile(memory)
+        return observation.tile(frame_stack)
     return torch.cat((recent[..., observation.shape[-1] :], observation), -1)

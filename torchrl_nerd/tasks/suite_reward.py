@@ -26,7 +26,7 @@ PARTS = (  # of mj_forward: positions, velocities and the sensors of both
 )
 
 
-class SuiteJudge:
+class SuiteReward:
     """Reset distribution, reward, observation and end of ``domain-task``, row by row.
 
     | attribute | meaning |

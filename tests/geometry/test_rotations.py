@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import random_quats
 
-from torchrl_nerd.geometry.frames import (
+from torchrl_nerd.geometry.rotations import (
     orientation_error,
     quat_conjugate,
     quat_exp,

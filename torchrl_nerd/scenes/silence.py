@@ -7,7 +7,7 @@ import mujoco
 
 
 @contextmanager
-def quiet_mujoco() -> Iterator[None]:
+def silence_mujoco() -> Iterator[None]:
     """Neither warnings on the terminal nor a MUJOCO_LOG.TXT in the working folder."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_say_nothing)

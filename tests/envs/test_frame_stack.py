@@ -5,7 +5,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd.envs import make_env
-from torchrl_nerd.envs.memory import recall, remember
+from torchrl_nerd.envs.frame_stack import append_frame, stack_frames
 from torchrl_nerd.robots import make_task
 
 ROWS, STEPS = 4, 6
@@ -18,29 +18,29 @@ def dynamics(request) -> str:
 
 def test_one_observation_is_the_env_itself(dynamics):
     env = make_env("franka/reach", dynamics, ROWS)
-    assert remember(env, 1) is env
+    assert stack_frames(env, 1) is env
 
 
-@pytest.mark.parametrize("memory", [2, 3])
-def test_it_shows_what_was_seen(memory, dynamics, seed):
+@pytest.mark.parametrize("frame_stack", [2, 3])
+def test_it_shows_what_was_seen(frame_stack, dynamics, seed):
     env, plain = (make_env("franka/reach", dynamics, ROWS, seed) for _ in range(2))
-    env = remember(env, memory)
+    env = stack_frames(env, frame_stack)
     check_env_specs(env)
     env.set_seed(seed)
     plain.set_seed(seed)
     actions = torch.rand(STEPS, ROWS, 7) * 2.0 - 1.0
     td, one = env.reset(), plain.reset()
-    recent = recall(None, one["observation"], memory)
+    recent = append_frame(None, one["observation"], frame_stack)
     assert torch.equal(td["observation"], recent)
     for action in actions:
         td = env.step(td.set("action", action))["next"]
         one = plain.step(one.set("action", action))["next"]
-        recent = recall(recent, one["observation"], memory)
+        recent = append_frame(recent, one["observation"], frame_stack)
         assert torch.equal(td["observation"], recent)
 
 
 def test_a_partial_reset_forgets_its_rows_alone(dynamics, seed):
-    env = remember(make_env("franka/reach", dynamics, ROWS, seed), 3)
+    env = stack_frames(make_env("franka/reach", dynamics, ROWS, seed), 3)
     last = env.rollout(4, break_when_any_done=False)[:, -1]["next"].clone()
     which = torch.tensor([False, True, True, False])
     again = env.reset(last.clone().set("_reset", which[:, None]))["observation"]
@@ -51,5 +51,5 @@ def test_a_partial_reset_forgets_its_rows_alone(dynamics, seed):
 
 def test_no_memory_at_all_is_refused():
     task = make_task("cartpole/swingup")
-    with pytest.raises(ValueError, match="memory"):
-        remember(make_env(task, "mujoco"), 0)
+    with pytest.raises(ValueError, match="frame_stack"):
+        stack_frames(make_env(task, "mujoco"), 0)
