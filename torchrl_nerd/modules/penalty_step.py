@@ -5,7 +5,8 @@ back by friction, ``min(kf * slip, mu * normal force)``: the law of the paper's 
 `scenes.penalty_law`. Two things are added that real bodies have: a centre of mass that
 is not where the body's frame is, and friction that fades under load, ``mu / (1 + normal
 force * fading)``, as elastic asperities' does (J. F. Archard, "Elastic deformation and
-the laws of friction", 1957). A few substeps with a backward Euler spring are stable at any stiffness.
+the laws of friction", 1957). A few substeps with a backward Euler spring are stable at
+any stiffness.
 Every operation is differentiable, and so are the physical parameters: a rollout through it
 fits them to recordings.
 """
