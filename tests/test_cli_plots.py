@@ -1,4 +1,4 @@
-"""``nerd plot`` and ``nerd data --inspect``: files, figures, refusals."""
+"""``nerd plot``: files, figures, refusals."""
 
 import json
 
@@ -27,17 +27,6 @@ def test_rollouts_are_plotted(tmp_path, seed, capsys):
     assert set(content["energies"]) == set(content["gaps"]) == {"learned", "MuJoCo"}
 
 
-def test_a_data_set_is_inspected(tmp_path, seed, capsys):
-    figures = tmp_path / "a.json"
-    argv = ["data", "cartpole", "--out", str(tmp_path / "d"), "--trajectories", "20"]
-    argv += ["--steps", "5", "--seed", str(seed), "--quiet", "--inspect"]
-    assert main([*argv, "--json", str(figures)]) == 0
-    assert "report.html" in capsys.readouterr().out
-    text = (tmp_path / "d" / "report.html").read_text()
-    assert f"seed {seed}" in text and "slider (m)" in text
-    assert len(json.loads(figures.read_text())["survey"]["columns"]) == 5
-
-
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
@@ -45,7 +34,7 @@ def test_a_data_set_is_inspected(tmp_path, seed, capsys):
         ("plot cartpole --case gorge", "unknown case 'gorge', expected one of passive"),
         ("plot cartpole --rows 1", "rows of at least 2, got 1"),
         ("plot cartpole --steps 0", "steps of at least 1, got 0"),
-        ("data cube --from a.npz --inspect", "--inspect without --from"),
+        ("data cube --from a.npz --policy p", "--policy without --from"),
     ],
 )
 def test_bad_input_is_refused(argv, words, tmp_path, monkeypatch, capsys):

@@ -22,14 +22,11 @@ from torchrl_nerd.data.generate import (
     Draw,
     draw_chunk,
     generate,
-    load_data,
     plain_strategy,
 )
 from torchrl_nerd.data.ray_map import ray_map
 from torchrl_nerd.data.recorded import load_tosses, write_tosses
 from torchrl_nerd.data.strategies import preset_strategy
-from torchrl_nerd.evaluation.data_report.page import write_page
-from torchrl_nerd.evaluation.data_report.survey import survey, survey_figures
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.policy_strategy import along_policy
@@ -42,8 +39,6 @@ class Data(Command):
     Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
 
     Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
-
-    Example: nerd data cartpole --inspect
 
     Example: nerd data ant --trajectories 1000000 --ray auto
 
@@ -66,8 +61,6 @@ class Data(Command):
     its actions, from the starts of its task."""
     noise: float = 0.5
     """Of a policy's actions: a standard deviation from U(0, this) for each trajectory."""
-    inspect: bool = False
-    """Write a page about the data set, made before or now, to report.html in its folder."""
     ray: str | None = None
     """Draw on the workers of a Ray cluster: its HOST:PORT, auto, or local for this machine
     alone. The data are the same."""
@@ -108,11 +101,8 @@ class Data(Command):
             ValueError: options that exclude each other, or see `generate`, `load_tosses`.
         """
         if self.recorded is not None:
-            for name, is_given in (("inspect", self.inspect), ("policy", self.policy)):
-                if is_given:
-                    raise ValueError(
-                        f"expected --{name} without --from: it is of drawn data"
-                    )
+            if self.policy is not None:
+                raise ValueError("expected --policy without --from: it draws data")
             scene = real_scene(self.scene)
             out = self.out or Path("datasets") / f"{scene.name}_recorded"
             card = write_tosses(self.recorded, scene, out)
@@ -128,13 +118,4 @@ class Data(Command):
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
         )
-        return card | self.report(scene, out, card)
-
-    def report(self, scene: Scene, out: Path, card: dict[str, Any]) -> dict[str, Any]:
-        """Write the page where it was asked for, and return its figures."""
-        if not self.inspect:
-            return {}
-        found = survey(scene, load_data(scene, out))
-        write_page(found, card, out / "report.html")
-        print(f"report: {out / 'report.html'}")
-        return {"survey": survey_figures(found)}
+        return card

@@ -27,15 +27,6 @@ PARTS = {  # of a joint's qpos
     mjtJoint.mjJNT_SLIDE: ("(m)",),
     mjtJoint.mjJNT_HINGE: ("(rad)",),
 }
-DOFS = {  # of a joint's qvel
-    mjtJoint.mjJNT_FREE: (
-        *("x' (m/s)", "y' (m/s)", "z' (m/s)"),
-        *("wx (rad/s)", "wy (rad/s)", "wz (rad/s)"),
-    ),
-    mjtJoint.mjJNT_BALL: ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)"),
-    mjtJoint.mjJNT_SLIDE: ("speed (m/s)",),
-    mjtJoint.mjJNT_HINGE: ("speed (rad/s)",),
-}
 STYLES = ("-", "--", ":", "-.")
 PANEL = (7.0, 2.0)  # inches
 
@@ -95,15 +86,6 @@ def qpos_names(scene: Scene) -> list[str]:
     for joint in range(model.njnt):
         name = model.joint(joint).name
         names += [f"{name} {part}" for part in PARTS[mjtJoint(model.jnt_type[joint])]]
-    return names
-
-
-def dof_names(scene: Scene) -> list[str]:
-    """Name and unit of every entry of ``qvel``."""
-    model, names = scene.model, []
-    for joint in range(model.njnt):
-        name = model.joint(joint).name
-        names += [f"{name} {part}" for part in DOFS[mjtJoint(model.jnt_type[joint])]]
     return names
 
 
