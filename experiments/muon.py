@@ -1,0 +1,204 @@
+"""Muon of PyTorch against the same update computed in float32.
+
+    python experiments/muon.py --json results/muon.json
+
+`torch.optim.Muon` orthogonalises updates in bfloat16, one matrix after the other.
+`GramMuon` below, which was part of the package, iterates on Gram matrices in float32. Both
+train the same networks on the same data from the same seeds. The script writes the error on
+test rollouts and the training time of each.
+"""
+
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+import tyro
+from torch import Generator, Tensor
+
+from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.data.generate import simulate
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.files import write_json
+from torchrl_nerd.robots import load_scene, source_of
+from torchrl_nerd.training.trainer import Trainer, adamw, split_parameters
+
+COEFFICIENTS = (
+    3.4445,
+    -4.7750,
+    2.0315,
+)  # quintic of https://kellerjordan.github.io/posts/muon
+HORIZONS = (100, 500)  # control steps
+TEST_SEED, TEST_ROLLOUTS = 7, 512
+
+
+@dataclass
+class Options:
+    """What to train."""
+
+    scene: str = "cartpole"
+    networks: tuple[str, ...] = ("transformer-2x64", "mlp-4x64")
+    seeds: tuple[int, ...] = (0, 1)
+    trajectories: int = 4000
+    steps: int = 2000
+    """Updates on one-step targets; a tenth as many on rollouts follow."""
+    json: Path | None = None
+    """Write the results to this file."""
+
+
+class GramMuon(torch.optim.Optimizer):
+    """Muon in float32, all matrices of one shape at once.
+
+    Args:
+        params: weight matrices.
+        lr: step size.
+        momentum: Nesterov momentum.
+    """
+
+    def __init__(
+        self, params: Iterable[Tensor], lr: float, momentum: float = 0.95
+    ) -> None:
+        super().__init__(params, {"lr": lr, "momentum": momentum})
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # pyright: ignore
+        """Update every matrix that has a gradient."""
+        for group in self.param_groups:
+            by_shape: dict[torch.Size, list[Tensor]] = {}
+            for weight in group["params"]:
+                by_shape.setdefault(weight.shape, []).append(weight)
+            for shape, weights in by_shape.items():
+                updates = []
+                for weight in weights:
+                    state, gradient = self.state[weight], cast(Tensor, weight.grad)
+                    buffer = state.setdefault(
+                        "momentum_buffer", torch.zeros_like(weight)
+                    )
+                    buffer.lerp_(gradient, 1.0 - group["momentum"])
+                    updates.append(gradient.lerp(buffer, group["momentum"]))
+                scale = group["lr"] * max(1.0, shape[0] / shape[1]) ** 0.5
+                directions = orthogonalize(torch.stack(updates))
+                for weight, direction in zip(weights, directions, strict=True):
+                    weight.add_(direction, alpha=-scale)
+
+
+def orthogonalize(matrices: Tensor, iterations: int = 5) -> Tensor:
+    """Matrices ``(*batch, m, n)`` with all singular values brought to about one."""
+    is_tall = matrices.shape[-2] > matrices.shape[-1]
+    x = matrices.mT if is_tall else matrices
+    x = x / (torch.linalg.matrix_norm(x, keepdim=True) + 1e-12)
+    gram = x @ x.mT
+    product = factor = quintic(gram)
+    for _ in range(iterations - 1):
+        gram = factor @ gram @ factor
+        factor = quintic(gram)
+        product = factor @ product
+    x = product @ x
+    return x.mT if is_tall else x
+
+
+def quintic(gram: Tensor) -> Tensor:
+    """The matrix that one Newton-Schulz iteration multiplies with."""
+    a, b, c = COEFFICIENTS
+    factor = b * gram + c * gram @ gram
+    factor.diagonal(dim1=-2, dim2=-1).add_(a)
+    return factor
+
+
+class GramTrainer(Trainer):
+    """A trainer whose matrices are updated by `GramMuon`."""
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """See `Trainer.make_optimizers`."""
+        matrices, others = split_parameters(self.model.network)
+        return {
+            "muon": GramMuon(matrices, self.config.lr),
+            "adamw": adamw(others, self.config.adamw_lr),
+        }
+
+
+class TorchTrainer(Trainer):
+    """A trainer whose matrices are updated by `torch.optim.Muon`."""
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """See `Trainer.make_optimizers`."""
+        matrices, others = split_parameters(self.model.network)
+        muon = torch.optim.Muon(
+            matrices, self.config.lr, weight_decay=0.0, adjust_lr_fn="original"
+        )
+        return {"muon": muon, "adamw": adamw(others, self.config.adamw_lr)}
+
+
+TRAINERS = {"float32": GramTrainer, "torch": TorchTrainer}
+
+
+def train(options: Options, name: str, network: str, seed: int) -> dict[str, Any]:
+    """Train one network and return its errors on test rollouts and the seconds taken."""
+    scene = load_scene(options.scene)
+    source = source_of(scene)
+    data = simulate(scene, options.trajectories, 100, Generator().manual_seed(0))
+    config = TrainConfig(
+        network=network,
+        steps=options.steps,
+        rollout_steps=options.steps // 10,
+        single_step_fraction=0.0,
+        seed=seed,
+        save_every=10**6,
+        validate_every=10**6,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = TRAINERS[name](
+            scene, data, source, config, Path(folder), horizons=(2,), logger="csv"
+        )
+        began = time.monotonic()
+        model = trainer.run()
+        seconds = time.monotonic() - began
+    errors = passive_errors(
+        source,
+        NeRDDynamics(model),
+        MujocoDynamics(scene),
+        list(HORIZONS),
+        rows=TEST_ROLLOUTS,
+        seed=TEST_SEED,
+    )
+    found = {"optimizer": name, "network": network, "seed": seed}
+    found |= {
+        f"{quantity}_{horizon}": summary.mean
+        for horizon, by_name in errors.items()
+        for quantity, summary in by_name.items()
+    }
+    return {**found, "seconds": round(seconds, 1)}
+
+
+def main() -> None:
+    """Train every network from every seed with both optimizers."""
+    options = tyro.cli(Options)
+    torch.set_num_threads(1)
+    results = []
+    for seed in options.seeds:
+        for network in options.networks:
+            for name in TRAINERS:
+                results.append(train(options, name, network, seed))
+                print(results[-1], flush=True)
+    if options.json is not None:
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        about = {
+            "command": f"python experiments/muon.py {' '.join(sys.argv[1:])}",
+            "commit": commit,
+            "machine": f"{platform.machine()}, 1 thread, torch {torch.__version__}",
+            "seed": list(options.seeds),
+        }
+        write_json(options.json, {**about, "results": results})
+
+
+if __name__ == "__main__":
+    main()
