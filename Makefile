@@ -68,21 +68,21 @@ PRETRAINED := torchrl_nerd/pretrained
 
 model-ant-mlp: $(STAMP) ## the Ant's network alone: learned, tried by a policy, learned on
 	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp
-	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --flies --use-symmetry \
+	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --use-symmetry \
 		--steps 46000 --rollout-steps 6000 --rollout-restarts 2 --bf16-fraction 0.85 \
 		--validate-every 5000 --out runs/ant_mlp
 	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant_mlp/best --out runs/ppo_ant \
 		--horizon 16 --minibatch 8192 --lr 1e-3 --total-frames 8000000 --episodes 512
 	$(NERD) data ant --policy runs/ppo_ant --trajectories 12000 --out datasets/ant_policy
-	$(NERD) train ant --start runs/ant_mlp/best --data datasets/ant_mlp datasets/ant_policy \
-		--network mlp-4x160 --flies --use-symmetry --bf16-fraction 0.85 \
+	$(NERD) train ant --init-from runs/ant_mlp/best --data datasets/ant_mlp datasets/ant_policy \
+		--network mlp-4x160 --use-symmetry --bf16-fraction 0.85 \
 		--steps 12000 --rollout-steps 4000 --rollout-restarts 1 --lr 0.004 --adamw-lr 0.0012 \
 		--rollout-lr-ratio 0.25 --validate-every 2000 --out runs/ant_policy
 	cp runs/ant_policy/best/* $(PRETRAINED)/ant-mlp/
 
 model-anymal-mlp: $(STAMP) ## ANYmal's network alone: learned, tried by two policies, learned on
 	$(NERD) data anymal --trajectories 20000 --out datasets/anymal_mlp
-	$(NERD) train anymal --data datasets/anymal_mlp --network mlp-4x128 --flies \
+	$(NERD) train anymal --data datasets/anymal_mlp --network mlp-4x128 \
 		--steps 15000 --rollout-steps 1000 --bf16-fraction 0.8 --out runs/anymal_mlp
 	for task in forward sideways; do \
 		$(PY) examples/ppo.py --task anymal/$$task --dynamics runs/anymal_mlp/best \
@@ -93,9 +93,9 @@ model-anymal-mlp: $(STAMP) ## ANYmal's network alone: learned, tried by two poli
 		--out datasets/anymal_forward
 	$(NERD) data anymal --policy runs/ppo_anymal_sideways --noise 0.3 --trajectories 5000 \
 		--out datasets/anymal_sideways
-	$(NERD) train anymal --start runs/anymal_mlp/best --out runs/anymal_on \
+	$(NERD) train anymal --init-from runs/anymal_mlp/best --out runs/anymal_on \
 		--data datasets/anymal_mlp datasets/anymal_forward datasets/anymal_sideways \
-		--network mlp-4x128 --flies --bf16-fraction 0.8 --steps 7000 --rollout-steps 1000 \
+		--network mlp-4x128 --bf16-fraction 0.8 --steps 7000 --rollout-steps 1000 \
 		--lr 0.004 --adamw-lr 0.0012 --validate-every 1000
 	cp runs/anymal_on/best/* $(PRETRAINED)/anymal-mlp/
 
@@ -105,7 +105,7 @@ model-double_pendulum-mlp: $(STAMP) ## the double pendulum's network alone: two 
 	$(NERD) data double_pendulum --trajectories 150000 --out datasets/double_pendulum_mlp
 	$(NERD) train double_pendulum --data datasets/double_pendulum_mlp $(PENDULUM_MLP) \
 		--steps 90000 --rollout-steps 4000 --rollout-lr-ratio 0.03 --out runs/double_pendulum_mlp
-	$(NERD) train double_pendulum --start runs/double_pendulum_mlp/best \
+	$(NERD) train double_pendulum --init-from runs/double_pendulum_mlp/best \
 		--data datasets/double_pendulum_mlp $(PENDULUM_MLP) --steps 24000 \
 		--rollout-steps 3000 --lr 0.004 --adamw-lr 0.0012 --rollout-lr-ratio 0.08 \
 		--out runs/double_pendulum_on

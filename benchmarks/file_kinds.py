@@ -36,7 +36,12 @@ SCENE, CUBE = "cartpole", "cube_real"
 DATA = DataConfig(trajectories=6, steps=4)
 CHUNK = 2  # trajectories, in place of the package's own chunk
 TRAIN = TrainConfig(
-    network="mlp-4x64", steps=2, rollout_steps=0, rows=2, length=2, save_every=2
+    network="mlp-4x64",
+    steps=2,
+    rollout_steps=0,
+    batch_size=2,
+    sequence_length=2,
+    save_every=2,
 )
 
 

@@ -16,7 +16,15 @@ from torchrl_nerd.robots import PRESETS, SCENES, load_scene
 NOTHING_RANDOM = ("doctor", "replay")
 SOON_DONE = ("plot", "explain", "replay")
 QUICK = ("cartpole", "double_pendulum", "cube")  # the others take minutes in all
-TINY = ["--network", "mlp-4x64", "--rows", "64", "--rollout-batch-size", "8", "--quiet"]
+TINY = [
+    "--network",
+    "mlp-4x64",
+    "--batch-size",
+    "64",
+    "--rollout-batch-size",
+    "8",
+    "--quiet",
+]
 
 
 def refusal(capsys, *argv: str) -> str:
@@ -101,8 +109,16 @@ def test_a_dry_run_says_what_it_would_do_and_does_nothing(
 def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     draw = "data cartpole --trajectories 8 --steps 20 --quiet".split()
-    learn = "train cartpole --steps 1 --rollout-steps 1 --rows 2 --length 2".split()
-    learn += ["--rollout-batch-size", "2", "--rollout-length", "2", "--quiet"]
+    learn = "train cartpole --steps 1 --rollout-steps 1 --batch-size 2".split()
+    learn += [
+        "--sequence-length",
+        "2",
+        "--rollout-batch-size",
+        "2",
+        "--rollout-length",
+        "2",
+        "--quiet",
+    ]
     assert main(draw) == main(learn) == main([*draw, "--dry-run"]) == 0
     assert "where 8 are now" in capsys.readouterr().out
     assert main([*learn, "--dry-run"]) == 0
@@ -133,7 +149,7 @@ def test_an_unknown_scene_is_refused(command, capsys):
         ("data cartpole --trajectories -5", "trajectories of at least 1, got -5"),
         ("data cartpole --steps 0", "steps of at least 1, got 0"),
         ("train cartpole --steps -1", "steps of at least 0, got -1"),
-        ("train cartpole --rows -8", "rows of at least 1, got -8"),
+        ("train cartpole --batch-size -8", "batch_size of at least 1, got -8"),
         ("train cartpole --network huge", "unknown network 'huge'"),
         ("train cartpole --save-every 0", "save_every of at least 1"),
         ("train cartpole --threads -1", "threads"),

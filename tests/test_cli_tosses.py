@@ -13,9 +13,9 @@ TINY = [
     "all",
     "--epochs",
     "0.02",
-    "--rows",
+    "--batch-size",
     "16",
-    "--length",
+    "--sequence-length",
     "2",
 ]
 

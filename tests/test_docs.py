@@ -44,8 +44,8 @@ SHARED = {"load_scene": load_scene, "torch": torch, "TensorDict": TensorDict}
 
 BUDGETS = {
     "data": "--trajectories 300 --steps 20 --quiet",
-    "train": "--network mlp-4x64 --steps 2 --rollout-steps 1 --rows 16 --length 2 "
-    "--rollout-batch-size 2 --rollout-length 2 --quiet",
+    "train": "--network mlp-4x64 --steps 2 --rollout-steps 1 --batch-size 16 "
+    "--sequence-length 2 --rollout-batch-size 2 --rollout-length 2 --quiet",
     "eval": "--rows 2 --quiet",
     "finetune": "--epochs 1 --quiet",
     "transfer": "--episodes 2 --quiet",

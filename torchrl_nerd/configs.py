@@ -6,7 +6,7 @@ from typing import Literal, get_args
 from torchrl_nerd.settings import SettingError, expect_at_least
 
 COUNTS = (
-    *("rows", "length", "rollout_batch_size", "rollout_length"),
+    *("batch_size", "sequence_length", "rollout_batch_size", "rollout_length"),
     *("save_every", "validate_every", "rollout_restarts"),
 )
 
@@ -46,9 +46,8 @@ class TrainConfig:
       `GroundedNeRD` |
     | ``steps`` | updates on one-step targets |
     | ``rollout_steps`` | further updates on the model's own rollouts |
-    | ``rows``, ``length`` | sequences per update and tokens of each |
+    | ``batch_size``, ``sequence_length`` | sequences per update, control steps of each |
     | ``single_step_fraction`` | share of updates on as many single states instead |
-    | ``flies`` | have rows that nothing pushes move along the free motion, see `Flight` |
     | ``use_symmetry`` | show each sample as a random one of its mirror images |
     | ``rollout_batch_size``, ``rollout_length`` | the same for rollouts |
     | ``lr``, ``adamw_lr`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
@@ -71,10 +70,9 @@ class TrainConfig:
     network: str = "transformer-2x64"
     steps: int = 20_000
     rollout_steps: int = 2_000
-    rows: int = 64
-    length: int = 16
+    batch_size: int = 64
+    sequence_length: int = 16
     single_step_fraction: float = 0.75
-    flies: bool = False
     use_symmetry: bool = False
     rollout_batch_size: int = 128
     rollout_length: int = 8
@@ -111,8 +109,8 @@ class FinetuneConfig:
     | ``update`` | physics alone, without gradients, or all, head, low-rank weights too |
     | ``evaluations`` | of physics, in each of two stages |
     | ``epochs`` | at most; an epoch shows every training window once |
-    | ``rows`` | windows per update |
-    | ``length`` | steps of a rollout |
+    | ``batch_size`` | windows per update |
+    | ``sequence_length`` | control steps of a rollout |
     | ``short_history_fraction`` | share of updates, the first ones, at half of it |
     | ``rank`` | of low-rank changes |
     | ``lr`` | peak step size of the network |
@@ -135,8 +133,8 @@ class FinetuneConfig:
     update: Update = "physics"
     evaluations: int = 90
     epochs: float = 2.0
-    rows: int = 384
-    length: int = 24
+    batch_size: int = 384
+    sequence_length: int = 24
     short_history_fraction: float = 0.5
     rank: int = 4
     lr: float = 1e-3
@@ -161,7 +159,14 @@ class FinetuneConfig:
                 )
         if self.observe == "states" and (self.every > 1 or self.pose_noise > 0.0):
             raise SettingError("expected observe 'poses' with every or pose_noise")
-        counts = ("evaluations", "every", "rows", "length", "rank", "validate_every")
+        counts = (
+            "evaluations",
+            "every",
+            "batch_size",
+            "sequence_length",
+            "rank",
+            "validate_every",
+        )
         expect_at_least(
             1, **{name: getattr(self, name) for name in (*counts, "patience")}
         )

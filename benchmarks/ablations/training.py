@@ -52,8 +52,8 @@ class VariantTrainer(Trainer):
         config = TrainConfig(
             steps=updates,
             rollout_steps=0,
-            rows=TOKENS // length,
-            length=length,
+            batch_size=TOKENS // length,
+            sequence_length=length,
             lr=LR,
             adamw_lr=LR_OTHER if variant.has_muon else LR_ALONE,
             loss_eps=SOFTENING[scene.name],

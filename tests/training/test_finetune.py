@@ -17,7 +17,9 @@ from torchrl_nerd.training.finetune import FineTuner
 from torchrl_nerd.training.pose_loss import pose_error, rollout
 from torchrl_nerd.training.toss_models import from_scratch
 
-QUICK = FinetuneConfig(update="all", epochs=0.2, rows=64, length=4, validate_every=100)
+QUICK = FinetuneConfig(
+    update="all", epochs=0.2, batch_size=64, sequence_length=4, validate_every=100
+)
 NUMBERS = torch.arange(12)
 
 

@@ -17,7 +17,16 @@ from torchrl_nerd.training import ranks
 from torchrl_nerd.transforms import Stats
 
 BRIEF = (
-    *("--steps", "12", "--rollout-steps", "3", "--rows", "8", "--length", "4"),
+    *(
+        "--steps",
+        "12",
+        "--rollout-steps",
+        "3",
+        "--batch-size",
+        "8",
+        "--sequence-length",
+        "4",
+    ),
     *("--rollout-batch-size", "4", "--rollout-length", "3", "--warmup", "2"),
     *("--save-every", "5", "--validate-every", "3", "--quiet", "--threads", "1"),
     *("--bf16-fraction", "0"),  # whose rounding is a thousand times as coarse
@@ -71,8 +80,8 @@ def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
 def test_shares_that_are_not_equal_are_refused(tmp_path):
     name = "cartpole"
     generate(load_scene(name), DataConfig(20, 8), tmp_path / "data", quiet=True)
-    _, said = train(name, tmp_path / "data", tmp_path / "run", 2, "--rows", "9")
-    assert "expected rows to be a multiple of the 2 ranks, got 9" in said
+    _, said = train(name, tmp_path / "data", tmp_path / "run", 2, "--batch-size", "9")
+    assert "expected batch_size to be a multiple of the 2 ranks, got 9" in said
 
 
 def test_alone_nothing_changes(generator):
@@ -81,4 +90,4 @@ def test_alone_nothing_changes(generator):
     assert torch.equal(ranks.share(x), x)
     stats = Stats.of(x)
     assert ranks.merge_stats(stats) is stats
-    ranks.expect_shares(rows=TrainConfig().rows)
+    ranks.expect_shares(batch_size=TrainConfig().batch_size)

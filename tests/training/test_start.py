@@ -30,8 +30,8 @@ CONFIG = TrainConfig(
     network="transformer-2x64",
     steps=6,
     rollout_steps=2,
-    rows=4,
-    length=3,
+    batch_size=4,
+    sequence_length=3,
     rollout_batch_size=4,
     rollout_length=3,
     save_every=4,
@@ -153,8 +153,25 @@ def test_the_shipped_ant_can_be_shown_images(generator):
     begin_from(model, model.scene, "mlp-4x160", Symmetry.of(model.scene, data))
 
 
-ARGS = ["train", "cartpole", "--quiet", "--rows", "4", "--rollout-batch-size", "4"]
-ARGS += ["--steps", "3", "--rollout-steps", "1", "--length", "2", "--logger", "csv"]
+ARGS = [
+    "train",
+    "cartpole",
+    "--quiet",
+    "--batch-size",
+    "4",
+    "--rollout-batch-size",
+    "4",
+]
+ARGS += [
+    "--steps",
+    "3",
+    "--rollout-steps",
+    "1",
+    "--sequence-length",
+    "2",
+    "--logger",
+    "csv",
+]
 ARGS += ["--rollout-length", "2", "--validate-every", "4"]
 
 
@@ -164,21 +181,27 @@ def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
     for out, seed in (("a", "1"), ("b", "2")):
         sizes = ["--trajectories", "9", "--steps", "110", "--seed", seed, "--quiet"]
         assert main(["data", "cartpole", "--out", out, *sizes]) == 0
-    argv = [*ARGS, "--data", "a", "b", "--start", "cartpole", "--out", "on"]
+    argv = [*ARGS, "--data", "a", "b", "--init-from", "cartpole", "--out", "on"]
     assert main([*argv, "--dry-run"]) == 0
     assert "use the data in a, b" in capsys.readouterr().out
     assert main(argv) == main(argv) == 0
     training = read_json(tmp_path / "on" / "last" / "card.json")["training"]
     assert training["trajectories"] == 18
     assert training["start"] == fingerprint(from_pretrained("cartpole"))
-    assert main([*ARGS, "--data", "a", "--start", "on/last", "--dry-run"]) == 0
+    assert main([*ARGS, "--data", "a", "--init-from", "on/last", "--dry-run"]) == 0
     capsys.readouterr()
     for options, words in (
-        (["--data", "a", "--start", "ant"], "is for robot 'ant', expected 'cartpole'"),
-        (["--data", "a", "--start", "none"], "checkpoint folder, got 'none'"),
-        (["--data", "a", "--start", "cartpole-micro"], "start from, mlp-micro, got"),
+        (
+            ["--data", "a", "--init-from", "ant"],
+            "is for robot 'ant', expected 'cartpole'",
+        ),
+        (["--data", "a", "--init-from", "none"], "checkpoint folder, got 'none'"),
+        (
+            ["--data", "a", "--init-from", "cartpole-micro"],
+            "start from, mlp-micro, got",
+        ),
         (["--data", "a", "none"], "expected a data set in none"),
-        (["--data", "a", "--start", "on/last", "--out", "on"], "run with start"),
+        (["--data", "a", "--init-from", "on/last", "--out", "on"], "run with start"),
     ):
         assert main([*ARGS, "--out", "new", *options]) == 2
         said = capsys.readouterr().err

@@ -145,9 +145,15 @@ def test_training_with_symmetry_resumes_to_the_same_bits(tmp_path):
     data = simulate(scene, 60, 12, Generator().manual_seed(1))
     config = TrainConfig(
         **dict(
-            network="mlp-4x64", use_symmetry=True, steps=6, rollout_steps=4, rows=16
+            network="mlp-4x64",
+            use_symmetry=True,
+            steps=6,
+            rollout_steps=4,
+            batch_size=16,
         ),
-        **dict(length=4, rollout_batch_size=16, rollout_length=4, save_every=4),
+        **dict(
+            sequence_length=4, rollout_batch_size=16, rollout_length=4, save_every=4
+        ),
         validate_every=20,
     )
     task = make_task("ant/run")

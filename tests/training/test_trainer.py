@@ -25,8 +25,8 @@ SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 BRIEF = TrainConfig(
     steps=40,
     rollout_steps=5,
-    rows=32,
-    length=8,
+    batch_size=32,
+    sequence_length=8,
     rollout_batch_size=8,
     rollout_length=4,
     warmup=5,
@@ -157,7 +157,11 @@ def test_another_robot_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "longest"),
-    [({"length": 13}, 13), ({"rollout_length": 14}, 14), ({"length": 20}, 20)],
+    [
+        ({"sequence_length": 13}, 13),
+        ({"rollout_length": 14}, 14),
+        ({"sequence_length": 20}, 20),
+    ],
 )
 def test_too_short_trajectories_are_refused(change, longest, tmp_path):
     with pytest.raises(ValueError, match=f"at least {longest} steps, got 12"):
@@ -170,8 +174,8 @@ def test_unusable_settings_are_refused(tmp_path):
     for name in ("steps", "rollout_steps", "lr", "ema", "seed"):
         with pytest.raises(ValueError, match=f"{name} of at least [01], got -1"):
             TrainConfig(**{name: -1})
-    with pytest.raises(ValueError, match="unknown network 'huge', expected.*tiny"):
-        TrainConfig(network="huge")
+    with pytest.raises(ValueError, match="unknown network 'huge', expected.*mlp"):
+        make_trainer(SCENE, replace(BRIEF, network="huge"), tmp_path / "huge")
     (tmp_path / "taken").write_text("not a folder")
     with pytest.raises(ValueError, match=f"got {tmp_path / 'taken'}"):
         make_trainer(SCENE, BRIEF, tmp_path / "taken")
@@ -180,8 +184,8 @@ def test_unusable_settings_are_refused(tmp_path):
 @pytest.mark.parametrize(
     "name",
     [
-        "rows",
-        "length",
+        "batch_size",
+        "sequence_length",
         "rollout_batch_size",
         "rollout_length",
         "save_every",

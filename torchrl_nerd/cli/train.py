@@ -38,7 +38,7 @@ class Train(DeviceCommand):
 
     Example: nerd train cartpole --out runs/cartpole --network mlp-4x64
 
-    Example: nerd train ant --start ant --data datasets/ant datasets/ant_policy
+    Example: nerd train ant --init-from ant --data datasets/ant datasets/ant_policy
     """
 
     scene: Positional[str]
@@ -49,7 +49,7 @@ class Train(DeviceCommand):
     data: tuple[Path, ...] = ()
     """Folders of data sets, learned from together; datasets/SCENE by default. A single one
     is drawn if it is not there."""
-    start: str | None = None
+    init_from: str | None = None
     """Begin with the weights and statistics of a shipped model, by name, or of a checkpoint
     folder."""
     reference: Literal["rk4"] | None = None
@@ -73,7 +73,9 @@ class Train(DeviceCommand):
 
     def begin(self, scene: Scene) -> NeRD | None:
         """The model to start from, where there is one."""
-        return None if self.start is None else from_pretrained(self.start, scene)
+        return (
+            None if self.init_from is None else from_pretrained(self.init_from, scene)
+        )
 
     def plan(self) -> list[str]:
         """What would be trained on what, and what is there."""

@@ -69,7 +69,7 @@ class FineTuner:
         self.model, self.keep = copy.deepcopy(model), keep
         self.model.flight = None  # measured bodies fall as they do, not as the scene's
         self.view = TossView(model.scene, tosses, config, model.device)
-        states = STATES if config.update == "physics" else config.length + 1
+        states = STATES if config.update == "physics" else config.sequence_length + 1
         self.starts = self.view.starts(states, train)
         self.checks = self.view.starts(STATES, validation)[::VALIDATION_STRIDE]
         for name, found in (("training", self.starts), ("validation", self.checks)):
@@ -112,7 +112,7 @@ class FineTuner:
     @property
     def updates_per_epoch(self) -> int:
         """Updates that show every window once."""
-        return -(-len(self.starts) // self.config.rows)
+        return -(-len(self.starts) // self.config.batch_size)
 
     def run(self) -> NeRD:
         """Train until the epochs are over or validation stands still."""
@@ -158,9 +158,13 @@ class FineTuner:
             for update in range(1, total + 1):
                 if len(order) == 0:
                     order = torch.randperm(len(self.starts), generator=generator)
-                pick, order = order[: config.rows], order[config.rows :]
+                pick, order = order[: config.batch_size], order[config.batch_size :]
                 is_short = update <= config.short_history_fraction * total
-                length = max(1, config.length // 2) if is_short else config.length
+                length = (
+                    max(1, config.sequence_length // 2)
+                    if is_short
+                    else config.sequence_length
+                )
                 rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
                 for group, peak in zip(
                     self.optimizer.param_groups, self.peaks, strict=True

@@ -85,10 +85,10 @@ class Trainer:
         self.horizons, self.random_actions = horizons, random_actions
         self.quiet = quiet or ranks.rank() > 0
         ranks.expect_shares(
-            rows=config.rows, rollout_batch_size=config.rollout_batch_size
+            batch_size=config.batch_size, rollout_batch_size=config.rollout_batch_size
         )
         longest = max(
-            config.length, config.rollout_length if config.rollout_steps else 1
+            config.sequence_length, config.rollout_length if config.rollout_steps else 1
         )
         if data.batch_size[1] < longest:
             raise ValueError(
@@ -101,8 +101,6 @@ class Trainer:
             model = self.make_model(data, symmetry)
         else:
             model = begin_from(start, scene, config.network, symmetry)
-        if config.flies:
-            model.fly()
         self.start = None if start is None else fingerprint(start)
         self.sequences = Sequences(model, data, self.device, symmetry)
         self.model, self.resting = model.to(self.device), resting(self.sequences.data)
@@ -211,7 +209,7 @@ class Trainer:
         history, make a batch of the same size tell more.
         """
         config = self.config
-        rows, length = config.rows, config.length
+        rows, length = config.batch_size, config.sequence_length
         if torch.rand((), generator=generator) < config.single_step_fraction:
             rows, length = rows * length, 1
         return self.sequences.one_step(rows, length, generator)
