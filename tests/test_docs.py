@@ -51,7 +51,6 @@ BUDGETS = {
     "transfer": "--episodes 2 --quiet",
     "play": "--steps 3 --draw drawing --quiet",
     "plot": "--rows 2 --steps 3",
-    "explain": "--rows 64 --no-timing",
     "bench": "--batches 1 --rows 2 --rounds 1 --steps 2 --no-compile --quiet",
     "stability": "--cases batching --quiet",
     "doctor": "--quiet",

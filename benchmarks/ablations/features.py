@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from torchrl_nerd.evaluation.explain.paper_input import BaseFrame, PaperInput
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate, wrap_angle
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
@@ -14,6 +13,8 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import ContactFeatures
+
+from .paper_input import BaseFrame, PaperInput
 
 WORLD_POSE = 9  # position, and two columns of the rotation, in place of gravity
 

@@ -1,4 +1,4 @@
-"""Which coordinates the dynamics do not depend on, found by asking the true solver.
+"""Which coordinates the dynamics do not depend on, found by stepping MuJoCo.
 
 The same random states are stepped as they are and with one coordinate moved. Where the
 change of state comes out the same, the coordinate is a symmetry of the robot: it need not
@@ -29,7 +29,7 @@ Move = Callable[[mujoco.MjData, np.random.Generator], None]
 
 @dataclass(frozen=True)
 class Effect:
-    """How much one coordinate matters to the true solver.
+    """How much a step of MuJoCo depends on one coordinate.
 
     | field | meaning |
     |---|---|
@@ -68,7 +68,7 @@ class Symmetries:
 
 @dataclass(frozen=True)
 class SolverReport:
-    """What the true solver says about a scene; its text by ``print``.
+    """What MuJoCo says about a scene; its text by ``print``.
 
     | field | meaning |
     |---|---|
@@ -76,30 +76,32 @@ class SolverReport:
     | ``effects`` | of every hinge and slide, and of a floating base's pose |
     | ``points_found`` | contact points of the robot's shapes |
     | ``points_merged`` | of these, how many always coincide with another one |
-    | ``points_still`` | of these, how many no joint can move |
+    | ``points_fixed`` | of these, how many no joint can move |
     """
 
     scene: str
     effects: tuple[Effect, ...]
     points_found: int
     points_merged: int
-    points_still: int
+    points_fixed: int
 
     @property
     def points_kept(self) -> int:
         """Contact points that have features."""
-        return self.points_found - self.points_merged - self.points_still
+        return self.points_found - self.points_merged - self.points_fixed
 
     def __str__(self) -> str:
-        title = "moved in the true solver"
-        lines = [f"{title:<30}{'change of step':>16}  verdict"]
+        lines = [f"{'coordinate moved':<30}{'change of step':>16}  feature"]
         for effect in self.effects:
-            verdict = "dropped" if effect.is_ignored else "kept"
+            verdict = "kept"
+            if effect.is_ignored:
+                verdict = "dropped: the step does not depend on it"
             what = f"{effect.name} {effect.key}[{effect.address}]"
             lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
         lines.append(
-            f"contact points: {self.points_found} found, {self.points_merged} merged, "
-            f"{self.points_still} that no joint moves dropped, {self.points_kept} kept"
+            f"contact points: {self.points_found} found, {self.points_merged} merged "
+            f"with one at the same place, {self.points_fixed} dropped since no joint "
+            f"moves them, {self.points_kept} kept"
         )
         return "\n".join(lines)
 
@@ -107,8 +109,8 @@ class SolverReport:
 def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
     """Perturb every hinge and slide of a compiled model and compare one control step.
 
-    One coordinate is moved and nothing else, so that only true invariances pass; the
-    ground stays where it is.
+    One coordinate is moved and nothing else, so that only invariances of the
+    dynamics pass; the ground stays where it is.
     """
     free = _without(model, mujoco.mjtDisableBit.mjDSBL_LIMIT)
     rng = np.random.default_rng(0)
@@ -131,7 +133,7 @@ def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
 def base_effects(
     model: mujoco.MjModel, base: Base, substeps: int
 ) -> tuple[Effect, ...]:
-    """Effect of where a floating base stands and faces, by its own axes' step.
+    """Effect of a floating base's position and heading, measured in its own frame.
 
     Without contact: distances and normals, features of their own, carry the ground.
     Empty for a fixed base.
@@ -190,7 +192,7 @@ def _largest_change(
     With a floating ``base``, its linear velocity is seen from the base and no force
     drives it; without one, every dof is driven.
     """
-    largest, sound = 0.0, 0
+    largest, num_valid = 0.0, 0
     for _ in range(TRIALS):
         data = mujoco.MjData(model)
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
@@ -209,11 +211,11 @@ def _largest_change(
                 _change(model, d, substeps, base) for d in (data, moved)
             )
         if data.warning.number.any() or moved.warning.number.any():
-            continue  # states that MuJoCo gave up on say nothing
-        sound += 1
+            continue  # MuJoCo reset the state: nothing to compare
+        num_valid += 1
         size += abs(change).max()
         largest = max(largest, float(abs(change - moved_change).max() / size))
-    return largest if sound else 1.0
+    return largest if num_valid else 1.0
 
 
 def _change(

@@ -215,19 +215,19 @@ class Scene:
         return find_symmetries(self.model, self.substeps)
 
     def explain(self) -> SolverReport:
-        """Which coordinates and contact points are kept, asked of the true solver.
+        """Which coordinates and contact points are kept, found by stepping MuJoCo.
 
-        `torchrl_nerd.evaluation.explain.explain` adds features, proofs and timing.
+        `torchrl_nerd.evaluation.explain.explain` adds features and what else is left out.
         """
         base = base_effects(self.model, self.base, self.substeps)
         stands_for = self.contacts.stands_for
-        still = stands_for.count(-1)
+        fixed = stands_for.count(-1)
         return SolverReport(
             scene=self.name,
             effects=base + self.symmetries.effects,
             points_found=len(stands_for),
-            points_merged=len(stands_for) - still - len(self.contacts),
-            points_still=still,
+            points_merged=len(stands_for) - fixed - len(self.contacts),
+            points_fixed=fixed,
         )
 
     def foreseeing(self, forces: bool, free_motion: bool = False) -> "Scene":

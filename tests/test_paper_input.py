@@ -6,10 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from helpers import every_scene
+from ablations import paper_input as paper
+from helpers import every_scene, random_transitions
 
-from torchrl_nerd.evaluation.explain import paper_input as paper
-from torchrl_nerd.evaluation.explain.states import draw_states
 from torchrl_nerd.geometry.manifold import FREE
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import load_scene
@@ -70,7 +69,7 @@ def seen_by_mujoco(scene, row):
 
 @every_scene
 def test_the_papers_input_is_what_mujoco_sees(scene, generator):
-    states = draw_states(scene, ROWS, generator)
+    states = random_transitions(scene, ROWS, generator)
     module, ground = paper.PaperInput(scene), states.get(TERRAIN, None)
     inputs = states[QPOS], states[QVEL], states[JOINT_TORQUE], ground
     pieces = module.pieces(*inputs)
@@ -86,7 +85,7 @@ def test_the_papers_input_is_what_mujoco_sees(scene, generator):
 
 @every_scene
 def test_torques_stand_at_their_joints_and_passive_ones_are_zero(scene, generator):
-    states, module = draw_states(scene, ROWS, generator), paper.PaperInput(scene)
+    states, module = random_transitions(scene, ROWS, generator), paper.PaperInput(scene)
     inputs = states[QPOS], states[QVEL], states[JOINT_TORQUE], states.get(TERRAIN, None)
     nothing = torch.zeros(len(states), 0).double()  # of a body without joints
     torque = module.pieces(*inputs).get(paper.TORQUES, nothing)

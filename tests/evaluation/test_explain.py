@@ -1,0 +1,62 @@
+"""The report of a scene, and its text."""
+
+import mujoco
+import pytest
+from helpers import every_scene, make_scene
+
+from torchrl_nerd.evaluation.explain import explain
+from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.robots import load_scene
+
+CROSSED = """
+<mujoco><worldbody><body name="upper"><joint axis="0 1 0"/><geom size="0.1"/>
+  <body name="middle" pos="0.5 0 0"><joint axis="0 1 0"/>
+    <geom size="0.1" contype="0" conaffinity="0"/>
+    <body name="lower" pos="0.5 0 0"><joint axis="0 1 0"/><geom size="0.1"/></body>
+  </body></body></worldbody></mujoco>"""
+
+
+@every_scene
+def test_the_report_adds_up_and_its_text_names_all(scene):
+    report, text = explain(scene), str(explain(scene))
+    assert report.token_width == SceneTokens(scene).size
+    assert text.startswith(f"{scene.name}: {report.token_width} features a step")
+    assert all(feature.key in text for feature in report.features)
+    assert all(body in text for body in report.contact_bodies)
+    assert len(report.contact_bodies) == report.solver.points_kept
+    assert type(scene.controller).__name__ in text
+    assert ("none that the robot can touch" in text) == (scene.terrain is None)
+
+
+@pytest.mark.parametrize(
+    ("name", "can"),
+    [
+        ("cartpole", {"unconstrained": True, "penalty-contact": False}),
+        ("ant", {"unconstrained": False, "penalty-contact": True}),
+        ("dm_control/cheetah-run", {"unconstrained": False, "penalty-contact": False}),
+    ],
+)
+def test_analytic_steps_are_supported_or_say_why_not(name, can):
+    report = explain(load_scene(name))
+    found = report.analytic_steps
+    assert {step: reason is None for step, reason in found.items()} == can
+    for reason in found.values():
+        assert reason is None or (name in reason and reason in str(report))
+
+
+def test_self_contacts_are_those_that_mujoco_finds():
+    scene = make_scene(CROSSED)
+    assert explain(scene).self_contacts == (("lower", "upper"),)
+    assert "self-contacts: 1 pairs of bodies" in str(explain(scene))
+    data = mujoco.MjData(scene.model)
+    data.qpos[1:] = 2.0944, 2.0944  # rad: the three bodies at a triangle's corners
+    data.qpos[1] = 3.14159  # folded: lower lies in upper
+    mujoco.mj_forward(scene.model, data)
+    assert data.ncon == 1
+    assert "self-contacts: none" in str(explain(load_scene("cartpole")))
+
+
+def test_merged_and_fixed_contact_points_are_counted():
+    solver = explain(load_scene("double_pendulum")).solver
+    assert (solver.points_found, solver.points_merged, solver.points_fixed) == (4, 1, 1)
+    assert "4 found, 1 merged" in str(solver)

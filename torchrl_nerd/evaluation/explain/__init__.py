@@ -1,1 +1,0 @@
-"""What a scene's network sees, what the paper's saw, and proofs that nothing is missing."""
