@@ -28,7 +28,8 @@ from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import load_scene, source_of
-from torchrl_nerd.training.trainer import Trainer, adamw, split_parameters
+from torchrl_nerd.training.optimizers import make_adamw, split_parameters
+from torchrl_nerd.training.trainer import Trainer
 
 COEFFICIENTS = (
     3.4445,
@@ -120,23 +121,11 @@ class GramTrainer(Trainer):
         matrices, others = split_parameters(self.model.network)
         return {
             "muon": GramMuon(matrices, self.config.lr),
-            "adamw": adamw(others, self.config.adamw_lr),
+            "adamw": make_adamw(others, self.config.adamw_lr),
         }
 
 
-class TorchTrainer(Trainer):
-    """A trainer whose matrices are updated by `torch.optim.Muon`."""
-
-    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """See `Trainer.make_optimizers`."""
-        matrices, others = split_parameters(self.model.network)
-        muon = torch.optim.Muon(
-            matrices, self.config.lr, weight_decay=0.0, adjust_lr_fn="original"
-        )
-        return {"muon": muon, "adamw": adamw(others, self.config.adamw_lr)}
-
-
-TRAINERS = {"float32": GramTrainer, "torch": TorchTrainer}
+TRAINERS = {"float32": GramTrainer, "torch": Trainer}
 
 
 def train(options: Options, name: str, network: str, seed: int) -> dict[str, Any]:

@@ -99,6 +99,12 @@ class TrainConfig:
         """Updates of both kinds."""
         return self.steps + self.rollout_steps
 
+    @property
+    def longest(self) -> int:
+        """Control steps that a trajectory of the data must have."""
+        rollout = self.rollout_length if self.rollout_steps else 1
+        return max(self.sequence_length, rollout)
+
 
 @dataclass(frozen=True)
 class FinetuneConfig:

@@ -10,8 +10,9 @@ from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training.optimizers import make_adamw
 from torchrl_nerd.training.sequences import Symmetry
-from torchrl_nerd.training.trainer import Trainer, adamw
+from torchrl_nerd.training.trainer import Trainer
 
 from .variants import Variant
 
@@ -70,7 +71,7 @@ class VariantTrainer(Trainer):
         if self.variant.has_muon:
             return super().make_optimizers()
         weights = list(self.model.network.parameters())
-        return {"adamw": adamw(weights, self.config.adamw_lr)}
+        return {"adamw": make_adamw(weights, self.config.adamw_lr)}
 
     def validate(self) -> dict[str, float]:
         """Nothing: no choice hangs on it."""

@@ -39,7 +39,7 @@ KILLS = {
     "Trainer.update": (1, 7, 15, 20),
     "Trainer.validate": (2,),
     "save_checkpoint": (2, 4, 7),
-    "write_tensors": (1, 2, 4),
+    "RunState.save": (1, 2, 4),
     "write_json": (1, 2, 5),
 }
 """Function of the module -> calls at whose beginning the process is killed."""
@@ -90,7 +90,7 @@ def make_trainer(folder: Path, start: NeRD | None = None) -> Trainer:
     scene = load_scene(SCENE)
     data = simulate(scene, 60, 10, Generator().manual_seed(1))
     task, how = make_task(TASK), {"horizons": (2, 4), "quiet": True}
-    return Trainer(scene, data, task, CONFIG, folder, start=start, **how)
+    return Trainer(scene, data, task, CONFIG, folder, init_from=start, **how)
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_a_run_with_a_start_goes_on_to_the_same_bits(tmp_path, generator):
     assert_same_bits(tmp_path / "stopped", tmp_path / "whole")
     other = random_model(load_scene(SCENE), generator, CONFIG.network)
     for another in (other, None):
-        with pytest.raises(ValueError, match="stopped holds a run with start"):
+        with pytest.raises(ValueError, match="stopped holds a run with init_from"):
             make_trainer(tmp_path / "stopped", another)
 
 

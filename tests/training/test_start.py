@@ -21,7 +21,7 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.robots import SCENES, load_scene
-from torchrl_nerd.training import trainer
+from torchrl_nerd.training import validation
 from torchrl_nerd.training.sequences import Symmetry, cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
 from torchrl_nerd.training.trainer import Trainer
@@ -64,7 +64,7 @@ def test_without_an_update_nothing_is_other_than_at_the_start(
     start, drive = random_model(scene, generator), random_drive(scene, 4, 6, generator)
     before = fingerprint(start)
     trainer = Trainer(
-        scene, little_data(scene), scene, CONFIG, tmp_path, **HOW, start=start
+        scene, little_data(scene), scene, CONFIG, tmp_path, **HOW, init_from=start
     )
     begun = trainer.averaged_model()
     assert torch.equal(path(begun, drive), path(start, drive))
@@ -76,7 +76,9 @@ def test_statistics_are_frozen_and_bounds_do_not_shrink(
 ):
     start = random_model(scene, generator)
     data = other_data(scene, seed)
-    trained = Trainer(scene, data, scene, CONFIG, tmp_path, **HOW, start=start).run()
+    trained = Trainer(
+        scene, data, scene, CONFIG, tmp_path, **HOW, init_from=start
+    ).run()
     old, new = start.state_dict(), load_checkpoint(tmp_path / "last").state_dict()
     assert all(torch.equal(new[k], v) for k, v in trained.state_dict().items())
     for key, value in old.items():
@@ -93,7 +95,7 @@ def test_statistics_are_frozen_and_bounds_do_not_shrink(
     cover(own, data)
     assert torch.equal(new["coverage.center"], own.coverage.center)
     card = read_json(tmp_path / "last" / "card.json")
-    assert card["training"]["start"] == fingerprint(start)
+    assert card["training"]["init_from"] == fingerprint(start)
 
 
 @pytest.mark.parametrize("name", [n for n in SCENES if load_scene(n).foresees_forces])
@@ -177,7 +179,7 @@ ARGS += ["--rollout-length", "2", "--validate-every", "4"]
 
 def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(trainer, "VALIDATION_ROWS", 2)
+    monkeypatch.setattr(validation, "ROLLOUTS", 2)
     for out, seed in (("a", "1"), ("b", "2")):
         sizes = ["--trajectories", "9", "--steps", "110", "--seed", seed, "--quiet"]
         assert main(["data", "cartpole", "--out", out, *sizes]) == 0
@@ -187,7 +189,7 @@ def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
     assert main(argv) == main(argv) == 0
     training = read_json(tmp_path / "on" / "last" / "card.json")["training"]
     assert training["trajectories"] == 18
-    assert training["start"] == fingerprint(from_pretrained("cartpole"))
+    assert training["init_from"] == fingerprint(from_pretrained("cartpole"))
     assert main([*ARGS, "--data", "a", "--init-from", "on/last", "--dry-run"]) == 0
     capsys.readouterr()
     for options, words in (
@@ -201,7 +203,10 @@ def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
             "start from, mlp-micro, got",
         ),
         (["--data", "a", "none"], "expected a data set in none"),
-        (["--data", "a", "--init-from", "on/last", "--out", "on"], "run with start"),
+        (
+            ["--data", "a", "--init-from", "on/last", "--out", "on"],
+            "run with init_from",
+        ),
     ):
         assert main([*ARGS, "--out", "new", *options]) == 2
         said = capsys.readouterr().err

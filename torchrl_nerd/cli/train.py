@@ -120,7 +120,7 @@ class Train(DeviceCommand):
             random_actions=bool(protocol.random_actions),
             quiet=self.quiet,
             logger=self.logger,
-            start=start,
+            init_from=start,
         )
         trainer.run()
         made = out / preset.exports

@@ -1,85 +1,63 @@
-"""Weights, their averages and what optimisers stack_frames, as tensors by name."""
+"""State of a training run as tensors by name: weights, their averages, optimizers."""
 
-from torch import Tensor, nn, tensor
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
-REMEMBERED = {"muon": ("momentum",), "adamw": ("exp_avg", "exp_avg_sq")}
-"""What an optimiser remembers of a weight, of the weight's shape."""
+from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
-Average = dict[str, Tensor]
-Optimizers = dict[str, Optimizer]
+STATE = "state.safetensors"
 
 
-def pack(
-    network: nn.Module, average: Average, optimizers: Optimizers
-) -> dict[str, Tensor]:
-    """All of it, for one file.
+class RunState:
+    """The tensors of a run, saved to one file and restored in place.
 
     Args:
-        network: what is trained.
-        average: of its weights, by their names.
-        optimizers: by names of `REMEMBERED`.
+        network: that is trained.
+        average: of its weights, by name.
+        optimizers: by name, their states allocated.
     """
-    tensors = _weights(network, average)
-    for name, optimizer in optimizers.items():
-        for index, state in optimizer.state_dict()["state"].items():
-            tensors |= {f"{name}.{index}.{k}": v for k, v in state.items()}
-    return tensors
 
+    def __init__(
+        self,
+        network: nn.Module,
+        average: Mapping[str, Tensor],
+        optimizers: Mapping[str, Optimizer],
+    ) -> None:
+        self.network, self.average, self.optimizers = network, average, optimizers
 
-def like_packed(
-    found: dict[str, Tensor],
-    network: nn.Module,
-    average: Average,
-    optimizers: Optimizers,
-) -> dict[str, Tensor]:
-    """Tensors like those that `pack` gives once weights of these names were updated.
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors themselves, not copies, by name."""
+        found = {f"model.{k}": v for k, v in self.network.state_dict().items()}
+        found |= {f"average.{k}": v for k, v in self.average.items()}
+        for name, optimizer in self.optimizers.items():
+            for index, state in optimizer.state_dict()["state"].items():
+                found |= {f"{name}.{index}.{k}": v for k, v in state.items()}
+        return found
 
-    Args:
-        found: names tell which weights an optimiser has seen.
-        network: what is trained, as in `pack`.
-        average: of its weights.
-        optimizers: its own.
-    """
-    expected = _weights(network, average)
-    for name, optimizer in optimizers.items():
-        groups = optimizer.param_groups
-        parameters = [weight for group in groups for weight in group["params"]]
-        seen = {key.split(".")[0] for key in _with_prefix(found, f"{name}.")}
-        for index, weight in enumerate(parameters):
-            if str(index) in seen:
-                kinds = REMEMBERED[name]
-                expected |= {f"{name}.{index}.{kind}": weight for kind in kinds}
-                if name == "adamw":
-                    expected[f"{name}.{index}.step"] = tensor(0.0)
-    return expected
+    def save(self, folder: Path, step: int, best: float) -> None:
+        """Write all tensors with the update's number and the best validation error."""
+        numbers = {"step": torch.tensor(step)}
+        numbers["best"] = torch.tensor(best, dtype=torch.float64)
+        write_tensors(folder / STATE, {**self.tensors(), **numbers})
 
+    def restore(self, folder: Path) -> tuple[int, float]:
+        """Restore what `save` wrote; returns the number of the update and the best error.
 
-def unpack(
-    tensors: dict[str, Tensor],
-    network: nn.Module,
-    average: Average,
-    optimizers: Optimizers,
-) -> None:
-    """Put back what `pack` gave; other names are passed over."""
-    network.load_state_dict(_with_prefix(tensors, "model."))
-    for name, value in _with_prefix(tensors, "average.").items():
-        average[name].copy_(value)
-    for name, optimizer in optimizers.items():
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in _with_prefix(tensors, f"{name}.").items():
-            index, entry = key.split(".", 1)
-            state.setdefault(int(index), {})[entry] = value
-        groups = optimizer.state_dict()["param_groups"]
-        optimizer.load_state_dict({"state": state, "param_groups": groups})
-
-
-def _weights(network: nn.Module, average: Average) -> dict[str, Tensor]:
-    tensors = {f"model.{k}": v for k, v in network.state_dict().items()}
-    return tensors | {f"average.{k}": v for k, v in average.items()}
-
-
-def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {
-        k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)
-    }
+        Raises:
+            ValueError: in one sentence, a file that does not fit this run.
+        """
+        path = folder / STATE
+        found, own = read_tensors(path), self.tensors()
+        best = found.pop("best", torch.tensor([]))  # infinite before any validation
+        expected = {**own, "step": torch.tensor(0)}
+        expect_fit(found, expected, f"tensors in {path}", "this run")
+        if best.shape or best.dtype != torch.float64 or best.isnan():
+            raise ValueError(f"expected the best error in {path}, got {best}")
+        with torch.no_grad():
+            for name, tensor in own.items():
+                tensor.copy_(found[name])
+        return int(found["step"]), float(best)

@@ -1,4 +1,4 @@
-"""Training of a NeRD: sequences gathered on the device, resumable to the bit."""
+"""Training of a NeRD: one-step targets, then rollouts; a killed run resumes bit for bit."""
 
 import copy
 import time
@@ -14,55 +14,56 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
-from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.loggers import LoggerName, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
-from torchrl_nerd.training.muon import Muon
+from torchrl_nerd.training.optimizers import (
+    allocate_state,
+    learning_rate_ratio,
+    make_adamw,
+    make_muon,
+    split_parameters,
+)
 from torchrl_nerd.training.rest import find_rest, resting
-from torchrl_nerd.training.run_state import like_packed, pack, unpack
+from torchrl_nerd.training.run_state import RunState
 from torchrl_nerd.training.sequences import Sequences, Symmetry, cover
 from torchrl_nerd.training.start import begin_from, fingerprint, fresh_model
+from torchrl_nerd.training.validation import Errors, Validation, for_card, metrics
 
-STATE = "state.json"  # of a run that can go on
-VALIDATION_SEED = 1_000_003
-VALIDATION_ROWS = 256
+STATE = "state.json"  # card of a run that can be resumed
 
 
 class Trainer:
-    """Trains a model on one data set; `run` goes on from where the folder stopped.
+    """Trains a model on one data set; `run` continues where the folder's run stopped.
 
-    Under `torchrun` every rank does its share of each batch, see `training.ranks`.
+    Under `torchrun` every rank computes its share of each batch, see `training.ranks`.
 
-    The folder holds ``last`` and ``best`` checkpoints (averaged weights), ``state`` (all
-    that a resumed run needs for the same bits) and ``log.csv``; `open_logger` says where
-    figures go besides.
+    The folder holds checkpoints ``last`` and ``best`` (averaged weights), the ``state`` of
+    the run and ``log.csv``; `open_logger` says where metrics go besides.
 
     Args:
         scene: the robot.
-        data: from `load_data`.
-        source: a task or the scene; its resets or ranges start the validation rollouts.
-        config: how.
-        folder: where.
+        data: transitions ``[trajectories, steps]``, from `load_data`.
+        source: task or scene whose resets or ranges start the validation rollouts.
+        config: how to train.
+        folder: of the run.
         device: of model and data; CUDA multiplies matrices in bfloat16.
         horizons: control steps of the validation rollouts.
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
-        logger: ``tensorboard``, ``wandb``, ``mlflow``, or ``csv`` for the table alone.
-        start: a model to begin with, see `begin_from`; bounds are those of its data and
-            these, trust and rest of these alone.
+        logger: ``tensorboard``, ``wandb``, ``mlflow``, or ``csv`` for ``log.csv`` alone.
+        init_from: a model whose weights and statistics the training continues, see
+            `begin_from`. The training range covers its data and these.
 
     Raises:
         ValueError: the folder cannot be written or holds a run of another configuration,
-            or a start that does not fit.
+            trajectories are too short, or ``init_from`` does not fit.
     """
 
     def __init__(
@@ -77,89 +78,91 @@ class Trainer:
         random_actions: bool = False,
         quiet: bool = False,
         logger: LoggerName = "tensorboard",
-        start: NeRD | None = None,
+        init_from: NeRD | None = None,
     ) -> None:
-        self.logger: LoggerName = logger
-        self.scene, self.source, self.config = scene, source, config
-        self.folder, self.device = writable_folder(folder), torch.device(device)
-        self.horizons, self.random_actions = horizons, random_actions
-        self.quiet = quiet or ranks.rank() > 0
         ranks.expect_shares(
             batch_size=config.batch_size, rollout_batch_size=config.rollout_batch_size
         )
-        longest = max(
-            config.sequence_length, config.rollout_length if config.rollout_steps else 1
-        )
-        if data.batch_size[1] < longest:
+        if data.batch_size[1] < config.longest:
             raise ValueError(
-                f"expected trajectories of at least {longest} steps, "
+                f"expected trajectories of at least {config.longest} steps, "
                 f"got {data.batch_size[1]}"
             )
+        self.scene, self.source, self.config = scene, source, config
+        self.folder, self.device = writable_folder(folder), torch.device(device)
+        self.validation = Validation(source, horizons, random_actions)
+        self.quiet = quiet or ranks.rank() > 0
+        self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
-        symmetry = Symmetry.of(scene, data) if config.use_symmetry else None
-        if start is None:
+        self._build(data, init_from)
+        self.optimizers = self.make_optimizers()
+        for optimizer in self.optimizers.values():
+            allocate_state(optimizer)
+        weights = dict(self.model.network.named_parameters())
+        self.average = {name: w.detach().clone() for name, w in weights.items()}
+        self.state = RunState(self.model.network, self.average, self.optimizers)
+        self.step, self.seconds, self.best = 0, 0.0, float("inf")
+        self.errors: Errors = {}  # of the last validation
+        if (self.folder / STATE).exists():
+            self._resume()
+
+    def _build(self, data: TensorDict, init_from: NeRD | None) -> None:
+        """The model, its statistics and its batches."""
+        symmetry = Symmetry.of(self.scene, data) if self.config.use_symmetry else None
+        if init_from is None:
             model = self.make_model(data, symmetry)
         else:
-            model = begin_from(start, scene, config.network, symmetry)
-        self.start = None if start is None else fingerprint(start)
+            model = begin_from(init_from, self.scene, self.config.network, symmetry)
+        self.init_from = None if init_from is None else fingerprint(init_from)
         self.sequences = Sequences(model, data, self.device, symmetry)
         self.model, self.resting = model.to(self.device), resting(self.sequences.data)
         samples = self.sequences.tokens, self.sequences.targets
         cover(self.model, self.sequences.data, samples)
-        if start is not None:
-            self.model.coverage.widen(start.coverage)
-        self.optimizers = self.make_optimizers()
-        self.peaks = {"muon": config.lr, "adamw": config.adamw_lr}
-        weights = dict(self.model.network.named_parameters())
-        self.average = {name: w.detach().clone() for name, w in weights.items()}
-        self.step, self.seconds, self.best = 0, 0.0, float("inf")
-        self.errors: dict[int, dict[str, ErrorSummary]] = {}  # of the last validation
-        if (self.folder / STATE).exists():
-            self._resume()
+        if init_from is not None:
+            self.model.coverage.widen(init_from.coverage)
 
     def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
-        """What is trained, where there is no start: the configured network, fresh."""
+        """The configured model with fresh weights."""
         return fresh_model(self.scene, data, self.config.network, symmetry)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Muon for the weights of linear layers, AdamW for everything else."""
+        """Muon for the weights of linear layers, AdamW for all others."""
         matrices, others = split_parameters(self.model.network)
         return {
-            "muon": Muon(matrices, lr=self.config.lr),
-            "adamw": adamw(others, self.config.adamw_lr),
+            "muon": make_muon(matrices, self.config.lr),
+            "adamw": make_adamw(others, self.config.adamw_lr),
         }
 
     def run(self, until: int | None = None) -> NeRD:
         """Train to the end, or to update ``until``; returns the averaged model."""
         last = min(until or self.config.total_steps, self.config.total_steps)
-        bar = tqdm(
+        log = self._open_log() if ranks.rank() == 0 else None
+        began = time.monotonic() - self.seconds
+        with tqdm(
             total=self.config.total_steps,
             initial=self.step,
             desc=f"train {self.scene.name}",
             disable=self.quiet,
-        )
-        is_first = ranks.rank() == 0
-        log = self._open_log() if is_first else None
-        began = time.monotonic() - self.seconds
-        loss = torch.zeros(())
-        while self.step < last:
-            loss = self.update()
-            self.step += 1
-            self.errors = {}
-            is_last = self.step == self.config.total_steps
-            if log and (self.step % self.config.validate_every == 0 or is_last):
-                figures = self.validate()
-                log.write({"step": self.step, "loss": float(loss), **figures})
-                bar.set_postfix({k: f"{v:.2g}" for k, v in figures.items()})
-            if log and (self.step % self.config.save_every == 0 or is_last):
-                self.seconds = time.monotonic() - began
-                self.save()
-            bar.update()
-        bar.close()
-        if log:
+        ) as bar:
+            while self.step < last:
+                loss = self.update()
+                self.step += 1
+                self.errors = {}
+                if log is not None and self._is_due(self.config.validate_every):
+                    found = self.validate()
+                    log.write({"step": self.step, "loss": float(loss), **found})
+                    bar.set_postfix({k: f"{v:.2g}" for k, v in found.items()})
+                if log is not None and self._is_due(self.config.save_every):
+                    self.seconds = time.monotonic() - began
+                    self.save()
+                bar.update()
+        if log is not None:
             log.close()
-        ranks.wait()  # for what the first one writes
+        ranks.wait()  # for the files that rank 0 writes
         return self.averaged_model()
+
+    def _is_due(self, every: int) -> bool:
+        return self.step % every == 0 or self.step == self.config.total_steps
 
     def _open_log(self) -> TrainingLog:
         settings = {"scene": self.scene.name, **asdict(self.config)}
@@ -167,62 +170,57 @@ class Trainer:
         return TrainingLog(self.folder, self.step, logger)
 
     def update(self) -> Tensor:
-        """One update and its loss, ``()``; the batch depends on seed and step alone."""
-        config = self.config
-        generator = fold_in(config.seed, self.step)
-        rate = self._rate()
-        for name, optimizer in self.optimizers.items():
-            for group in optimizer.param_groups:
-                group["lr"] = self.peaks[name] * rate
-            optimizer.zero_grad()
+        """One update; returns its loss ``()``. Seed and step alone decide the batch."""
+        generator = fold_in(self.config.seed, self.step)
+        self._set_learning_rates()
         self.model.train()
+        is_rollout = self.step >= self.config.steps
         with torch.enable_grad(), self._autocast():
-            if self.step < config.steps:
-                tokens, targets = map(ranks.share, self._batch(generator))
-                outputs = self.model.network(tokens).float()
-                loss = one_step_loss(outputs, targets, config.loss_eps)
-            else:
-                *states, terrain = self.sequences.rollout(
-                    config.rollout_batch_size, config.rollout_length, generator
-                )
-                qpos, qvel, torque = map(ranks.share, cast(list[Tensor], states))
-                ground = None if terrain is None else ranks.share(terrain)
-                mine = qpos, qvel, torque, ground
-                loss = rollout_loss(self.model, *mine, config.loss_eps)
+            loss = (self._rollout_loss if is_rollout else self._one_step_loss)(
+                generator
+            )
         loss.backward()
         parameters = list(self.model.network.parameters())
         loss = ranks.average_gradients(parameters, loss)
-        norm = nn.utils.clip_grad_norm_(parameters, config.clip)
+        norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
         if norm.isfinite():
             for optimizer in self.optimizers.values():
                 optimizer.step()
-        decay = min(config.ema, self.step / (self.step + 10.0))
-        with torch.no_grad():
-            for name, weight in self.model.network.named_parameters():
-                self.average[name].lerp_(weight, 1.0 - decay)
+        self._update_average()
         return loss
 
-    def _batch(self, generator: Generator) -> tuple[Tensor, Tensor]:
-        """Sequences, or as many states from all over the data.
+    def _set_learning_rates(self) -> None:
+        ratio = learning_rate_ratio(self.config, self.step)
+        peaks = {"muon": self.config.lr, "adamw": self.config.adamw_lr}
+        for name, optimizer in self.optimizers.items():
+            for group in optimizer.param_groups:
+                group["lr"] = peaks[name] * ratio
+            optimizer.zero_grad()
 
-        The steps of a sequence resemble each other: single states, each with an empty
-        history, make a batch of the same size tell more.
+    def _one_step_loss(self, generator: Generator) -> Tensor:
+        """Loss of a batch of sequences, or of as many single states from all trajectories.
+
+        Consecutive states are alike, so a batch of single states, each with an empty
+        history, is more diverse.
         """
         config = self.config
-        rows, length = config.batch_size, config.sequence_length
+        count, length = config.batch_size, config.sequence_length
         if torch.rand((), generator=generator) < config.single_step_fraction:
-            rows, length = rows * length, 1
-        return self.sequences.one_step(rows, length, generator)
+            count, length = count * length, 1
+        batch = self.sequences.one_step(count, length, generator)
+        tokens, targets = map(ranks.share, batch)
+        outputs = self.model.network(tokens).float()
+        return one_step_loss(outputs, targets, config.loss_eps)
 
-    def _rate(self) -> float:
-        """Share of the peak step size: up, then down to zero; rollouts in rounds."""
-        config, step = self.config, self.step
-        if step < config.steps:
-            return min(1.0, (step + 1) / max(config.warmup, 1)) * (
-                1 - step / config.steps
-            )
-        done = config.rollout_restarts * (step - config.steps) / config.rollout_steps
-        return config.rollout_lr_ratio * (1.0 - done % 1.0)
+    def _rollout_loss(self, generator: Generator) -> Tensor:
+        """Loss of the model's own rollouts."""
+        config = self.config
+        *states, terrain = self.sequences.rollout(
+            config.rollout_batch_size, config.rollout_length, generator
+        )
+        qpos, qvel, torque = map(ranks.share, cast(list[Tensor], states))
+        ground = None if terrain is None else ranks.share(terrain)
+        return rollout_loss(self.model, qpos, qvel, torque, ground, config.loss_eps)
 
     def _autocast(self) -> AbstractContextManager:
         is_coarse = self.step < self.config.bf16_fraction * self.config.steps
@@ -230,81 +228,56 @@ class Trainer:
             return torch.autocast(self.device.type, torch.bfloat16)
         return nullcontext()
 
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """Exponential moving average of the weights, over fewer updates at the start."""
+        decay = min(self.config.ema, self.step / (self.step + 10.0))
+        for name, weight in self.model.network.named_parameters():
+            self.average[name].lerp_(weight, 1.0 - decay)
+
     def averaged_model(self) -> NeRD:
-        """A copy of the model that holds the averaged weights, and knows rest."""
+        """A copy of the model with the averaged weights and its sleep threshold."""
         model = copy.deepcopy(self.model)
         model.network.load_state_dict(self.average)
         find_rest(model.eval(), self.resting)
         return model
 
     def validate(self) -> dict[str, float]:
-        """Mean open-loop error of the averaged model at every horizon.
-
-        The starts (their seed) are of no test: choices are made on them.
-        """
-        summaries = passive_errors(
-            self.source,
-            NeRDDynamics(self.averaged_model()),
-            MujocoDynamics(self.scene),
-            list(self.horizons),
-            rows=VALIDATION_ROWS,
-            seed=VALIDATION_SEED,
-            device=self.device,
-            random_actions=self.random_actions,
-        )
-        figures = {
-            f"{name}_{horizon}": summary.mean
-            for horizon, by_name in summaries.items()
-            for name, summary in by_name.items()
-        }
-        self.errors = summaries
-        score = sum(
-            v for k, v in figures.items() if k.endswith(f"_{self.horizons[-1]}")
-        )
+        """Mean errors of the averaged model; the best model so far is saved."""
+        self.errors = self.validation(self.averaged_model(), self.device)
+        score = self.validation.score(self.errors)
         is_best = score < self.best
-        if is_best:
-            self.best = score
-        # the first one is kept even if its rollouts blow up
+        self.best = score if is_best else self.best
+        # the first model is saved even if its rollouts diverge
         if is_best or not (self.folder / "best").exists():
-            self._save_model("best", summaries)
-        return figures
+            self._save_model("best")
+        return metrics(self.errors)
 
     def save(self) -> None:
-        """Everything a resumed run needs; the state's card is written last."""
-        self._save_model("last", self.errors)
-        tensors = pack(self.model.network, self.average, self.optimizers)
-        tensors["step"] = torch.tensor(self.step)
-        tensors["best"] = torch.tensor(self.best, dtype=torch.float64)
-        write_tensors(self.folder / "state.safetensors", tensors)
+        """Write all that a resumed run needs; the card is written last."""
+        self._save_model("last")
+        self.state.save(self.folder, self.step, self.best)
         write_json(self.folder / STATE, self._identity | {"seconds": self.seconds})
 
-    def _save_model(
-        self, name: str, errors: dict[int, dict[str, ErrorSummary]]
-    ) -> None:
-        curve = {
-            str(horizon): {k: asdict(v) for k, v in by_name.items()}
-            for horizon, by_name in errors.items()
-        }
+    def _save_model(self, name: str) -> None:
         training = {
-            "training": {
-                **asdict(self.config),
-                "steps_done": self.step,
-                "seconds": round(self.seconds, 1),
-                "device": str(self.device),
-                "threads": torch.get_num_threads(),
-                "trajectories": len(self.sequences.tokens),
-                "start": self.start,
-            },
-            "validation_error": curve,
+            **asdict(self.config),
+            "steps_done": self.step,
+            "seconds": round(self.seconds, 1),
+            "device": str(self.device),
+            "threads": torch.get_num_threads(),
+            "trajectories": len(self.sequences.tokens),
+            "init_from": self.init_from,
         }
+        about = {"training": training, "validation_error": for_card(self.errors)}
         model = self.averaged_model()
-        save_checkpoint(model, self.folder / name, make_card(model, training))
+        save_checkpoint(model, self.folder / name, make_card(model, about))
 
     @property
     def _identity(self) -> dict[str, Any]:
-        """What a run that goes on must have in common with the one that stopped."""
+        """What a resumed run must have in common with the one that stopped."""
         config, scene_hash = asdict(self.config), self.scene.hash
-        return {"config": config, "scene_hash": scene_hash, "start": self.start}
+        return {"config": config, "scene_hash": scene_hash, "init_from": self.init_from}
 
     def _resume(self) -> None:
         card = read_json(self.folder / STATE)
@@ -314,15 +287,7 @@ class Trainer:
                     f"{self.folder} holds a run with {key} {card.get(key)}, asked for "
                     f"{value}: choose another folder"
                 )
-        path = self.folder / "state.safetensors"
-        tensors = read_tensors(path)
-        best = tensors.pop("best", torch.tensor([]))  # infinite before any validation
-        parts = self.model.network, self.average, self.optimizers
-        expected = {**like_packed(tensors, *parts), "step": torch.tensor(0)}
-        expect_fit(tensors, expected, f"tensors in {path}", "this run")
-        if best.shape or best.dtype != torch.float64 or best.isnan():
-            raise ValueError(f"expected the best error in {path}, got {best}")
-        self.step, self.best = int(tensors["step"]), float(best)
+        self.step, self.best = self.state.restore(self.folder)
         seconds = card.get("seconds")
         if not 0 < self.step <= self.config.total_steps or type(seconds) is not float:
             raise ValueError(
@@ -330,18 +295,3 @@ class Trainer:
                 f"{self.step} and {seconds!r}"
             )
         self.seconds = seconds
-        unpack(tensors, *parts)
-
-
-def adamw(parameters: list[Tensor], lr: float) -> torch.optim.AdamW:
-    """AdamW as it is used here: a short memory of squares, no weight decay."""
-    return torch.optim.AdamW(parameters, lr=lr, betas=(0.9, 0.95), weight_decay=0.0)
-
-
-def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
-    """Weights ``(out, in)`` of linear layers, for Muon, and everything else."""
-    matrices, others = [], []
-    for name, weight in network.named_parameters():
-        is_matrix = weight.ndim == 2 and "offset_bias" not in name
-        (matrices if is_matrix else others).append(weight)
-    return matrices, others
