@@ -128,11 +128,13 @@ def test_the_scene_is_used_as_it_is_given(name, tmp_path, generator):
 
 def test_other_networks_are_refused(generator):
     start = random_model(CARTPOLE, generator, "mlp-4x64")
-    with pytest.raises(ValueError, match="network.*start from, mlp, got tiny"):
+    with pytest.raises(
+        ValueError, match="network.*start from, mlp-4x64, got transformer-2x64"
+    ):
         begin_from(start, CARTPOLE, "transformer-2x64")
     cube = load_scene("cube_real")
     residual = ResidualNeRD(cube, ResidualConfig())
-    with pytest.raises(ValueError, match="start from, ResidualConfig.*got mlp"):
+    with pytest.raises(ValueError, match="start from, ResidualConfig.*got mlp-4x64"):
         begin_from(residual, cube, "mlp-4x64")
 
 
@@ -200,7 +202,7 @@ def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
         (["--data", "a", "--init-from", "none"], "checkpoint folder, got 'none'"),
         (
             ["--data", "a", "--init-from", "cartpole-micro"],
-            "start from, mlp-micro, got",
+            "start from, mlp-1x16, got",
         ),
         (["--data", "a", "none"], "expected a data set in none"),
         (
