@@ -23,7 +23,7 @@ from torchrl_nerd.evaluation.rollout_error import action_drive, initial_states, 
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.flight import LEAST_GAP
-from torchrl_nerd.modules.free_step import FreeStep
+from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
 from torchrl_nerd.robots import Source, load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
 
@@ -85,7 +85,7 @@ def _of_case(
     torque = action_drive(source, rows, steps, options.seed, has_actions)
     terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL)
-    dynamics, free_step = MujocoDynamics(scene), FreeStep(scene)
+    dynamics, free_step = MujocoDynamics(scene), UnconstrainedStep(scene)
     before, counts = None, torch.zeros(2, dtype=torch.float64)
     for step in range(steps + 1):
         now = kinds(free_step, scene, state, terrain)
@@ -100,7 +100,7 @@ def _of_case(
 
 
 def kinds(
-    free_step: FreeStep, scene: Scene, state: TensorDictBase, terrain: Tensor | None
+    free_step: UnconstrainedStep, scene: Scene, state: TensorDictBase, terrain: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Which rows are clear of everything, and which are slow, ``(rows,)``."""
     gap = scene.clearances(state[QPOS], terrain)

@@ -27,7 +27,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.correction import FreeConfig
 from torchrl_nerd.modules.free import FreeNeRD
-from torchrl_nerd.modules.ground_step import GroundStep
+from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, STEPS
 from torchrl_nerd.robots import SCENES, load_scene, make_task
@@ -50,7 +50,7 @@ warp_too = pytest.mark.parametrize(
 
 
 def is_free(scene: Scene) -> bool:
-    """Whether nothing but a `FreeStep` moves the robot."""
+    """Whether nothing but a `UnconstrainedStep` moves the robot."""
     try:
         FreeNeRD(scene, FreeConfig())
     except ValueError:
@@ -59,9 +59,9 @@ def is_free(scene: Scene) -> bool:
 
 
 def is_grounded(scene: Scene, parts: int = 1) -> bool:
-    """Whether a `GroundStep` of so many parts can move the robot."""
+    """Whether a `PenaltyContactStep` of so many parts can move the robot."""
     try:
-        GroundStep(scene, parts=parts)
+        PenaltyContactStep(scene, parts=parts)
     except ValueError:
         return False
     return True

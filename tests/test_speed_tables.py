@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd.evaluation.bench.rates import Rate
 from torchrl_nerd.evaluation.bench.report import BenchReport
-from torchrl_nerd.modules.free_step import FreeStep
+from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
 from torchrl_nerd.robots import load_scene
 
 
@@ -61,7 +61,7 @@ def test_who_flies_and_who_rests(generator):
     state = TensorDict(scene.sample_initial(3, generator)[0], [3])
     state["qpos"][:, 2] = torch.tensor([5.0, 0.0, 0.0]).double()
     state["qvel"][2] = 0.0
-    clear, slow = early_exit.kinds(FreeStep(scene), scene, state, None)
+    clear, slow = early_exit.kinds(UnconstrainedStep(scene), scene, state, None)
     assert clear.tolist() == [True, False, False]
     assert slow.tolist() == [False, False, True]
 

@@ -1,34 +1,36 @@
 """Checkpoints: a folder with ``model.safetensors`` and ``card.json``; nothing is pickled.
 
-The card says which physics the weights were trained on. Loading compares it with the
-local scene and warns, in one sentence, of what differs.
+The card names the kind of the model (learned, hybrid or analytic), its network and step,
+and the physics that it was made for. Loading compares that with the local scene and warns,
+in one sentence, of what differs.
 """
 
 import os
 import platform
 import warnings
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import mujoco
 import torch
-from tensordict.utils import NestedKey
 
 from torchrl_nerd import __version__
-from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
-from torchrl_nerd.modules.correction import (
-    FreeConfig,
-    GroundedConfig,
-    ResidualConfig,
+from torchrl_nerd.analytic import make_step
+from torchrl_nerd.configs import (
+    FeatureConfig,
+    FreeBodyConfig,
+    PenaltyContactConfig,
+    StepConfig,
+    UnconstrainedConfig,
 )
-from torchrl_nerd.modules.free import FreeNeRD
-from torchrl_nerd.modules.grounded import GroundedNeRD
-from torchrl_nerd.modules.nerd import Config, NeRD
+from torchrl_nerd.dynamics import Model
+from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
+from torchrl_nerd.modules.gru import GRUConfig
+from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.modules.mlp import MLPConfig
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
-from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene, is_import
@@ -40,62 +42,50 @@ from torchrl_nerd.selfcheck import (
     warn_of_differences,
 )
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
-from torchrl_nerd.transforms import Stats
 
+FORMAT = 2
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
-LARGEST_SIZE = 2**14  # of any number in a network's configuration
-COVERAGE = "coverage."
-GAIN = {"coverage.gain"}
-REST = {"coverage.still", *GAIN}
-NEWEST = {"coverage.qpos_low", "coverage.qpos_high", *REST}
-KINDS: dict[str, type] = {
+MAX_SIZE = 2**14  # of any number in a network's configuration
+NETWORK_KINDS: dict[str, type] = {
     "transformer": TransformerConfig,
-    "mlp-4x64": MLPConfig,
+    "mlp": MLPConfig,
     "gru": GRUConfig,
-    "residual-mlp": ResidualConfig,
-    "free-mlp": FreeConfig,
-    "grounded-mlp": GroundedConfig,
 }
-CORRECTED: dict[type, type[NeRD]] = {
-    ResidualConfig: ResidualNeRD,
-    FreeConfig: FreeNeRD,
-    GroundedConfig: GroundedNeRD,
+STEP_KINDS: dict[str, type] = {
+    "unconstrained": UnconstrainedConfig,
+    "penalty-contact": PenaltyContactConfig,
+    "free-body": FreeBodyConfig,
 }
 
 
-def make_model(
-    scene: Scene,
-    config: Config,
-    stats: Mapping[NestedKey, Stats] | None = None,
-) -> NeRD:
-    """A model of that configuration whose weights are yet to be loaded or trained.
-
-    Raises:
-        ValueError: a robot that no model of that configuration is for.
-    """
-    return CORRECTED.get(type(config), NeRD)(scene, config, stats)
-
-
-def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, Any]:
+def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str, Any]:
     """What a checkpoint says of itself.
 
     Args:
         model: the weights' owner.
         training: how they were made: configuration, data, measured error curve.
     """
-    scene, config = model.scene, model.config
-    kind = next(name for name, cls in KINDS.items() if type(config) is cls)
-    return {
-        "format": 1,
+    scene = model.scene
+    card: dict[str, Any] = {
+        "format": FORMAT,
+        "kind": model.kind,
         "scene": scene.name,
         "scene_hash": scene.hash,
         "reference_ratio": scene.reference_ratio,
         "control_step": scene.control_step,
-        "foresees_forces": scene.foresees_forces,
-        "foresees_free_motion": scene.foresees_free_motion,
-        "flies": model.flight is not None,
-        "network": {"kind": kind, **asdict(cast(Any, config))},
+        "network": None,
+        "step": None,
+    }
+    step = model if not isinstance(model, NeRD) else None
+    if isinstance(model, NeRD):
+        card["network"] = _described(NETWORK_KINDS, model.config)
+        card["features"] = asdict(model.scene_features.config)
+    if isinstance(model, HybridNeRD):
+        step = model.analytic_step
+    if step is not None:
+        card["step"] = _described(STEP_KINDS, step.config)
+    return card | {
         "training_ranges": scene.sampling.ranges(),
         "versions": {
             "torchrl_nerd": __version__,
@@ -108,16 +98,17 @@ def make_card(model: NeRD, training: dict[str, Any] | None = None) -> dict[str, 
     }
 
 
-def save_checkpoint(model: NeRD, folder: Path, card: dict[str, Any]) -> Path:
+def save_checkpoint(model: Model, folder: Path, card: dict[str, Any]) -> Path:
     """Write weights, with a few steps to check them by, then card: each whole or not."""
     folder = writable_folder(folder)
-    steps = stored_steps(model, _teacher(card, model.scene))
-    write_tensors(folder / WEIGHTS, model.state_dict() | steps)
+    steps = stored_steps(model, _solver_scene(card, model.scene))
+    weights = model.state_dict()
+    write_tensors(folder / WEIGHTS, weights | steps)
     write_json(folder / CARD, card)
     return folder
 
 
-def load_checkpoint(folder: str | Path, scene: Scene | None = None) -> NeRD:
+def load_checkpoint(folder: str | Path, scene: Scene | None = None) -> Model:
     """A model from a folder; warns where this machine does not repeat its steps.
 
     See `read_checkpoint`.
@@ -131,10 +122,10 @@ def load_checkpoint(folder: str | Path, scene: Scene | None = None) -> NeRD:
 
 def read_checkpoint(
     folder: Path, scene: Scene | None = None
-) -> tuple[NeRD, SelfCheck | None]:
+) -> tuple[Model, SelfCheck | None]:
     """A model from a folder that `save_checkpoint` wrote, and its self-check.
 
-    There is none for another scene than the card's, nor in weights of before 0.2.
+    There is no self-check for another scene than the card's.
 
     Args:
         folder: where.
@@ -149,46 +140,40 @@ def read_checkpoint(
             f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint"
         )
     card = read_json(folder / CARD)
-    names = "foresees_forces", "foresees_free_motion"
-    foresight = [card.get(name) is True for name in names]  # none did before 0.2
-    scene = (scene or _scene_of(card, folder)).foreseeing(*foresight)
-    teacher = _teacher(card, scene)
-    _compare(card, teacher, folder)
-    config, tensors = _network_config(card, folder), read_tensors(folder / WEIGHTS)
-    # its first weights are drawn, then replaced
-    with torch.random.fork_rng(devices=[]):
-        try:
-            _expect_room(config, tensors)
-            model = make_model(scene, config)
-            if card.get("flies") is True:
-                model.fly()
-        except ValueError as error:
-            raise ValueError(
-                f"the network in {folder} cannot be built: {error}"
-            ) from None
-    bounds = {k: v for k, v in model.state_dict().items() if k.startswith(COVERAGE)}
-    missing = bounds.keys() - tensors.keys()
-    if missing in (bounds.keys(), NEWEST, REST, GAIN):  # weights of before 0.2
-        tensors |= {key: bounds[key] for key in missing}
-    what = f"weights in {folder}"
+    if card.get("format") != FORMAT:
+        raise ValueError(
+            f"expected a card of format {FORMAT} in {folder}, got {card.get('format')!r}"
+        )
+    scene = scene or _scene_of(card, folder)
+    solver_scene = _solver_scene(card, scene)
+    _compare(card, solver_scene, folder)
+    tensors = read_tensors(folder / WEIGHTS)
+    model = _build(card, scene, solver_scene, tensors, folder)
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
-    expect_fit(weights, model.state_dict(), what, f"scene '{scene.name}'")
+    expect_fit(
+        weights, model.state_dict(), f"weights in {folder}", f"scene '{scene.name}'"
+    )
     model.load_state_dict(weights)
-    if card.get("scene_hash") != teacher.hash:
-        return model.eval(), None
-    return model, self_check(model.eval(), teacher, tensors, str(folder / WEIGHTS))
+    model.eval()
+    if card.get("scene_hash") != solver_scene.hash:
+        return model, None
+    return model, self_check(model, solver_scene, tensors, str(folder / WEIGHTS))
 
 
-def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> NeRD:
-    """A shipped model by the name of its scene, or one of your own by its folder.
+def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> Model:
+    """A shipped model by its name, or one of your own by its folder.
+
+    The name of a scene stands for its learned model: ``ant`` for ``ant-mlp``.
 
     Raises:
         ValueError: neither a shipped model nor a folder with a checkpoint.
     """
     asked = str(name_or_folder)
     name = folder_name(asked) if is_import(asked) else asked
-    if name in shipped_models():
-        return load_checkpoint(PRETRAINED / name, scene)
+    shipped = shipped_models()
+    for known in (name, f"{name}-mlp"):
+        if known in shipped:
+            return load_checkpoint(PRETRAINED / known, scene)
     if os.path.isdir(asked):  # False, too, for what no path can be
         return load_checkpoint(Path(name_or_folder), scene)
     if is_import(asked):
@@ -196,15 +181,75 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> N
             f"no model of '{asked}' is shipped: make one with `nerd data {asked}` and "
             f"`nerd train {asked}`, then give its folder, runs/{name}/best"
         )
-    names = ", ".join(shipped_models())
     raise ValueError(
-        f"expected a shipped model ({names}) or a checkpoint folder, got {asked!r}"
+        f"expected a shipped model ({', '.join(shipped)}) or a checkpoint folder, got "
+        f"{asked!r}"
     )
 
 
-def shipped_models() -> list[str]:
-    """Names of the models that come with the package."""
-    return sorted(path.parent.name for path in PRETRAINED.glob(f"*/{CARD}"))
+def shipped_models(scene: Scene | None = None) -> list[str]:
+    """Names of the models that come with the package, all or those of a scene."""
+    names = sorted(path.parent.name for path in PRETRAINED.glob(f"*/{CARD}"))
+    if scene is None:
+        return names
+    return [name for name in names if shipped_card(name)["scene"] == scene.name]
+
+
+def shipped_card(name: str) -> dict[str, Any]:
+    """The card of a shipped model."""
+    return read_json(PRETRAINED / name / CARD)
+
+
+def _build(
+    card: dict[str, Any],
+    scene: Scene,
+    solver_scene: Scene,
+    tensors: dict[str, torch.Tensor],
+    folder: Path,
+) -> Model:
+    """The model that a card describes, its weights drawn at random."""
+    kind = card.get("kind")
+    try:
+        with torch.random.fork_rng(devices=[]):
+            if kind == "analytic":
+                config = _config(STEP_KINDS, card.get("step"), "step", folder)
+                return make_step(solver_scene, cast(StepConfig, config))
+            network = _config(NETWORK_KINDS, card.get("network"), "network", folder)
+            network = cast(NetworkConfig, network)
+            _expect_room(network, tensors)
+            features = FeatureConfig(**card["features"])
+            if kind == "learned":
+                return NeRD(scene, features, network)
+            if kind == "hybrid":
+                config = _config(STEP_KINDS, card.get("step"), "step", folder)
+                step = make_step(solver_scene, cast(StepConfig, config))
+                return HybridNeRD(scene, step, features, network)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"the model in {folder} cannot be built: {error}") from None
+    raise ValueError(
+        f"expected kind learned, hybrid or analytic in the card in {folder}, got {kind!r}"
+    )
+
+
+def _described(kinds: dict[str, type], config: Any) -> dict[str, Any]:
+    """A configuration with the name of its kind."""
+    kind = next(name for name, cls in kinds.items() if type(config) is cls)
+    return {"kind": kind, **asdict(config)}
+
+
+def _config(kinds: dict[str, type], found: Any, what: str, folder: Path) -> Any:
+    """The inverse of `_described`, of a card that may say anything."""
+    fields = dict(found) if isinstance(found, dict) else {}
+    kind = fields.pop("kind", None)
+    sizes = [x for x in fields.values() if not isinstance(x, str)]
+    try:
+        if not all(type(size) is int and 0 < size <= MAX_SIZE for size in sizes):
+            raise TypeError
+        return kinds[str(kind)](**fields)
+    except (KeyError, TypeError):
+        raise ValueError(
+            f"the card in {folder} has a {what} this version cannot build: {found!r}"
+        ) from None
 
 
 def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
@@ -217,33 +262,13 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
         raise ValueError(f"the scene of the card in {folder}: {error}") from None
 
 
-def _teacher(card: dict[str, Any], scene: Scene) -> Scene:
-    """The scene as the model's data were stepped."""
+def _solver_scene(card: dict[str, Any], scene: Scene) -> Scene:
+    """The scene with the solver that the model was made for."""
     return scene.reference if card.get("reference_ratio", 1) != 1 else scene
 
 
-def _network_config(
-    card: dict[str, Any], folder: Path
-) -> NetworkConfig | ResidualConfig:
-    found = card.get("network")
-    network = dict(found) if isinstance(found, dict) else {}
-    kind = network.pop("kind", None)
-    sizes = network.values()
-    try:
-        if not all(type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes):
-            raise TypeError
-        return KINDS[str(kind)](**network)
-    except (KeyError, TypeError):
-        raise ValueError(
-            f"the card in {folder} has a network this version cannot build: "
-            f"{card.get('network')!r}"
-        ) from None
-
-
-def _expect_room(
-    config: NetworkConfig | ResidualConfig, tensors: dict[str, torch.Tensor]
-) -> None:
-    """Refuse a card's network that its weights cannot fill, before memory is asked for."""
+def _expect_room(config: NetworkConfig, tensors: dict[str, torch.Tensor]) -> None:
+    """Refuse a card's network that its weights cannot fill, before memory is allocated."""
     depth = getattr(config, "depth", 0) or getattr(config, "layers", 0)
     if depth <= len(tensors):
         with torch.device("meta"):
@@ -268,8 +293,9 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
         "scene_hash": scene.hash,
         "mujoco": mujoco.__version__.rsplit(".", 1)[0],
     }
-    version = str(_versions(card).get("mujoco"))
-    stored = {**card, "mujoco": version.rsplit(".", 1)[0]}
+    versions = card.get("versions")
+    versions = versions if isinstance(versions, dict) else {}
+    stored = {**card, "mujoco": str(versions.get("mujoco")).rsplit(".", 1)[0]}
     differing = [
         f"{key} is {stored.get(key)} there and {value} here"
         for key, value in local.items()
@@ -281,8 +307,3 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
             + ", ".join(differing),
             stacklevel=3,
         )
-
-
-def _versions(card: dict[str, Any]) -> dict[str, Any]:
-    found = card.get("versions")
-    return found if isinstance(found, dict) else {}

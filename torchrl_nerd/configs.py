@@ -12,6 +12,51 @@ COUNTS = (
 
 Update = Literal["physics", "all", "head", "low-rank"]
 Observe = Literal["states", "poses"]
+Precision = Literal["float32", "float64"]
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Which predictions of the contact law are among a model's features.
+
+    | field | meaning |
+    |---|---|
+    | ``predicted_force`` | the penalty law's forces at contacts and joint limits over the
+      coming step, see `PredictedForce`; for scenes that follow it |
+    | ``unconstrained_motion`` | contacts predicted along the motion that the robot has if
+      nothing touches it, not at constant velocity; see `PredictedPenetration` |
+    """
+
+    predicted_force: bool = False
+    unconstrained_motion: bool = False
+
+
+NO_PREDICTIONS = FeatureConfig()
+
+
+@dataclass(frozen=True)
+class UnconstrainedConfig:
+    """An `UnconstrainedStep`."""
+
+
+@dataclass(frozen=True)
+class PenaltyContactConfig:
+    """A `PenaltyContactStep`; fields as its arguments."""
+
+    num_stages: int = 2
+    num_outer_steps: int = 1
+    merged_substeps: int = 1
+    precision: Precision = "float32"
+
+
+@dataclass(frozen=True)
+class FreeBodyConfig:
+    """A `FreeBodyPenaltyStep`; fields as its arguments."""
+
+    num_substeps: int = 8
+
+
+StepConfig = UnconstrainedConfig | PenaltyContactConfig | FreeBodyConfig
 
 
 @dataclass(frozen=True)
@@ -42,8 +87,10 @@ class TrainConfig:
 
     | field | meaning |
     |---|---|
-    | ``network`` | name in `NETWORKS`, or ``free``, see `FreeNeRD`, or ``grounded``, see
-      `GroundedNeRD` |
+    | ``network`` | name in `NETWORKS` |
+    | ``step`` | name of the analytic step in `STEPS` whose residual is learned: a hybrid;
+      None: a learned model |
+    | ``predicted_force``, ``unconstrained_motion`` | features, see `FeatureConfig` |
     | ``steps`` | updates on one-step targets |
     | ``rollout_steps`` | further updates on the model's own rollouts |
     | ``batch_size``, ``sequence_length`` | sequences per update, control steps of each |
@@ -68,6 +115,9 @@ class TrainConfig:
     """
 
     network: str = "transformer-2x64"
+    step: str | None = None
+    predicted_force: bool = False
+    unconstrained_motion: bool = False
     steps: int = 20_000
     rollout_steps: int = 2_000
     batch_size: int = 64
@@ -91,8 +141,13 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if name != "network":
+            if not isinstance(value, str | None):
                 expect_at_least(1 if name in COUNTS else 0, **{name: value})
+
+    @property
+    def features(self) -> FeatureConfig:
+        """Which predictions are among the model's features."""
+        return FeatureConfig(self.predicted_force, self.unconstrained_motion)
 
     @property
     def total_steps(self) -> int:

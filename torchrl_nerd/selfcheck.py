@@ -1,4 +1,4 @@
-"""A few steps kept among the weights, and whether this machine still makes them.
+"""A few steps stored with the weights, and whether this machine repeats them.
 
 A checkpoint says which physics it learned; another MuJoCo, processor or library may step
 differently. Some states, what MuJoCo made of them where the model was trained, and what the
@@ -13,14 +13,13 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 
 PREFIX = "check."  # of the names of what is stored
 ROWS = 8
-TRUE_TOLERANCE, LEARNED_TOLERANCE = 1e-6, 1e-3  # relative to 1 + the largest number
+MUJOCO_TOLERANCE, MODEL_TOLERANCE = 1e-6, 1e-3  # relative to 1 + the largest number
 
 
 @dataclass(frozen=True)
@@ -29,20 +28,20 @@ class SelfCheck:
 
     | field | meaning |
     |---|---|
-    | ``true`` | MuJoCo's |
-    | ``learned`` | the model's |
+    | ``mujoco`` | MuJoCo's |
+    | ``model`` | the model's |
     """
 
-    true: float
-    learned: float
+    mujoco: float
+    model: float
 
     @property
     def agrees(self) -> bool:
         """Whether both are within their tolerance."""
-        return self.true <= TRUE_TOLERANCE and self.learned <= LEARNED_TOLERANCE
+        return self.mujoco <= MUJOCO_TOLERANCE and self.model <= MODEL_TOLERANCE
 
 
-def stored_steps(model: NeRD, scene: Scene) -> dict[str, Tensor]:
+def stored_steps(model: Model, scene: Scene) -> dict[str, Tensor]:
     """A few steps of this machine, to be kept among the model's weights.
 
     Args:
@@ -59,7 +58,7 @@ def stored_steps(model: NeRD, scene: Scene) -> dict[str, Tensor]:
 
 
 def self_check(
-    model: NeRD, scene: Scene, tensors: dict[str, Tensor], where: str
+    model: Model, scene: Scene, tensors: dict[str, Tensor], where: str
 ) -> SelfCheck | None:
     """Step the stored states again; None where there are none.
 
@@ -87,11 +86,11 @@ def self_check(
             f"expected a few steps of '{model.scene.name}' in {where}, got "
             f"something else: {str(error).splitlines()[0]}"
         ) from None
-    true, learned = (
+    mujoco_, model_ = (
         max(worst[f"{kind}_{key}"] for key in (QPOS, QVEL))
-        for kind in ("true", "learned")
+        for kind in ("mujoco", "model")
     )
-    return SelfCheck(true, learned)
+    return SelfCheck(mujoco_, model_)
 
 
 def warn_of_differences(check: SelfCheck, folder: Path) -> None:
@@ -99,22 +98,22 @@ def warn_of_differences(check: SelfCheck, folder: Path) -> None:
     if not check.agrees:
         warnings.warn(
             f"this machine does not repeat the steps stored in {folder}: MuJoCo differs "
-            f"by {check.true:.1e} (up to {TRUE_TOLERANCE:.0e} expected), the model by "
-            f"{check.learned:.1e} (up to {LEARNED_TOLERANCE:.0e}), relative",
+            f"by {check.mujoco:.1e} (up to {MUJOCO_TOLERANCE:.0e} expected), the model by "
+            f"{check.model:.1e} (up to {MODEL_TOLERANCE:.0e}), relative",
             stacklevel=3,
         )
 
 
-def _steps(model: NeRD, scene: Scene, given: dict[str, Tensor]) -> dict[str, Tensor]:
+def _steps(model: Model, scene: Scene, given: dict[str, Tensor]) -> dict[str, Tensor]:
     """One step of MuJoCo and of the model."""
     state = TensorDict({key: given[key] for key in (QPOS, QVEL)}, [len(given[QPOS])])
     torque, terrain = given["joint_torque"], given.get(TERRAIN)
-    worlds = {
-        "true": MujocoDynamics(scene, num_threads=1),
-        "learned": NeRDDynamics(model),
+    both = {
+        "mujoco": MujocoDynamics(scene, num_threads=1),
+        "model": dynamics_of(model),
     }
     made = {}
-    for kind, dynamics in worlds.items():
+    for kind, dynamics in both.items():
         dynamics.reset(state)
         after = dynamics.step(state, torque, terrain)
         made |= {f"{kind}_{key}": after[key] for key in (QPOS, QVEL)}

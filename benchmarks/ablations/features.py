@@ -1,4 +1,4 @@
-"""Other features than `SceneTokens`."""
+"""Other features than `SceneFeatures`."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torchrl_nerd.keys import (
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
 )
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import ContactFeatures
 
@@ -19,12 +19,12 @@ from .paper_input import BaseFrame, PaperInput
 WORLD_POSE = 9  # position, and two columns of the rotation, in place of gravity
 
 
-def straight(scene: Scene) -> SceneTokens:
+def straight(scene: Scene) -> SceneFeatures:
     """What a scene's features are without foresight: no forces, velocities that stay."""
-    return SceneTokens(scene.foreseeing(False, False))
+    return SceneFeatures(scene.foreseeing(False, False))
 
 
-class DistanceTokens(SceneTokens):
+class DistanceTokens(SceneFeatures):
     """Of contacts no more than the paper sees: distances, and normals where they vary."""
 
     def __init__(self, scene: Scene) -> None:
@@ -44,7 +44,7 @@ class DistanceTokens(SceneTokens):
         return torch.cat((state, joint_torque, *kept), -1)
 
 
-class PaperTokens(SceneTokens):
+class PaperTokens(SceneFeatures):
     """The paper's full input, of which the scene's own are what is left, see `PaperInput`.
 
     Angles of hinges without limits within half a turn of zero.
@@ -64,7 +64,7 @@ class PaperTokens(SceneTokens):
         return self.input(wrapped, qvel, joint_torque, terrain)
 
 
-class LinkTokens(SceneTokens):
+class LinkTokens(SceneFeatures):
     """The paper's frame for a fixed base: its first link's, which turns with its joint."""
 
     def __init__(self, scene: Scene) -> None:
@@ -81,7 +81,7 @@ class LinkTokens(SceneTokens):
         return torch.cat((state, joint_torque, *found), -1)
 
 
-class EndToEndTokens(SceneTokens):
+class EndToEndTokens(SceneFeatures):
     """State in world axes and torque: the paper's end to end, which sees no contact."""
 
     def __init__(self, scene: Scene) -> None:
@@ -103,7 +103,7 @@ class EndToEndTokens(SceneTokens):
         return torch.cat((*base_in_world(self, qpos, qvel), *joints, joint_torque), -1)
 
 
-class WorldTokens(SceneTokens):
+class WorldTokens(SceneFeatures):
     """The scene's features in world axes, and where the robot stands: NeRD eq. 1."""
 
     def __init__(self, scene: Scene) -> None:
@@ -121,7 +121,7 @@ class WorldTokens(SceneTokens):
         return torch.cat((*base, *joints, joint_torque, *found), -1)
 
 
-def base_in_world(tokens: SceneTokens, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
+def base_in_world(tokens: SceneFeatures, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
     """Pose and velocity of a floating base in world axes."""
     base = tokens.robot.base
     if not base.is_floating:

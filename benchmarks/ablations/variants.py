@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, Config, NeRD, unit_stats
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import stats_of
@@ -37,7 +37,7 @@ class Variant:
     """
 
     what: str
-    tokens: Callable[[Scene], SceneTokens] = SceneTokens
+    tokens: Callable[[Scene], SceneFeatures] = SceneFeatures
     target: Callable[[Scene], StateDelta] = StateDelta
     network: Config = TransformerConfig()
     raw: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from torchrl_nerd.evaluation.parameter_fit import (
     moved,
 )
 from torchrl_nerd.evaluation.toss_error import path_errors
-from torchrl_nerd.modules.penalty_step import PARAMETERS, PenaltyStep
+from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
 
 TOSSES, STATES = 12, 16
 
@@ -29,7 +29,7 @@ def made(scene, step, generator, height):
 
 
 def test_flight_tells_gravity_and_the_centre_of_mass(real_cube, generator):
-    step = PenaltyStep(real_cube)
+    step = FreeBodyPenaltyStep(real_cube)
     drawn = 0.01 * torch.randn(3, generator=generator).double()
     truth = {"gravity": 9.7, **dict(zip(CENTRE, drawn.tolist(), strict=True))}
     step.set_values(truth)
@@ -40,12 +40,12 @@ def test_flight_tells_gravity_and_the_centre_of_mass(real_cube, generator):
 
 
 def test_tosses_without_flight_tell_nothing(real_cube, generator):
-    tosses = made(real_cube, PenaltyStep(real_cube), generator, height=-0.01)
+    tosses = made(real_cube, FreeBodyPenaltyStep(real_cube), generator, height=-0.01)
     assert fit_flight(real_cube, tosses) == {}
 
 
 def test_a_fit_lowers_the_error(real_cube, generator):
-    step = PenaltyStep(real_cube, substeps=2)
+    step = FreeBodyPenaltyStep(real_cube, substeps=2)
     tosses = made(real_cube, step, generator, height=0.0)
     truth, rows = step.values(), tosses.starts(STATES)
 

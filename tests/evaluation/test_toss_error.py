@@ -20,7 +20,7 @@ from torchrl_nerd.evaluation.toss_error import (
     summarize_both,
     toss_errors,
 )
-from torchrl_nerd.modules.penalty_step import PenaltyStep
+from torchrl_nerd.analytic.free_body import FreeBodyPenaltyStep
 
 
 class Replay:
@@ -101,7 +101,7 @@ def test_mujocos_centre_of_mass_falls_freely(real_cube, generator):
     centre = 0.01 * torch.randn(3, generator=generator).double()
     values = dict(zip(CENTRE, centre.tolist(), strict=True))
     truth = MujocoDynamics(cube_with(real_cube, {**PUBLISHED, **values}), num_threads=1)
-    step = PenaltyStep(real_cube, substeps=SUBSTEPS)
+    step = FreeBodyPenaltyStep(real_cube, substeps=SUBSTEPS)
     step.set_values(values)
     state = real_cube.sample_initial(8, generator)[0]
     real_cube.place_on_terrain(state, torch.ones(8, dtype=torch.float64))

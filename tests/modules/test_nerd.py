@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import (
     ContactFeatures,
@@ -58,7 +58,7 @@ def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator)
     raw = torch.cat([td[key].double() for key in keys], -1)
     stats = scene_stats(scene)["token"]
     expected = (raw - stats.mean) / stats.std
-    assert token.dtype == dtype and token.shape[-1] == SceneTokens(scene).size
+    assert token.dtype == dtype and token.shape[-1] == SceneFeatures(scene).size
     # the transforms hand over float32, whose rounding a small deviation magnifies
     slack = 1e-6 * (raw.abs() + 1.0) / stats.std + tolerance * (1.0 + expected.abs())
     assert ((token - expected).abs() <= slack).all()

@@ -18,7 +18,7 @@ from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.actuators import ActuatorController
@@ -233,7 +233,7 @@ def test_a_network_can_step_it(robot, generator):
     state, action = states_and_actions(robot, generator, robot.sampling.clearance)
     torque = robot.controller(action, state[QPOS], state[QVEL])
     dynamics = NeRDDynamics(NeRD(robot, NETWORKS["transformer-2x64"]))
-    assert dynamics.model.tokens.size == SceneTokens(robot).size
+    assert dynamics.model.tokens.size == SceneFeatures(robot).size
     tokens = dynamics.model.tokens(state[QPOS], state[QVEL], torque, None)
     assert tokens.shape == (ROWS, dynamics.model.tokens.size)
     for after in (
@@ -263,7 +263,7 @@ def test_a_planar_robot_does_not_see_where_it_is(name, generator):
     assert address in scene.symmetries.positions
     state, action = states_and_actions(scene, generator)
     torque = scene.controller(action, state[QPOS], state[QVEL])
-    tokens, elsewhere = SceneTokens(scene), state[QPOS].clone()
+    tokens, elsewhere = SceneFeatures(scene), state[QPOS].clone()
     elsewhere[:, address] += 1e4
     here = tokens(state[QPOS], state[QVEL], torque, None)
     there = tokens(elsewhere, state[QVEL], torque, None)

@@ -12,7 +12,7 @@ from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TE
 from torchrl_nerd.modules.baselines import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.images import Images
@@ -77,7 +77,7 @@ def test_the_group_is_closed_and_has_inverses(scene, data):
 
 def test_tokens_and_targets_are_renumbered(scene, data):
     symmetry = Symmetry.of(scene, data)
-    encode = SceneTokens(scene), StateDelta(scene)
+    encode = SceneFeatures(scene), StateDelta(scene)
     flat = data.flatten(0, 1)[::7]
     here = raw_tokens(*encode, flat)
     for number, isometry in enumerate(symmetry.isometries):

@@ -34,7 +34,7 @@ class Doctor(Command):
             if "error" in check:
                 print(f"  {name:<28}{check['error']}")
                 continue
-            differences = f"MuJoCo {check['true']:.0e}, model {check['learned']:.0e}"
+            differences = f"MuJoCo {check['mujoco']:.0e}, model {check['model']:.0e}"
             verdict = "ok" if check["agrees"] else "DIFFERS"
             print(f"  {name:<28}{differences:<30}{check['seconds']:>5} s  {verdict}")
         wrong = [name for name, check in checks.items() if not check["agrees"]]

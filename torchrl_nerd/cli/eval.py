@@ -11,12 +11,11 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional, real_scene
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.dynamics.nerd import Inference
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
 from torchrl_nerd.evaluation.toss_error import STATES
 from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
-from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import PRESETS, load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
 
@@ -91,7 +90,7 @@ class Eval(DeviceCommand):
             here = model if place is scene else model.with_terrain(place)
             errors = passive_errors(
                 source,
-                NeRDDynamics(here, inference=self.inference),
+                dynamics_of(here, inference=self.inference),
                 MujocoDynamics(place.reference if self.reference else place),
                 list(protocol.horizons),
                 self.rows,
@@ -118,7 +117,7 @@ class Eval(DeviceCommand):
         }
         return {"scene": self.scene, **settings, "errors": rows}
 
-    def _load(self, name: Path | str, scene: Scene) -> NeRD:
+    def _load(self, name: Path | str, scene: Scene) -> Model:
         """The model as it was asked for."""
         model = from_pretrained(name, scene).to(self.device)
         return model.to(torch.bfloat16) if self.bf16 else model
@@ -141,7 +140,7 @@ class Eval(DeviceCommand):
             raise ValueError(
                 f"expected a toss of at least {STATES} states in {path}, got none"
             )
-        models = {"model": NeRDDynamics(model, inference=self.inference)}
+        models = {"model": dynamics_of(model, inference=self.inference)}
         if self.baselines:
             models = {**mujoco_baselines(scene), **models}
         table = compare(models, tosses, starts)

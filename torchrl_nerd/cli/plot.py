@@ -7,7 +7,7 @@ from typing import Any
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.rollout_error import scene_of
 from torchrl_nerd.evaluation.trace_plot import plot_traces, plot_training
 from torchrl_nerd.evaluation.traces import Traces, compare_traces
@@ -79,7 +79,7 @@ class Plot(DeviceCommand):
         model = from_pretrained(self.model or self.what, scene).to(self.device)
         traces = compare_traces(
             source,
-            NeRDDynamics(model if place is scene else model.with_terrain(place)),
+            dynamics_of(model if place is scene else model.with_terrain(place)),
             MujocoDynamics(place),
             steps,
             self.rows,

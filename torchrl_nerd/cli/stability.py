@@ -9,7 +9,7 @@ from tqdm import tqdm
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.stability.plot import plot_results
 from torchrl_nerd.evaluation.stability.run import (
     as_json,
@@ -65,7 +65,7 @@ class Stability(DeviceCommand):
         scene = load_scene(self.scene)
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         truth = DynamicsWorld(MujocoDynamics(scene))
-        learned = DynamicsWorld(NeRDDynamics(model, compile=self.compile))
+        learned = DynamicsWorld(dynamics_of(model, compile=self.compile))
         results, count = [], sum(case.applies(scene) for case in cases)
         figures: dict[str, Any] = {"scene": self.scene, "seed": self.seed}
         figures["scale"] = self.scale

@@ -9,7 +9,6 @@ import torch
 from torchrl_nerd.checkpoint import (
     from_pretrained,
     load_checkpoint,
-    make_model,
     save_checkpoint,
 )
 from torchrl_nerd.cli.command import DeviceCommand
@@ -19,12 +18,11 @@ from torchrl_nerd.data.generate import CARD, generate, load_data_sets
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName
-from torchrl_nerd.training.start import begin_from
+from torchrl_nerd.training.start import begin_from, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
 
 
@@ -73,17 +71,23 @@ class Train(DeviceCommand):
 
     def begin(self, scene: Scene) -> NeRD | None:
         """The model to start from, where there is one."""
-        return (
-            None if self.init_from is None else from_pretrained(self.init_from, scene)
-        )
+        if self.init_from is None:
+            return None
+        model = from_pretrained(self.init_from, scene)
+        if not isinstance(model, NeRD):
+            raise ValueError(
+                f"expected a learned or hybrid model to start from, got the analytic step "
+                f"'{self.init_from}'"
+            )
+        return model
 
     def plan(self) -> list[str]:
         """What would be trained on what, and what is there."""
         scene, (out, folders) = scene_of(self.scene, self.reference), self.folders
-        model = make_model(scene, network_config(self.config.network))
+        model = make_model(scene, self.config)
         start = self.begin(scene)
         if start is not None:
-            model = begin_from(start, scene, self.config.network)
+            model = begin_from(start, scene, self.config)
         weights = sum(weight.numel() for weight in model.network.parameters())
         count = preset_of(self.scene).data.trajectories
         return [

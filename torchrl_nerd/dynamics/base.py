@@ -1,4 +1,4 @@
-"""The one box that learned and true dynamics fill: state and torque in, state out."""
+"""The interface of all dynamics: state and torque in, next state out."""
 
 from typing import Protocol
 
@@ -12,11 +12,12 @@ from torchrl_nerd.scenes.scene import Scene
 class Dynamics(Protocol):
     """What an env needs of physics. A state holds ``qpos`` and ``qvel``, float64.
 
-    It computes where it lives and answers where it was asked: the next state is on the
-    device of the one before, whichever that is.
+    The next state is on the device of the state before, wherever the dynamics computes.
+    ``kind`` is ``"ground truth"``, ``"learned"``, ``"hybrid"`` or ``"analytic"``.
     """
 
     scene: Scene
+    kind: str
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all rows)."""

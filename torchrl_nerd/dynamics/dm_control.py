@@ -40,6 +40,8 @@ class DMControlDynamics:
         scene: robot, ground and substeps.
     """
 
+    kind = "ground truth"
+
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._rows: list[Physics] = []

@@ -26,7 +26,7 @@ class GuardedDynamics:
     """A `NeRDDynamics` whose every step says how far its input may be trusted.
 
     ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
-    the inverse of `Coverage.distance`: 0.5 is twice as far out. A row that is not finite
+    the inverse of `OODScore`: 0.5 is twice as far out. A row that is not finite
     has trust 0. Rows below ``least_trust`` are untrusted. In ``"fallback"`` MuJoCo steps
     them until they have been trusted for ``patience`` steps in a row: a swing that is too
     fast at its bottom looks familiar at its top. The network sees their true states, so
@@ -57,12 +57,13 @@ class GuardedDynamics:
             raise ValueError(f"expected a least_trust in (0, 1], got {least_trust}")
         if patience < 0:
             raise ValueError(f"expected a patience of at least 0, got {patience}")
-        if not learned.model.coverage.is_fitted:
+        if not learned.model.training_range.is_fitted:
             raise ValueError(
                 "expected a model that knows what it was trained on, got weights of an "
                 "older version: train or fine-tune it again"
             )
         self.scene, self.learned = learned.scene, learned
+        self.kind = learned.kind
         self.guard, self.least_trust, self.patience = guard, least_trust, patience
         self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
         self.truth = MujocoDynamics(self.scene) if guard == "fallback" else None

@@ -65,6 +65,8 @@ class MujocoDynamics:
             ``NERD_THREADS`` says, or all processors.
     """
 
+    kind = "ground truth"
+
     def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
         self.scene = scene
         self.num_threads = num_threads or default_threads()

@@ -44,6 +44,8 @@ class MujocoWarpDynamics:
         ValueError: a model or a device that Warp cannot step on (named).
     """
 
+    kind = "ground truth"
+
     def __init__(
         self,
         scene: Scene,

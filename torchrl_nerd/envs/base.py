@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
+from torchrl_nerd.dynamics.torch_step import TorchDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition
@@ -29,7 +30,7 @@ MAX_SEED = 2**63
 
 
 class SceneEnv(EnvBase):
-    """What learned and true dynamics have in common: everything but the solver.
+    """A task in any dynamics: everything around the solver, written once.
 
     Per row: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
@@ -86,8 +87,8 @@ class SceneEnv(EnvBase):
         self.recorder: FaultRecorder | None = None
         if dump_dir is not None:
             name = type(dynamics).__name__
-            learned = self._learned
-            model = None if learned is None else learned.model
+            inner = self._torch_dynamics
+            model = inner.model if isinstance(inner, NeRDDynamics) else None
             where = dump_dir, self.scene.name
             self.recorder = FaultRecorder(*where, name, model)
         self._make_specs()
@@ -115,11 +116,11 @@ class SceneEnv(EnvBase):
                 them, those that suit the model.
         """
         suits: Mapping[str, Any] = {}
-        if (learned := self._learned) is not None:
+        if (inner := self._torch_dynamics) is not None:
             is_chosen = not kwargs.keys().isdisjoint(("mode", "backend", "options"))
-            suits = {} if is_chosen else learned.compile_options
-            learned.compile = not kwargs and learned.parts(self.batch_size.numel()) > 1
-            self._transition.is_round = learned.compile
+            suits = {} if is_chosen else inner.compile_options
+            inner.compile = not kwargs and inner.parts(self.batch_size.numel()) > 1
+            self._transition.is_round = inner.compile
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
         self._transit = Compiled(self._transition.step, **options)
         self._restart = Compiled(self._transition.restart, **options)
@@ -127,18 +128,18 @@ class SceneEnv(EnvBase):
 
     def eager(self) -> "SceneEnv":
         """Step without a compiler; returns the env itself."""
-        if (learned := self._learned) is not None:
-            learned.compile = False
+        if (inner := self._torch_dynamics) is not None:
+            inner.compile = False
         self._transit = self._transition.step
         self._restart = self._transition.restart
         return self
 
     @property
-    def _learned(self) -> NeRDDynamics | None:
-        """The model that steps, guarded or not."""
+    def _torch_dynamics(self) -> TorchDynamics | None:
+        """The model that steps, guarded or not; None for an engine."""
         dynamics = self.dynamics
         inner = dynamics.learned if isinstance(dynamics, GuardedDynamics) else dynamics
-        return inner if isinstance(inner, NeRDDynamics) else None
+        return inner if isinstance(inner, TorchDynamics) else None
 
     @property
     def _state_sizes(self) -> dict[str, int]:

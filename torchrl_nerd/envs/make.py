@@ -1,4 +1,4 @@
-"""One argument switches between learned and true dynamics."""
+"""One argument switches between ground truth, learned, hybrid and analytic dynamics."""
 
 from pathlib import Path
 from typing import cast
@@ -7,12 +7,7 @@ import torch
 
 from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.ground_truth import (
-    ENGINES,
-    GROUND_TRUTH,
-    Engine,
-    GroundTruthEnv,
-)
+from torchrl_nerd.envs.ground_truth import ENGINES, Engine, GroundTruthEnv
 from torchrl_nerd.envs.nerd import NeRDEnv
 from torchrl_nerd.tasks import Task
 
@@ -32,38 +27,34 @@ def make_env(
 
     Args:
         task: id of a registered task, or a task.
-        dynamics: ``"nerd"`` (the shipped model), ``"mujoco"``, ``"dm_control"``,
-            ``"mujoco_warp"`` (extra ``warp``), or the folder of a checkpoint.
-        num_envs: rows.
+        dynamics: ``"nerd"`` (learned), ``"hybrid"``, ``"analytic"``, ``"mujoco"``,
+            ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
+            analytic step's name, or a checkpoint folder; see `make_dynamics`.
+        num_envs: how many envs step together.
         seed: of the resets.
         device: where all tensors live.
         guard: what to do with steps that the model was not trained for, see
-            `GuardedDynamics`; true dynamics have nothing to guard against.
+            `GuardedDynamics`; ground truth has nothing to guard against.
         dump_dir: where the first fault of each kind leaves a dump for `nerd replay`.
-        compile: make one compiled piece of controller, learned dynamics, reward and
-            observation, see `SceneEnv.compile`; true dynamics stay as they are.
-        differentiable: record gradients through every step of learned dynamics.
+        compile: make one compiled piece of controller, model, reward and observation, see
+            `SceneEnv.compile`; engines stay as they are.
+        differentiable: record gradients through every step of a model.
 
     Raises:
-        ValueError: unknown task or dynamics, or gradients of true ones, in one sentence.
+        ValueError: unknown task or dynamics, or gradients of an engine, in one sentence.
         ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
     """
     if dynamics in ENGINES:
         if differentiable:
             raise ValueError(
-                f"expected learned dynamics for gradients, got '{dynamics}'"
+                f"expected learned, hybrid or analytic dynamics for gradients, got "
+                f"'{dynamics}'"
             )
         engine = cast(Engine, dynamics)
         return GroundTruthEnv(task, engine, num_envs, seed, device, dump_dir)
-    model = None if dynamics == "nerd" else dynamics
-    if model is not None and not Path(model).is_dir():
-        raise ValueError(
-            f"unknown dynamics '{dynamics}', expected nerd, "
-            f"{', '.join(GROUND_TRUTH)} or a checkpoint folder"
-        )
     env = NeRDEnv(
         task,
-        model,
+        dynamics,
         num_envs,
         seed,
         device,

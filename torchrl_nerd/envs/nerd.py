@@ -1,25 +1,25 @@
-"""A task in learned dynamics."""
+"""A task in the dynamics of a model."""
 
 from pathlib import Path
 
 import torch
 
-from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.dynamics.guarded import Guard, GuardedDynamics
-from torchrl_nerd.dynamics.nerd import Inference, NeRDDynamics
+from torchrl_nerd.dynamics import GuardedDynamics, Model, NeRDDynamics, dynamics_of
+from torchrl_nerd.dynamics.guarded import Guard
+from torchrl_nerd.dynamics.nerd import Inference
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.tasks import Task
 
 
 class NeRDEnv(SceneEnv):
-    """A `SceneEnv` on `NeRDDynamics`.
+    """A `SceneEnv` on a model: learned, hybrid or analytic.
 
     Args:
         task: id of a registered task, or a task.
-        model: a model, a checkpoint folder, or None for the one that is shipped.
-        num_envs: rows.
+        model: a model, or the name of one, see `resolve_model`.
+        num_envs: how many envs step together.
         seed: of the resets.
         device: where the model and all tensors live.
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
@@ -31,6 +31,9 @@ class NeRDEnv(SceneEnv):
 
     TorchRL's ``compile=True`` makes each step one compiled piece, see `SceneEnv.compile`.
 
+    Raises:
+        ValueError: no such task or model, or a guard of a model without training data.
+
     Examples:
         >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
         >>> env.rollout(5, break_when_any_done=False)["next", "qpos"].shape
@@ -40,7 +43,7 @@ class NeRDEnv(SceneEnv):
     def __init__(
         self,
         task: str | Task,
-        model: NeRD | str | Path | None = None,
+        model: Model | str | Path = "nerd",
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str = "cpu",
@@ -50,12 +53,15 @@ class NeRDEnv(SceneEnv):
         differentiable: bool = False,
     ) -> None:
         task = make_task(task) if isinstance(task, str) else task
-        if not isinstance(model, NeRD):
-            model = from_pretrained(model or task.scene.name, task.scene)
-        learned = NeRDDynamics(
-            model.to(device),
-            inference=inference,
-            differentiable=differentiable,
+        if isinstance(model, (str, Path)):
+            model = resolve_model(model, task.scene)
+        dynamics = dynamics_of(
+            model.to(device), differentiable=differentiable, inference=inference
         )
-        dynamics = learned if guard is None else GuardedDynamics(learned, guard)
+        if guard is not None:
+            if not isinstance(dynamics, NeRDDynamics):
+                raise ValueError(
+                    "expected a guard of a learned or hybrid model, got an analytic step"
+                )
+            dynamics = GuardedDynamics(dynamics, guard)
         super().__init__(task, dynamics, num_envs, seed, device, dump_dir)

@@ -69,9 +69,9 @@ def shipped_checks(quiet: bool = True) -> dict[str, dict[str, Any]]:
             continue
         found[name] = {
             "agrees": check is not None and check.agrees,
-            "true": None if check is None else check.true,
-            "learned": None if check is None else check.learned,
-            "knows its training data": model.coverage.is_fitted,
+            "mujoco": None if check is None else check.mujoco,
+            "model": None if check is None else check.model,
+            "kind": model.kind,
             "seconds": round(time.monotonic() - began, 2),
         }
     return found

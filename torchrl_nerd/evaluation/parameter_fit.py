@@ -14,9 +14,9 @@ import torch
 from scipy.optimize import minimize
 from torch import Generator, Tensor
 
+from torchrl_nerd.analytic.free_body import SCALED, SHIFTED
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.geometry.rotations import rotate_inverse
-from torchrl_nerd.modules.penalty_step import SCALED, SHIFTED
 from torchrl_nerd.modules.pose_encoder import CLEAR
 from torchrl_nerd.scenes import Scene
 

@@ -8,9 +8,8 @@ from safetensors import SafetensorError, safe_open
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 
@@ -55,7 +54,7 @@ def read_dump(path: Path) -> Dump:
     return Dump(about, TensorDict(tensors, [length]))
 
 
-def replay(dump: Dump, model: NeRD) -> list[dict[str, float]]:
+def replay(dump: Dump, model: Model) -> list[dict[str, float]]:
     """Every step of a dump from its recorded state, in both dynamics.
 
     Returns:
@@ -63,7 +62,7 @@ def replay(dump: Dump, model: NeRD) -> list[dict[str, float]]:
         largest difference of their velocities, and the input's distance from the training
         data (`Coverage.distance`).
     """
-    learned, truth = NeRDDynamics(model), MujocoDynamics(dump.scene)
+    learned, truth = dynamics_of(model), MujocoDynamics(dump.scene)
     rows = []
     learned.reset(dump.steps[:1])
     for step in range(len(dump.steps)):

@@ -1,4 +1,4 @@
-"""Axes of hinges and slides as points on their bodies, and what hangs on each joint."""
+"""Axes of hinges and slides as points on their bodies, and the bodies that they move."""
 
 from dataclasses import dataclass
 
@@ -40,8 +40,8 @@ class JointAxes:
         joints = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
         if len(joints) + base.is_floating < model.njnt or (model.body_jntnum > 1).any():
             raise ValueError(
-                "expected hinges and slides, one to a body, to foresee what they do, got "
-                "others"
+                "expected hinges and slides, one to a body, for the equation of motion, "
+                "got others"
             )
         bodies = [int(model.jnt_bodyid[j]) for j in joints]
         anchor, axis = model.jnt_pos[joints], model.jnt_axis[joints]
@@ -49,7 +49,7 @@ class JointAxes:
         is_slide = (model.jnt_type[joints] == SLIDE).astype(np.float64)
         return cls(model, joints, bodies + bodies, positions, is_slide)
 
-    def carries(self, bodies: list[int]) -> np.ndarray:
+    def ancestry(self, bodies: list[int]) -> np.ndarray:
         """``(J, len(bodies))``: 1 where a body moves with a joint, else 0."""
         moved = self.bodies[: len(self.joints)]
         below = [[_is_below(self.model, body, top) for body in bodies] for top in moved]

@@ -1,43 +1,57 @@
-"""A Neural Robot Dynamics model: features of a scene, a network, statistics."""
+"""Neural Robot Dynamics: a network predicts the change of a robot's state.
+
+    qpos, qvel, torque, terrain
+      -> features        robot-centric state, contacts, torques       (*batch, F)
+      -> normalise, clamp to the training range
+      -> network         causal transformer, MLP or GRU               (*batch, D)
+      -> denormalise     velocity change and position residual, D = 2 nv
+      -> integrate       next qpos, qvel
+
+NeRD (Xu et al., CoRL 2025), sections 3.2 to 3.4.
+"""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_nerd.modules.coverage import Coverage
-from torchrl_nerd.modules.flight import Flight
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.configs import FeatureConfig
+from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.ood import OODScore
+from torchrl_nerd.modules.sleep import Sleep
+from torchrl_nerd.modules.training_range import TrainingRange
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
-TOKEN, TARGET = "token", "target"
-LARGEST = 1e6  # of what a simulator within foresees, normalised
+TOKEN, TARGET = "token", "target"  # keys of the statistics
+
+State = tuple[Tensor, Tensor]
+"""``qpos (*batch, nq)`` and ``qvel (*batch, nv)``, float64."""
 
 
-class Memory(Protocol):
-    """History of a network, one entry per row."""
+class History(Protocol):
+    """History of a network, one entry per env."""
 
     def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool ``(num_rows,)``)."""
+        """Empty the history of ``rows`` (bool ``(num_envs,)``)."""
         ...
 
 
 class Network(Protocol):
-    """What every network can do; `step` takes the memory that its own kind makes."""
+    """What every network can do; `step` takes the history that its own kind makes."""
 
-    def empty_memory(self, rows: int) -> Memory:
-        """A history of nothing for ``rows`` rows."""
+    def empty_memory(self, rows: int) -> History:
+        """An empty history for ``rows`` envs."""
         ...
 
     def step(self, token: Tensor, memory: Any) -> Tensor:
-        """The next token of every row, ``(rows, F) -> (rows, D)``."""
+        """Output for the next token, ``(num_envs, F) -> (num_envs, D)``."""
         ...
 
 
-class Config(Protocol):
+class NetworkConfig(Protocol):
     """Size of a network, which it can build."""
 
     def build(self, num_inputs: int, num_outputs: int) -> Any:
@@ -45,120 +59,120 @@ class Config(Protocol):
         ...
 
 
+class Encoded(NamedTuple):
+    """What a state is to the network, and what its output is added to."""
+
+    features: Tensor  # (*batch, F), normalised, as they are
+    token: Tensor  # (*batch, token_size), the network's input
+    base: Tensor  # (*batch, D) or (): normalised change without the network
+    gate: Tensor  # (*batch, 1) or (): share of the network's output that counts
+
+
 class NeRD(nn.Module):
-    """The learned solver of one robot: state, torque and ground in, change of state out.
+    """The learned solver of one robot: state, torque and ground in, next state out.
 
     Args:
-        scene: the robot.
-        config: size and kind of the network.
-        stats: statistics of raw tokens and targets, from `SceneTokens`; zero mean and
-            unit variance where not given (a model whose weights are yet to be loaded).
-        tokens: what it sees of a state; the scene's own features where not given.
+        scene: the robot and its ground.
+        features: which predictions of the contact law are among its features.
+        network: size and kind of the network.
+        stats: statistics of raw features and targets; zero mean and unit variance where
+            not given (weights that are yet to be loaded).
+        scene_features: what it sees of a state; `SceneFeatures` where not given.
         state_delta: what it predicts; see `StateDelta`.
     """
 
-    has_simulator = False  # within, whose change the network is shown, see `foresee`
-    has_short_loops = False  # hundreds of them, when compiled, and no history
+    kind: ClassVar[str] = "learned"
+    zero: Tensor
+    one: Tensor
+    compile_single_threaded: ClassVar[bool] = False
 
     def __init__(
         self,
         scene: Scene,
-        config: Config,
+        features: FeatureConfig,
+        network: NetworkConfig,
         stats: Mapping[NestedKey, Stats] | None = None,
-        tokens: SceneTokens | None = None,
+        scene_features: SceneFeatures | None = None,
         state_delta: StateDelta | None = None,
     ) -> None:
         super().__init__()
-        self.scene, self.config = scene, config
-        self.tokens = SceneTokens(scene) if tokens is None else tokens
-        self.state_delta = StateDelta(scene) if state_delta is None else state_delta
-        num_inputs, num_outputs = self.tokens.size, self.state_delta.size
+        self.scene, self.config = scene, network
+        self.scene_features = scene_features or SceneFeatures(scene, features)
+        self.state_delta = state_delta or StateDelta(scene)
+        num_features, num_outputs = self.scene_features.size, self.state_delta.size
         self.normalize = Normalize(
-            stats or {TOKEN: unit_stats(num_inputs), TARGET: unit_stats(num_outputs)}
+            stats or {TOKEN: unit_stats(num_features), TARGET: unit_stats(num_outputs)}
         )
-        self.coverage = Coverage(scene, num_inputs, num_outputs)
-        self.flight: Flight | None = None
-        self.network = config.build(num_inputs + self.num_hints, num_outputs)
+        self.training_range = TrainingRange(scene, num_features, num_outputs)
+        self.ood, self.sleep = OODScore(num_features), Sleep(scene)
+        self.network = network.build(self.token_size, num_outputs)
+        zero = torch.zeros((), dtype=torch.float64)
+        self.register_buffer("zero", zero, persistent=False)
+        self.register_buffer("one", zero + 1.0, persistent=False)
 
-    def fly(self) -> "NeRD":
-        """Have rows that nothing pushes move along their free motion; returns itself.
-
-        Raises:
-            ValueError: a robot that `Flight` is not for.
-        """
-        self.flight = Flight(self.scene).to(self.device)
-        return self
-
-    def encode(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
-    ) -> Tensor:
-        """Normalised float32 tokens ``(*batch, F)`` of float64 states and torques.
-
-        What lies outside the training data is taken to their border, see `Coverage`.
-        """
-        features = self.features(qpos, qvel, joint_torque, terrain)
-        return self.assemble(features, qpos, qvel, joint_torque, terrain)
+    @property
+    def token_size(self) -> int:
+        """Width of the network's input."""
+        return self.scene_features.size
 
     def features(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
     ) -> Tensor:
-        """Normalised features ``(*batch, F)`` as they are, float64."""
-        raw = self.tokens(qpos, qvel, joint_torque, terrain)
+        """Normalised features ``(*batch, F)``, float64, unclamped."""
+        raw = self.scene_features(qpos, qvel, joint_torque, terrain)
         return self.normalize.normalize(TOKEN, raw)
 
-    def assemble(
+    def encode(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Encoded:
+        """The network's input for float64 states and torques, and what it adds to."""
+        features = self.features(qpos, qvel, joint_torque, terrain)
+        token = self.training_range.clamp_features(features).to(self.dtype)
+        return Encoded(features, token, self.zero, self.one)
+
+    def decode(self, state: State, encoded: Encoded, output: Tensor) -> State:
+        """The next state from the network's output ``(*batch, D)``.
+
+        change = base + gate * output, denormalised, clamped and integrated.
+        """
+        qpos, qvel = state
+        change = encoded.base + encoded.gate * output.to(qpos.dtype)
+        after = self.state_delta.integrate(
+            qpos, qvel, self.bounded(change), self.training_range.limit_motion
+        )
+        return self.sleep.apply_sleep(state, self.training_range.stop_joints(*after))
+
+    def bounded(self, change: Tensor) -> Tensor:
+        """Denormalised change ``(*batch, D)``, within the range of the data."""
+        change = self.training_range.clamp_target(change)
+        return self.normalize.denormalize(TARGET, change)
+
+    def step(
         self,
-        features: Tensor,
-        qpos: Tensor,
-        qvel: Tensor,
+        state: State,
         joint_torque: Tensor,
-        terrain: Tensor | None = None,
-    ) -> Tensor:
-        """The network's token ``(*batch, token_size)``, from a state's `features`."""
-        token = self.coverage.clamp_token(features).to(self.dtype)
-        if not self.has_simulator:
-            return token
-        change = self.foresee(qpos, qvel, joint_torque, terrain)
-        # torques a thousandfold overflow it; what is no number in a state is one in a token
-        change = change.nan_to_num(0.0).clamp(-LARGEST, LARGEST)
-        exact = torch.promote_types(self.dtype, torch.float32)
-        return torch.cat((token.to(exact), change.to(exact)), -1)
+        terrain: Tensor | None,
+        network_step: Callable[[Tensor], Tensor],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The next ``qpos`` and ``qvel``, and the features, for `ood_score`.
 
-    @property
-    def num_hints(self) -> int:
-        """H: what a simulator within tells beside its change."""
-        return 0
+        Args:
+            state: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
+            joint_torque: ``(*batch, num_actuated)``, N m and N.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+            network_step: ``(*batch, token_size) -> (*batch, D)``: keeps the history.
+        """
+        encoded = self.encode(*state, joint_torque, terrain)
+        after = self.decode(state, encoded, network_step(encoded.token))
+        return *after, encoded.features
 
-    def foresee(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
-    ) -> Tensor:
-        """What a simulator within foresees: hints, change, gate ``(*batch, H + D + 1)``."""
-        raise NotImplementedError(f"{type(self).__name__} has no simulator within")
+    def ood_score(self, features: Tensor) -> Tensor:
+        """Out-of-distribution score ``(*batch,)``, see `OODScore`."""
+        return self.ood(features, self.training_range.excess(features))
 
-    @property
-    def token_size(self) -> int:
-        """Width of a token: the features, and what is foreseen."""
-        foreseen = self.num_hints + self.state_delta.size + 1
-        return self.tokens.size + self.has_simulator * foreseen
-
-    def decode(
-        self, qpos: Tensor, qvel: Tensor, output: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Next ``qpos`` and ``qvel`` from normalised outputs ``(*batch, D)``."""
-        change = output.to(qpos.dtype)
-        if self.has_simulator:  # which knows harder impacts than the data hold
-            delta = self.normalize.denormalize(TARGET, change)
-            delta = self.coverage.clamp_change(delta, self.scene.control_step)
-        else:
-            change = self.coverage.clamp_target(change)
-            delta = self.normalize.denormalize(TARGET, change)
-        limit = self.coverage.limit_motion
-        after = self.state_delta.integrate(qpos, qvel, delta, limit)
-        return self.coverage.stay((qpos, qvel), self.coverage.stop_joints(*after))
+    def copy_for(self, scene: Scene) -> "NeRD":
+        """An uninitialised model of the same configuration for another scene."""
+        return NeRD(scene, self.scene_features.config, self.config)
 
     def with_terrain(self, scene: Scene) -> "NeRD":
         """The same weights for the same robot over another ground.
@@ -171,13 +185,10 @@ class NeRD(nn.Module):
                 f"expected the robot of scene '{self.scene.name}' over another ground, "
                 f"got another robot in '{scene.name}'"
             )
-        mine = self.scene
-        scene = scene.foreseeing(mine.foresees_forces, mine.foresees_free_motion)
         with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
-            model = type(self)(scene, self.config)
-        if self.flight is not None:
-            model.fly()
-        sizes, other = self.tokens.contact.sizes, model.tokens.contact.sizes
+            model = self.copy_for(scene)
+        sizes = self.scene_features.contact.sizes
+        other = model.scene_features.contact.sizes
         if sizes != other:
             raise ValueError(
                 f"expected a ground with the features {dict(sizes)} that the model was "
@@ -194,9 +205,10 @@ class NeRD(nn.Module):
                 for name, buffer in module._buffers.items():
                     if buffer is not None:
                         module._buffers[name] = buffer.to(fn(buffer).device)
-                for weight in module._parameters.values():  # of a simulator
+                for weight in module._parameters.values():  # of an analytic step
                     if weight is not None:
                         weight.data = weight.data.to(fn(weight.data).device)
+        self.zero, self.one = (x.to(fn(x).device) for x in (self.zero, self.one))
         self.network._apply(fn, recurse)
         return self
 

@@ -41,7 +41,7 @@ from torchrl_nerd.scenes.terrain import Terrain
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
 LARGEST_REDRAWS = 300  # of starts that are not clear of the ground
-REFERENCE_RATIO = 4  # of a finer teacher: its substeps in one of the scene's own
+REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +55,7 @@ class Scene:
     | ``substeps`` | MuJoCo steps per control step |
     | ``controller`` | turns actions into joint torques |
     | ``sampling`` | ranges of training states and torques |
-    | ``reference_ratio`` | substeps in one of the robot's own, see `fine`; else 1 |
-    | ``foresees_forces`` | whether the forces of its springs, at limits and contacts (see
-      `scenes.penalty_law`), are among the features: where they decide most steps |
-    | ``foresees_free_motion`` | whether contacts are foreseen along the way that the robot
-      takes if nothing touches it, not at constant velocity: where onsets decide |
+    | ``reference_ratio`` | substeps in one of the scene's own, see `reference`; else 1 |
 
     Raises:
         ValueError: the model has something no NeRD can be built for (named).
@@ -71,8 +67,6 @@ class Scene:
     controller: Controller
     sampling: Sampling
     reference_ratio: int = 1
-    foresees_forces: bool = False
-    foresees_free_motion: bool = False
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -150,16 +144,16 @@ class Scene:
 
     @cached_property
     def reference(self) -> "Scene":
-        """A finer teacher: MuJoCo's RK4, four substeps in one of the scene's own.
+        """The reference solver's scene: MuJoCo's RK4, four substeps in one of its own.
 
-        A model that learned from it steps as fast as any other and is not bound to the
-        error of the scene's own solver. To the model both are the same scene.
+        A model trained on it steps as fast as any other and does not share the error of
+        the scene's own solver.
         """
         if self.reference_ratio > 1:
             return self
         rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-        fine = self.with_substeps(REFERENCE_RATIO * self.substeps, rk4)
-        return replace(fine, reference_ratio=REFERENCE_RATIO)
+        finer = self.with_substeps(REFERENCE_RATIO * self.substeps, rk4)
+        return replace(finer, reference_ratio=REFERENCE_RATIO)
 
     @cached_property
     def layout(self) -> JointLayout:
@@ -229,12 +223,6 @@ class Scene:
             points_merged=len(stands_for) - fixed - len(self.contacts),
             points_fixed=fixed,
         )
-
-    def foreseeing(self, forces: bool, free_motion: bool = False) -> "Scene":
-        """The same scene with forces among the features, with or without free motion."""
-        if (self.foresees_forces, self.foresees_free_motion) == (forces, free_motion):
-            return self
-        return replace(self, foresees_forces=forces, foresees_free_motion=free_motion)
 
     @cached_property
     def hash(self) -> str:

@@ -20,8 +20,8 @@ from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.evaluation.parameter_fit import WINDOWS
 from torchrl_nerd.evaluation.toss_error import STATES
+from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.convergence import converged, score
 from torchrl_nerd.training.low_rank import add_low_rank, merge_low_rank
@@ -67,7 +67,6 @@ class FineTuner:
         self.config, self.tosses, self.quiet = config, tosses, quiet
         self.train = train
         self.model, self.keep = copy.deepcopy(model), keep
-        self.model.flight = None  # measured bodies fall as they do, not as the scene's
         self.view = TossView(model.scene, tosses, config, model.device)
         states = STATES if config.update == "physics" else config.sequence_length + 1
         self.starts = self.view.starts(states, train)
@@ -77,7 +76,7 @@ class FineTuner:
                 raise ValueError(
                     f"expected {name} tosses that are long enough, got none"
                 )
-        if config.update == "physics" and not isinstance(model, ResidualNeRD):
+        if config.update == "physics" and not isinstance(model, HybridNeRD):
             raise SettingError(
                 "expected a model with a simulator for update 'physics', got another: "
                 "give update 'all', 'head' or 'low-rank'"
@@ -92,8 +91,8 @@ class FineTuner:
             weight.requires_grad_(is_chosen)
         chosen = [w for w in network.parameters() if w.requires_grad]
         groups = [{"params": chosen, "lr": config.lr}]
-        if isinstance(model, ResidualNeRD):
-            simulator = cast(ResidualNeRD, self.model).simulator
+        if isinstance(model, HybridNeRD):
+            simulator = cast(HybridNeRD, self.model).analytic_step
             physics = [simulator.raw]
             groups.append({"params": physics, "lr": config.physics_lr})
         if self.view.encoder is not None:
@@ -133,7 +132,7 @@ class FineTuner:
 
     def _fit(self) -> None:
         """Physics alone, without gradients; an evaluation counts as its share of one."""
-        model, evaluations = cast(ResidualNeRD, self.model), self.config.evaluations
+        model, evaluations = cast(HybridNeRD, self.model), self.config.evaluations
         epoch = len(self.starts)
         planned = evaluations * sum(min(windows, epoch) for windows in WINDOWS)
         seen = 0

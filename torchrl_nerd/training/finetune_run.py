@@ -15,8 +15,8 @@ from torchrl_nerd.checkpoint import (
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import SHIPPED, load_tosses
 from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tensor_files import write_tensors
 from torchrl_nerd.training.finetune import FineTuner
@@ -70,8 +70,8 @@ def finetune(
 
     def keep(best: NeRD) -> None:
         figures = {**made, **tuner.card()["finetuning"]}
-        if isinstance(best, ResidualNeRD):
-            figures["simulator"] = best.simulator.values()
+        if isinstance(best, HybridNeRD):
+            figures["simulator"] = best.analytic_step.values()
         card = make_card(best, {"finetuning": figures})
         save_checkpoint(best, out, card)
         write_json(out / "curve.json", {"curve": tuner.curve})

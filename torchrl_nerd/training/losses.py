@@ -64,9 +64,12 @@ def rollout_loss(
     position, velocity = qpos[:, 0], qvel[:, 0]
     errors = []
     for step in range(joint_torque.shape[1]):
-        token = model.encode(position, velocity, joint_torque[:, step], terrain)
-        output = network.step(token, memory)
-        position, velocity = model.decode(position, velocity, output)
+        position, velocity, _ = model.step(
+            (position, velocity),
+            joint_torque[:, step],
+            terrain,
+            lambda token: network.step(token, memory),
+        )
         slip = differentiate_pos(layout, qpos[:, step + 1], position)
         slip = slip / (scale * delta.step_size)
         drift = (velocity - qvel[:, step + 1]) / scale

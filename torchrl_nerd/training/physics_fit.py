@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterator
 
 from torch import Tensor
 
+from torchrl_nerd.analytic.free_body import PARAMETERS
 from torchrl_nerd.evaluation.parameter_fit import fit_flight, fit_parameters
 from torchrl_nerd.evaluation.toss_error import STATES
-from torchrl_nerd.modules.penalty_step import PARAMETERS
-from torchrl_nerd.modules.residual import ResidualNeRD
+from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.training.toss_view import TossView
 
 
 def fit_physics(
-    model: ResidualNeRD,
+    model: HybridNeRD,
     view: TossView,
     train: Tensor,
     evaluations: int,
@@ -32,14 +32,14 @@ def fit_physics(
     """
 
     def errors_of(values: dict[str, float], rows: Tensor) -> tuple[Tensor, Tensor]:
-        model.simulator.set_values(values)
+        model.analytic_step.set_values(values)
         show(len(rows))
         seen = slice(view.every - 1, None, view.every)
         distance, angle = view.errors(model, rows)
         return distance[:, seen], angle[:, seen]
 
     flight = fit_flight(model.scene, view.seen.select(train), view.every)
-    first, starts = model.simulator.values() | flight, view.starts(STATES, train)
+    first, starts = model.analytic_step.values() | flight, view.starts(STATES, train)
     for found in fit_parameters(errors_of, first, PARAMETERS, starts, evaluations):
-        model.simulator.set_values(found)
+        model.analytic_step.set_values(found)
         yield found

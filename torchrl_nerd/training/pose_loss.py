@@ -26,8 +26,9 @@ def rollout(model: NeRD, qpos: Tensor, qvel: Tensor, steps: int) -> Tensor:
     memory, idle = network.empty_memory(len(qpos)), qpos[:, :0]
     path = []
     for _ in range(steps):
-        token = model.encode(qpos, qvel, idle, None)
-        qpos, qvel = model.decode(qpos, qvel, network.step(token, memory))
+        qpos, qvel, _ = model.step(
+            (qpos, qvel), idle, None, lambda token: network.step(token, memory)
+        )
         path.append(qpos)
     return torch.stack(path, 1)
 

@@ -1,16 +1,18 @@
 """Training data on the device: tokens and targets once, batches by one gather."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
-from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.images import Images, telling_rows
@@ -18,11 +20,48 @@ from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 PART = 1024  # trajectories turned into tokens at a time
-FEW = 32  # of them at a time are stepped: what a step takes stays in a cache
+FEW = 32  # trajectories that an analytic step takes at a time: fits the cache
 LOOK = 8  # parts in which images of tokens are looked for
 # ... and beside them states in which every contact point has features, which those of a
 # small data set may never have
 LOW_ROWS, SUNKEN = 256, 1.0  # -, m
+
+
+class Inputs(NamedTuple):
+    """What the network of a model is given, and what its output is added to."""
+
+    token: Tensor  # (*batch, token_size), float32
+    base: Tensor  # (*batch, D): the analytic change of a hybrid; (): zero
+    gate: Tensor  # (*batch, 1) of a hybrid; (): one
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, model: NeRD, data: TensorDict, features: Tensor) -> "Inputs":
+        """Those of a whole data set, unclamped; a learned model's are its features."""
+        if model.kind == "learned":
+            return cls(features, model.zero.float(), model.one.float())
+        parts = []
+        for part in data.split(FEW):
+            state, terrain = (part[QPOS], part[QVEL]), part.get(TERRAIN, None)
+            found = model.encode(*state, part[JOINT_TORQUE], terrain)
+            parts.append([x.float() for x in found[1:]])
+        return cls(*(torch.cat(x) for x in zip(*parts, strict=True)))
+
+    def __getitem__(self, index: tuple[Tensor, Tensor]) -> "Inputs":  # pyright: ignore
+        """Those of some samples."""
+        return Inputs(*(x[index] if x.ndim else x for x in tuple(self)))
+
+    def change(self, output: Tensor) -> Tensor:
+        """The normalised change ``(*batch, D)`` that a network's output makes."""
+        return self.base + self.gate * output
+
+    def to(self, device: torch.device) -> "Inputs":
+        """The same on another device."""
+        return Inputs(*(x.to(device) for x in tuple(self)))
+
+    def share(self, share: Callable[[Tensor], Tensor]) -> "Inputs":
+        """The part of each that a rank takes."""
+        return Inputs(*(share(x) if x.ndim else x for x in tuple(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +78,12 @@ class Symmetry:
     images: dict[str, Images]
 
     @classmethod
-    def of(cls, scene: Scene, data: TensorDict) -> "Symmetry":
-        """The symmetry of a robot, its tokens' images found in samples of ``data``."""
+    def of(
+        cls, scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
+    ) -> "Symmetry":
+        """The symmetry of a robot, its features' images found in samples of ``data``."""
         isometries = find_isometries(scene)
-        tokens, targets = SceneTokens(scene), StateDelta(scene)
+        tokens, targets = SceneFeatures(scene, config), StateDelta(scene)
         low = states_in_contact(scene, LOW_ROWS, SUNKEN)
 
         def telling(flat: TensorDict) -> TensorDict:
@@ -93,7 +134,7 @@ class Sequences:
         symmetry: show each sample as a random one of its images.
 
     Raises:
-        ValueError: images of what a simulator within the model foresees.
+        ValueError: symmetry images of a hybrid, whose analytic change has none.
     """
 
     def __init__(
@@ -103,15 +144,13 @@ class Sequences:
         device: torch.device,
         symmetry: Symmetry | None = None,
     ) -> None:
-        if symmetry is not None and model.has_simulator:
+        if symmetry is not None and model.kind == "hybrid":
             raise ValueError(
-                "expected training without use_symmetry for a model with a simulator "
-                f"within, got {type(model).__name__} with it"
+                "expected training without use_symmetry for a hybrid, got it with one"
             )
-        tokens, targets = normalised(model, data)
-        if model.has_simulator:
-            tokens = torch.cat((tokens, foreseen(model, data)), -1)
-        self.tokens, self.targets = tokens.to(device), targets.to(device)
+        features, targets = normalised(model, data)
+        self.features, self.targets = features, targets.to(device)
+        self.inputs = Inputs.of(model, data, features).to(device)
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
         self.steps = data.batch_size[1]
@@ -120,24 +159,25 @@ class Sequences:
         self, rows: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor]:
         """Random trajectories and times: indices ``(rows, 1), (rows, length)``."""
-        device = self.tokens.device
-        row = torch.randint(len(self.tokens), (rows, 1), generator=generator)
+        device = self.targets.device
+        row = torch.randint(len(self.targets), (rows, 1), generator=generator)
         last = self.steps - length + 1
         start = torch.randint(last, (rows, 1), generator=generator)
         return row.to(device), (start + torch.arange(length)).to(device)
 
     def one_step(
         self, rows: int, length: int, generator: Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Tokens and targets ``(rows, length, D)``."""
+    ) -> tuple["Inputs", Tensor]:
+        """Network inputs and targets of ``(rows, length)`` samples."""
         row, time_index = self.pick(rows, length, generator)
-        tokens, targets = self.tokens[row, time_index], self.targets[row, time_index]
+        inputs, targets = self.inputs[row, time_index], self.targets[row, time_index]
         if self.symmetry is None:
-            return tokens, targets
+            return inputs, targets
         count = len(self.symmetry.isometries)
-        choice = torch.randint(count, (rows,), generator=generator).to(tokens.device)
+        choice = torch.randint(count, (rows,), generator=generator).to(targets.device)
         images = self.symmetry.images
-        return images[TOKEN](tokens, choice), images[TARGET](targets, choice)
+        tokens = images[TOKEN](inputs.token, choice)
+        return inputs._replace(token=tokens), images[TARGET](targets, choice)
 
     def rollout(
         self, rows: int, length: int, generator: Generator
@@ -158,7 +198,7 @@ class Sequences:
 
 
 def raw_tokens(
-    tokens: SceneTokens, state_delta: StateDelta, data: TensorDict
+    tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
 ) -> tuple[Tensor, Tensor]:
     """Unnormalised tokens ``(*batch, F)`` and targets ``(*batch, D)``, float64."""
     terrain = data.get(TERRAIN, None)
@@ -167,13 +207,15 @@ def raw_tokens(
     return token, target
 
 
-def data_stats(scene: Scene, data: TensorDict) -> dict[NestedKey, Stats]:
-    """Exact statistics of a scene's own tokens and targets over a data set."""
-    return stats_of(SceneTokens(scene), StateDelta(scene), data)
+def data_stats(
+    scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
+) -> dict[NestedKey, Stats]:
+    """Exact statistics of a scene's features and targets over a data set."""
+    return stats_of(SceneFeatures(scene, config), StateDelta(scene), data)
 
 
 def stats_of(
-    tokens: SceneTokens, state_delta: StateDelta, data: TensorDict
+    tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
 ) -> dict[NestedKey, Stats]:
     """Exact statistics of tokens and targets over a data set, each rank's part of it."""
     size = min(PART, -(-len(data) // ranks.world()))
@@ -192,38 +234,28 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
     """Features and targets of transitions, normalised, float32 ``(*batch, D)``."""
     tokens, targets = (
         torch.empty(*data.batch_size, size, device=data[QPOS].device)
-        for size in (model.tokens.size, model.state_delta.size)
+        for size in (model.scene_features.size, model.state_delta.size)
     )
     for part, *places in zip(
         data.split(PART), tokens.split(PART), targets.split(PART), strict=True
     ):
-        raw = raw_tokens(model.tokens, model.state_delta, part)
+        raw = raw_tokens(model.scene_features, model.state_delta, part)
         for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
             place.copy_(model.normalize.normalize(key, value))
     return tokens, targets
 
 
-@torch.no_grad()
-def foreseen(model: NeRD, data: TensorDict) -> Tensor:
-    """What the simulator within foresees, float32 ``(*batch, model.token_size - F)``."""
-    found = []
-    for part in data.split(FEW):
-        state, terrain = (part[QPOS], part[QVEL]), part.get(TERRAIN, None)
-        found.append(model.foresee(*state, part[JOINT_TORQUE], terrain).float())
-    return torch.cat(found)
-
-
 def cover(
     model: NeRD, data: TensorDict, samples: tuple[Tensor, Tensor] | None = None
 ) -> None:
-    """Tell a model what it learns from, for its bounds and its trust.
+    """Fit a model's training range and out-of-distribution score to its data.
 
     Args:
-        model: whose `Coverage` is filled.
+        model: changed in place.
         data: transitions, ``[trajectories, steps]``.
-        samples: their normalised tokens and targets, where they are there already.
+        samples: their normalised features and targets, where they are there already.
     """
-    tokens, targets = samples or normalised(model, data)
-    features = tokens[..., : model.tokens.size]
+    features, targets = (x.flatten(0, -2) for x in samples or normalised(model, data))
     seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
-    model.coverage.fit(features.flatten(0, -2), targets.flatten(0, -2), *seen)
+    model.training_range.fit(features, targets, *seen)
+    model.ood.fit(features)

@@ -1,79 +1,92 @@
-"""The model that a training begins with: fresh, or with all that another one learned."""
+"""The model that a training begins with: fresh, or another one's weights."""
 
 import hashlib
+from collections.abc import Mapping
 
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 
-from torchrl_nerd.checkpoint import make_model
-from torchrl_nerd.modules.correction import GroundedConfig
-from torchrl_nerd.modules.nerd import Config, NeRD
-from torchrl_nerd.modules.networks import NETWORKS, STEPS, network_config
+from torchrl_nerd.analytic import make_step, step_config
+from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import Symmetry, data_stats
+from torchrl_nerd.transforms import Stats
+
+
+def make_model(
+    scene: Scene, config: TrainConfig, stats: Mapping[NestedKey, Stats] | None = None
+) -> NeRD:
+    """The model that a configuration describes, with random weights.
+
+    Args:
+        scene: the robot.
+        config: network, features and, for a hybrid, the analytic step.
+        stats: of its features and targets.
+
+    Raises:
+        ValueError: no such network or step, or a scene that the step cannot move.
+    """
+    network, features = network_config(config.network), config.features
+    if config.step is None:
+        return NeRD(scene, features, network, stats)
+    step = make_step(scene, step_config(config.step))
+    return HybridNeRD(scene, step, features, network, stats)
 
 
 def fresh_model(
-    scene: Scene, data: TensorDict, network: str, symmetry: Symmetry | None
+    scene: Scene, data: TensorDict, config: TrainConfig, symmetry: Symmetry | None
 ) -> NeRD:
-    """A model that has learned nothing, with the statistics of its data.
+    """A model with random weights and the statistics of its data.
 
     Args:
         scene: the robot.
         data: transitions, ``[trajectories, steps]``.
-        network: name in `NETWORKS`.
+        config: see `make_model`.
         symmetry: whose images count as data too.
     """
-    config = network_config(network)
-    scene = seen_by(config, scene)
-    stats = data_stats(scene, data)
+    stats = data_stats(scene, data, config.features)
     if symmetry is not None:
         stats = symmetry.complete(stats)
     return make_model(scene, config, stats)
 
 
-def seen_by(config: Config, scene: Scene) -> Scene:
-    """The scene with the features that such a network is shown.
-
-    What its springs push with, and where, a `GroundStep` finds out by itself.
-    """
-    return scene.foreseeing(False) if isinstance(config, GroundedConfig) else scene
-
-
 def begin_from(
-    start: NeRD, scene: Scene, network: str, symmetry: Symmetry | None = None
+    start: NeRD, scene: Scene, config: TrainConfig, symmetry: Symmetry | None = None
 ) -> NeRD:
-    """A model with weights and statistics of another one, for the scene as it is given.
+    """A model with weights and statistics of another one.
 
     The statistics stay as they are: what the network's inputs mean is part of what it
-    learned. Features may have other values, as where forces are foreseen in another way,
-    but not another width. What the data cover is left to be found.
+    learned. The training range is left to be fitted.
 
     Args:
         start: whose weights; left as it is.
         scene: the robot.
-        network: name in `NETWORKS`, which must be that of ``start``.
+        config: must describe a network like that of ``start``.
         symmetry: images of samples that will be shown.
 
     Raises:
-        ValueError: in one sentence, another network, features of another width, or
-            statistics that the images do not share.
+        ValueError: in one sentence, another network, kind or step, inputs of another
+            width, or statistics that the images do not share.
     """
-    config = network_config(network)
-    if start.config != config:
-        names = [
-            name for name, known in (NETWORKS | STEPS).items() if known == start.config
-        ]
+    if start.config != network_config(config.network):
+        names = [name for name, known in NETWORKS.items() if known == start.config]
         raise ValueError(
             f"expected the network of the model to start from, "
-            f"{' or '.join(names) or start.config}, got {network}"
+            f"{' or '.join(names) or start.config}, got {config.network}"
         )
-    model = make_model(seen_by(config, scene), config)
-    widths, found = ((m.tokens.size, m.state_delta.size) for m in (model, start))
+    model = make_model(scene, config)
+    if type(model) is not type(start):
+        raise ValueError(
+            f"expected a {model.kind} model to start from, got a {start.kind} one"
+        )
+    widths, found = ((m.token_size, m.state_delta.size) for m in (model, start))
     if widths != found:
         raise ValueError(
-            f"expected a model to start from with {widths[0]} features and "
-            f"{widths[1]} outputs as scene '{scene.name}' has, got {found[0]} and "
-            f"{found[1]}"
+            f"expected a model to start from with {widths[0]} inputs and {widths[1]} "
+            f"outputs as scene '{scene.name}' has, got {found[0]} and {found[1]}"
         )
     model.network.load_state_dict(start.network.state_dict())
     model.normalize.load_state_dict(start.normalize.state_dict())
@@ -86,7 +99,7 @@ def begin_from(
 
 
 def fingerprint(model: NeRD) -> str:
-    """Hash of weights, statistics and coverage, by which a run knows its start."""
+    """Hash of weights, statistics and range, by which a run knows its start."""
     digest = hashlib.sha256()
     for key, value in sorted(model.state_dict().items()):
         digest.update(key.encode() + value.cpu().contiguous().numpy().tobytes())

@@ -3,15 +3,15 @@
 import torch
 from tensordict.utils import NestedKey
 
-from torchrl_nerd.configs import FinetuneConfig
+from torchrl_nerd.analytic import FreeBodyPenaltyStep
+from torchrl_nerd.configs import NO_PREDICTIONS, FinetuneConfig
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.evaluation.system_identification import PUBLISHED
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
-from torchrl_nerd.modules.correction import ResidualConfig
+from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import network_config
-from torchrl_nerd.modules.residual import ResidualNeRD
-from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.robots.cube.scene import HALF
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import FineTuner
@@ -36,7 +36,7 @@ def toss_stats(scene: Scene, tosses: Tosses) -> dict[NestedKey, Stats]:
     """Statistics of tokens and targets over all transitions."""
     data = tosses.transitions()
     idle = data["next", "joint_torque"]
-    tokens = SceneTokens(scene)(data[QPOS], data[QVEL], idle, None)
+    tokens = SceneFeatures(scene)(data[QPOS], data[QVEL], idle, None)
     state = (data[key] for key in (QPOS, QVEL, NEXT_QPOS, NEXT_QVEL))
     return {TOKEN: Stats.of(tokens), TARGET: Stats.of(StateDelta(scene).delta(*state))}
 
@@ -59,10 +59,10 @@ def pretrain(
     """
     tosses = simulate_tosses(scene, CUBES, TOSSES, STATES, config.seed)
     torch.manual_seed(config.seed)
-    model = ResidualNeRD(scene, ResidualConfig(), toss_stats(scene, tosses))
+    model = _hybrid(scene, toss_stats(scene, tosses))
     cover(model, tosses.transitions())
     published = {**PUBLISHED, "inertia": 1.0, "size": PUBLISHED["size"] / HALF}
-    model.simulator.set_values(published)
+    model.analytic_step.set_values(published)
     number = torch.arange(len(tosses))
     parts = number[CHECKED:], number[:CHECKED]
     tuner = FineTuner(model.to(device), tosses, *parts, config, quiet)
@@ -81,8 +81,13 @@ def from_scratch(scene: Scene, tosses: Tosses, network: str, seed: int) -> NeRD:
     torch.manual_seed(seed)
     stats = toss_stats(scene, tosses)
     if network == "residual":
-        model: NeRD = ResidualNeRD(scene, ResidualConfig(), stats)
+        model: NeRD = _hybrid(scene, stats)
     else:
-        model = NeRD(scene, network_config(network), stats)
+        model = NeRD(scene, NO_PREDICTIONS, network_config(network), stats)
     cover(model, tosses.transitions())
     return model
+
+
+def _hybrid(scene: Scene, stats: dict[NestedKey, Stats]) -> HybridNeRD:
+    step = FreeBodyPenaltyStep(scene)
+    return HybridNeRD(scene, step, NO_PREDICTIONS, network_config("mlp-2x64"), stats)

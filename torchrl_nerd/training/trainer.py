@@ -108,22 +108,24 @@ class Trainer:
 
     def _build(self, data: TensorDict, init_from: NeRD | None) -> None:
         """The model, its statistics and its batches."""
-        symmetry = Symmetry.of(self.scene, data) if self.config.use_symmetry else None
+        symmetry = None
+        if self.config.use_symmetry:
+            symmetry = Symmetry.of(self.scene, data, self.config.features)
         if init_from is None:
             model = self.make_model(data, symmetry)
         else:
-            model = begin_from(init_from, self.scene, self.config.network, symmetry)
+            model = begin_from(init_from, self.scene, self.config, symmetry)
         self.init_from = None if init_from is None else fingerprint(init_from)
         self.sequences = Sequences(model, data, self.device, symmetry)
         self.model, self.resting = model.to(self.device), resting(self.sequences.data)
-        samples = self.sequences.tokens, self.sequences.targets
+        samples = self.sequences.features.to(self.device), self.sequences.targets
         cover(self.model, self.sequences.data, samples)
         if init_from is not None:
-            self.model.coverage.widen(init_from.coverage)
+            self.model.training_range.widen(init_from.training_range)
 
     def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
         """The configured model with fresh weights."""
-        return fresh_model(self.scene, data, self.config.network, symmetry)
+        return fresh_model(self.scene, data, self.config, symmetry)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Muon for the weights of linear layers, AdamW for all others."""
@@ -208,9 +210,9 @@ class Trainer:
         if torch.rand((), generator=generator) < config.single_step_fraction:
             count, length = count * length, 1
         batch = self.sequences.one_step(count, length, generator)
-        tokens, targets = map(ranks.share, batch)
-        outputs = self.model.network(tokens).float()
-        return one_step_loss(outputs, targets, config.loss_eps)
+        inputs, targets = batch[0].share(ranks.share), ranks.share(batch[1])
+        changes = inputs.change(self.model.network(inputs.token).float())
+        return one_step_loss(changes, targets, config.loss_eps)
 
     def _rollout_loss(self, generator: Generator) -> Tensor:
         """Loss of the model's own rollouts."""
@@ -266,7 +268,7 @@ class Trainer:
             "seconds": round(self.seconds, 1),
             "device": str(self.device),
             "threads": torch.get_num_threads(),
-            "trajectories": len(self.sequences.tokens),
+            "trajectories": len(self.sequences.targets),
             "init_from": self.init_from,
         }
         about = {"training": training, "validation_error": for_card(self.errors)}

@@ -1,16 +1,15 @@
-"""What the robot's contact points see of the ground, in the robot's own frame.
+"""Contact features of the ground, in the robot's own frame.
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
-zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out; where
-all there is is one plane that all rows share, and it is level (gravity is normal to it)
-or a fixed base cannot turn against it, n follows from gravity and pose and is left out
-too. Of several surfaces each point sees the nearest, so that a model fits any number.
+zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out. Where
+the ground is one plane that all rows share, and it is level (gravity is normal to it) or a
+fixed base cannot turn against it, n follows from gravity and pose and is left out too. Of
+several surfaces each point sees the nearest, so that a model fits any number.
 
-Added is what decides an impact: the point's velocity, and how deep it will be if it goes
-on: whether a point touches within the step is a threshold, which a network learns slowly
-from distance and speed. All of it fades to zero at the margin without a jump. Where a scene
-asks for it, the forces that its springs would push with on that way are worked out, too,
-and the way is that of a robot that nothing pushes back in place of one that keeps its
+Added are the point's velocity and its predicted penetration over the step: whether a point
+touches within the step is a threshold, which a network learns slowly from distance and
+speed. All of it fades to zero at the margin without a jump. `FeatureConfig` adds the
+predicted contact force, and predicts along unconstrained motion in place of constant
 velocity.
 """
 
@@ -20,11 +19,12 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.base import BasePose, over_ground
 from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.free_motion import FreeMotion
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -39,8 +39,11 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
-from torchrl_nerd.transforms.coming_depth import ComingDepth, num_glances
-from torchrl_nerd.transforms.ground_force import GroundForce
+from torchrl_nerd.transforms.predicted_force import PredictedForce
+from torchrl_nerd.transforms.predicted_penetration import (
+    PredictedPenetration,
+    num_times,
+)
 
 FADE = 0.25  # share of the way from margin to touching over which velocities fade in
 
@@ -54,17 +57,18 @@ class ContactFeatures(FeatureTransform):
     |---|---|---|
     | ``contact_distance`` | min(d - xi, 0), m | P |
     | ``contact_velocity`` | g * (normal speed, tangential velocity), m/s | 4 P |
-    | ``contact_depth`` | g * penetration at K times of the step, if qvel stayed; in scenes
-      that foresee free motion, along it (see `FreeMotion`), m | K P |
-    | ``contact_force`` | what springs push each dof with on that way, mean, N and N m; in
-      scenes that foresee forces, see `GroundForce` | nv |
+    | ``contact_depth`` | g * predicted penetration at K times of the step, at constant
+      velocity or, with ``unconstrained_motion``, along that motion, m | K P |
+    | ``contact_force`` | with ``predicted_force``: mean generalised force of the penalty
+      contacts over the step, N and N m, see `PredictedForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
-    The K = min(substeps, 5) times are those of `ComingDepth`. A scene without contact gives
-    no keys at all.
+    The K = min(substeps, 5) times are those of `PredictedPenetration`. A scene without
+    contact gives no keys at all.
 
     Args:
         scene: the robot and its ground.
+        features: which predictions to add; none by default.
 
     Examples:
         >>> transform = ContactFeatures(load_scene("cartpole"))
@@ -76,17 +80,17 @@ class ContactFeatures(FeatureTransform):
     radii: Tensor
     margins: Tensor
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, features: FeatureConfig = NO_PREDICTIONS) -> None:
         count, terrain = len(scene.contacts), scene.terrain
         sizes: dict[NestedKey, int] = {}
         in_keys: list[NestedKey] = []
         if terrain is not None:
             in_keys = [QPOS, QVEL]
             sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
-            sizes[CONTACT_DEPTH] = num_glances(scene) * count
+            sizes[CONTACT_DEPTH] = num_times(scene) * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
-            if scene.foresees_forces:
+            if features.predicted_force:
                 sizes[CONTACT_FORCE] = scene.layout.nv
             plane = terrain.fixed_plane
             is_level = (
@@ -102,24 +106,24 @@ class ContactFeatures(FeatureTransform):
             return
         points = scene.contacts
         bodies, positions = points.bodies, points.positions
-        self.force, self.free_motion, self.num_places = None, None, 0
-        if scene.foresees_forces or scene.foresees_free_motion:
-            axes = JointAxes.of(scene.model, scene.base)  # places found along the way
+        self.force, self.rigid_body, self.num_places = None, None, 0
+        if features.predicted_force or features.unconstrained_motion:
+            axes = JointAxes.of(scene.model, scene.base)
             self.num_places = len(axes.bodies)
             bodies = bodies + axes.bodies
             positions = np.concatenate((positions, axes.positions))
-            if scene.foresees_forces:
-                self.force = GroundForce(scene, axes)
-            if scene.foresees_free_motion:
+            if features.predicted_force:
+                self.force = PredictedForce(scene, axes)
+            if features.unconstrained_motion:
                 robot = scene.model, scene.base, axes, scene.actuated
-                self.free_motion = FreeMotion(*robot)
-                bodies = bodies + self.free_motion.bodies
-                positions = np.concatenate((positions, self.free_motion.positions))
+                self.rigid_body = RigidBodyDynamics(*robot)
+                bodies = bodies + self.rigid_body.bodies
+                positions = np.concatenate((positions, self.rigid_body.positions))
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
         self.count, self.num_known = count, count + self.num_places
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         self.pose = BasePose(scene.base, scene.fixed_base_pose)
-        self.coming_depth = ComingDepth(scene, self.ground, self.pose)
+        self.coming_depth = PredictedPenetration(scene, self.ground, self.pose)
         keep_constants(self, radii=points.radii, margins=points.margins)
 
     def contact_features(
@@ -135,8 +139,8 @@ class ContactFeatures(FeatureTransform):
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
-            joint_torque: ``(*batch, num_actuated)`` of the coming step, which free motion
-                follows; None where it is not known, as in an observation.
+            joint_torque: ``(*batch, num_actuated)`` of the coming step, for its prediction;
+                None where it is not known, as in an observation.
         """
         if self.terrain is None:
             return []
@@ -153,9 +157,9 @@ class ContactFeatures(FeatureTransform):
         speed = (velocity * normal).sum(-1)
         sliding = velocity - speed[..., None] * normal
         gain = None
-        if self.free_motion is not None:
+        if self.rigid_body is not None:
             where = pose[1], corners, places
-            gain = self.free_motion(qpos, qvel, joint_torque, *where, self.step_size)
+            gain = self.rigid_body(qpos, qvel, joint_torque, *where, self.step_size)
             gain = self.step_size * gain
         depth = self.radii - distance
         depth = gate * self.coming_depth(qpos, qvel, terrain, gain, depth, speed)

@@ -1,4 +1,4 @@
-"""The robot's state in its own frame: where it stands and faces does not matter.
+"""The robot's state in its own frame, invariant under translation and yaw.
 
 NeRD section 3.3. Dynamics do not depend on horizontal position and heading, so they are
 not features; nor is any other coordinate that `Scene.symmetries` found to be ignored.
@@ -11,16 +11,18 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
+from torchrl_nerd.geometry.penalty import limit_forces
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
 from torchrl_nerd.scenes.penalty_law import limit_springs
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
-LIMIT_STEPS = 1.5  # a limit is seen this many control steps ahead, at top speed
+LIMIT_STEPS = 1.5  # control steps at top speed from which on a limit is a feature
 FADE = 0.25  # share of the margin over which a gated velocity fades in
-GLANCES = 5  # parts of a step at whose ends a limit's torque is foreseen
+NUM_TIMES = 5  # intervals of a step at whose ends limit torques are predicted
 
 
 class RobotCentric(FeatureTransform):
@@ -34,12 +36,13 @@ class RobotCentric(FeatureTransform):
     | | ball: first two columns of its rotation matrix | 6 |
     | | limited joint: gaps to both limits, minus the margin, at most 0 | 2 |
     | | velocity of every dof; one that the free dynamics ignore only near a limit | 1 |
-    | | limited joint of a scene that foresees forces: mean torque of the limit's spring
-      and damper over the step, if ``qvel`` stayed | 1 |
+    | | limited joint, with ``predicted_force``: mean torque of the limit's spring and
+      damper over the step at constant velocity | 1 |
     | ``robot_torque`` | ``("next", "joint_torque")``, where there is one | actuated dofs |
 
     Args:
         scene: the robot.
+        features: whether to predict limit torques; not by default.
 
     Examples:
         >>> transform = RobotCentric(load_scene("cartpole"))
@@ -50,8 +53,8 @@ class RobotCentric(FeatureTransform):
 
     why_no_inverse = "position and heading are not among its features"
 
-    def __init__(self, scene: Scene) -> None:
-        joints = _JointFeatures.from_scene(scene)
+    def __init__(self, scene: Scene, features: FeatureConfig = NO_PREDICTIONS) -> None:
+        joints = _JointFeatures.from_scene(scene, features)
         state_size = joints.size + 9 * scene.base.is_floating
         sizes: dict[NestedKey, int] = {ROBOT_STATE: state_size}
         if scene.actuated:
@@ -98,7 +101,7 @@ class _JointFeatures:
     | ``limited`` | qpos of limited joints |
     | ``limits`` | low, high, margin of each |
     | ``gated`` | (index into limited, dof): velocity near a limit |
-    | ``pressed`` | dofs of the limited joints whose torque is foreseen |
+    | ``predicted`` | dofs of the limited joints whose limit torque is predicted |
     | ``springs`` | stiffness, damping of each |
     """
 
@@ -110,11 +113,11 @@ class _JointFeatures:
     limited: list[int] = field(default_factory=list)
     limits: list[tuple[float, float, float]] = field(default_factory=list)
     gated: list[tuple[int, int]] = field(default_factory=list)
-    pressed: list[int] = field(default_factory=list)
+    predicted: list[int] = field(default_factory=list)
     springs: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
-    def from_scene(cls, scene: Scene) -> "_JointFeatures":
+    def from_scene(cls, scene: Scene, features: FeatureConfig) -> "_JointFeatures":
         found = cls(scene.control_step)
         model, ignored = scene.model, scene.symmetries
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
@@ -143,9 +146,9 @@ class _JointFeatures:
                 # from the end: the ranges may leave out a floating base, which is first
                 fastest = float(speed[v - model.nv])
                 margin = LIMIT_STEPS * scene.control_step * fastest
-                if scene.foresees_forces:
+                if features.predicted_force:
                     stiffness, damping = limit_springs(model, [joint])
-                    found.pressed.append(v)
+                    found.predicted.append(v)
                     found.springs.append((stiffness.item(), damping.item()))
                 found.limited.append(q)
                 found.limits.append((low, high, margin))
@@ -154,7 +157,7 @@ class _JointFeatures:
     @property
     def size(self) -> int:
         configuration = 2 * len(self.angles) + len(self.positions) + 6 * len(self.balls)
-        limits = 2 * len(self.limited) + len(self.gated) + len(self.pressed)
+        limits = 2 * len(self.limited) + len(self.gated) + len(self.predicted)
         return configuration + len(self.velocities) + limits
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
@@ -174,19 +177,18 @@ class _JointFeatures:
                 rows, dofs = map(list, zip(*self.gated, strict=True))
                 depth = -torch.minimum(below, above) / (FADE * margin)
                 parts.append(qvel[..., dofs] * depth[..., rows].clamp(0.0, 1.0))
-        if self.pressed:
+        if self.predicted:
             parts.append(self._limit_torque(qpos[..., self.limited], qvel))
         return parts
 
     def _limit_torque(self, position: Tensor, qvel: Tensor) -> Tensor:
-        """Mean torque of the limits' springs and dampers over the step, N m."""
+        """Mean predicted torque of the limits' springs and dampers over the step, N m."""
         low, high, _ = position.new_tensor(self.limits)[..., None].unbind(-2)
         stiffness, damping = position.new_tensor(self.springs)[..., None].unbind(-2)
-        speed = qvel[..., self.pressed, None]
+        speed = qvel[..., self.predicted, None]
         times = torch.linspace(
-            0.0, self.step_size, GLANCES + 1, dtype=qvel.dtype, device=qvel.device
+            0.0, self.step_size, NUM_TIMES + 1, dtype=qvel.dtype, device=qvel.device
         )
         there = position[..., None] + speed * times
-        beyond = (there - high).clamp_min(0.0) - (low - there).clamp_min(0.0)
-        drag = torch.where(beyond == 0.0, 0.0, damping * speed)
-        return -(stiffness * beyond + drag).mean(-1)
+        below, above = limit_forces(stiffness, damping, low, high, there, speed)
+        return (below + above).mean(-1)

@@ -11,8 +11,7 @@ import torch
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
-from torchrl_nerd.modules.baselines import MLPConfig
-from torchrl_nerd.modules.correction import CorrectionConfig
+from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 
@@ -106,11 +105,13 @@ def learned_contenders(
     ]
     for name in models or shipped:
         model = from_pretrained(name, scene).to(device)
+        if not isinstance(model, NeRD):
+            continue
         yield _learned(name, model)
         yield Contender(f"{name}, guarded", True, _guarded(model))
         if is_compiling:
             yield _learned(f"{name}, compiled", model, compile=True)
-        if not isinstance(model.config, MLPConfig | CorrectionConfig):  # no history
+        if not isinstance(model.config, MLPConfig):  # no history
             yield _learned(f"{name}, window", model, inference="window")
         half = copy.deepcopy(model).to(torch.bfloat16)
         yield _learned(f"{name}, bf16", half)

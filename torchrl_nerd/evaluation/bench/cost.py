@@ -10,7 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import Memory, Network
+from torchrl_nerd.modules.nerd import History, Network
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,6 @@ def memory_bytes(network: Network) -> int:
     return two - one
 
 
-def _tensors(memory: Memory) -> list[Tensor]:
+def _tensors(memory: History) -> list[Tensor]:
     parts = (x if isinstance(x, list) else [x] for x in vars(memory).values())
     return list(chain.from_iterable(parts))

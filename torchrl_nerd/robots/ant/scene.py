@@ -67,5 +67,4 @@ def ant() -> Scene:
             torque=(GAIN,) * 8,
             base=base,
         ),
-        foresees_forces=True,  # 400 N m press most joints against their limits
     )

@@ -79,7 +79,6 @@ def anymal() -> Scene:
             zero_torque_fraction=0.1,
             low_torque_fraction=0.4,
         ),
-        foresees_forces=True,
     )
 
 

@@ -43,7 +43,7 @@ LIGHTER = 0.37 / 1.15102
 @cache
 def cube() -> Scene:
     """Build the scene. ``qpos`` = centre (m), quaternion."""
-    return cube_scene("cube", CONTACT).foreseeing(True)
+    return cube_scene("cube", CONTACT)
 
 
 @cache
@@ -68,8 +68,7 @@ def cube_slope() -> Scene:
         rgba=level.rgba,
     )
     spec.delete(level)
-    scene = cube_scene("cube_slope", CONTACT, spec.compile(), sample_slope)
-    return scene.foreseeing(True)
+    return cube_scene("cube_slope", CONTACT, spec.compile(), sample_slope)
 
 
 def sample_slope(qpos: Tensor, generator: Generator) -> Tensor:

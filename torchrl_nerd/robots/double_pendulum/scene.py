@@ -81,8 +81,6 @@ def _scene(
             level_ground=None if ground is None else sample_level_ground,
             clearance=clearance,
         ),
-        foresees_forces=True,
-        foresees_free_motion=True,  # a tip moves by centimetres before it touches
     )
 
 

@@ -37,7 +37,7 @@ def _run(world: World, generator: Generator, scale: float) -> Figures:
     if scene.base.is_floating and isinstance(world.dynamics, NeRDDynamics):
         q, v = scene.base.qpos_address, scene.base.dof_address
         moved = path[QPOS][:, 1:, q : q + 3] - path[QPOS][:, :-1, q : q + 3]
-        limit = float(world.dynamics.model.coverage.speed[v])
+        limit = float(world.dynamics.model.training_range.speed[v])
         allowed = (1.0 + ROUNDING) * limit * scene.control_step * (steps // KEPT)
         figures[LEAP] = float((length(moved) - allowed).clamp(min=0.0).amax())
     return figures

@@ -45,7 +45,7 @@ def _over(world: World, scene: Scene) -> World:
     if not isinstance(world.dynamics, NeRDDynamics):
         return DynamicsWorld(MujocoDynamics(scene))
     old = world.dynamics.model
-    model = type(old)(scene, old.config)
+    model = old.copy_for(scene)
     model.load_state_dict(old.state_dict())
     return DynamicsWorld(NeRDDynamics(model.to(old.device)))
 

@@ -90,17 +90,16 @@ def scores(model: NeRD, data: TensorDict, **others: Tensor) -> dict[str, Tensor]
     after = MujocoDynamics(model.scene).step(data, torque, terrain)
     fine = torch.all(after[QVEL].isfinite(), -1)
     target = model.state_delta.delta(*now, after[QPOS], after[QVEL])
-    features = model.features(*now, torque, terrain)
-    token = model.assemble(features, *now, torque, terrain)
     with torch.no_grad():
+        features, token, base, gate = model.encode(*now, torque, terrain)
         output = model.network.step(token, model.network.empty_memory(len(token)))
-    error = output.double() - model.normalize.normalize(TARGET, target)
-    coverage = model.coverage
+    change = base + gate * output.double()
+    error = change - model.normalize.normalize(TARGET, target)
     found = {
         "error": error.square().mean(-1).sqrt(),
-        "distance": coverage.distance(features),
-        "mahalanobis": coverage.mahalanobis(features),
-        "excess": coverage.excess(features),
+        "distance": model.ood_score(features),
+        "mahalanobis": model.ood.mahalanobis(features),
+        "excess": model.training_range.excess(features),
         **others,
     }
     return {name: score[fine].cpu() for name, score in found.items()}

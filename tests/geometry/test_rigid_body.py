@@ -1,0 +1,89 @@
+"""Free motion: what MuJoCo's own mass matrix and bias forces say."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from helpers import make_scene, random_transitions
+
+from torchrl_nerd.geometry.base import base_pose
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
+from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.robots import SCENES, load_scene
+
+ROWS = 16
+BRANCHED = """<mujoco><option gravity="1 -2 -9"/><worldbody>
+  <body pos="0.1 0.2 1" euler="20 30 40"><joint type="{first}" axis="1 2 3"
+    pos="0.1 0.1 0.2" damping="0.7" stiffness="3" springref="0.2" armature="0.1"/>
+    <inertial pos="0.1 -0.1 0.2" mass="2" fullinertia="0.2 0.3 0.25 0.02 0.03 -0.04"/>
+    <geom size="0.1" pos="0 0 -0.2"/>
+    <body pos="0.3 0 0" euler="10 0 50"><joint type="slide" axis="0 1 1" pos="0.1 0 0"/>
+      <geom type="box" size="0.1 0.2 0.3" pos="0.1 0.1 0" euler="5 6 7"/>
+      <body pos="0 0 0.3"><geom type="capsule" size="0.05 0.2"/></body></body>
+    <body pos="-0.3 0 0"><joint axis="1 0 1" pos="0 0.1 0"/><geom size="0.1"
+      pos="0.2 0 0"/></body></body></worldbody></mujoco>"""
+SUPPORTED = [load_scene(name) for name in SCENES]
+SUPPORTED += [make_scene(BRANCHED.format(first=kind)) for kind in ("hinge", "slide")]
+floating = BRANCHED.replace('axis="1 2 3"\n', "").replace("{first}", "free")
+floating = floating.replace('pos="0.1 0.1 0.2" damping="0.7" stiffness="3" ', "")
+floating = floating.replace('springref="0.2" armature="0.1"', "")
+SUPPORTED.append(make_scene(floating))
+
+
+def free_acceleration(scene, rows, period=0.0, torque=None):
+    model = scene.model
+    axes = JointAxes.of(model, scene.base)
+    motion = RigidBodyDynamics(model, scene.base, axes, list(range(model.nv)))
+    bodies = axes.bodies + motion.bodies
+    positions = np.concatenate((axes.positions, motion.positions))
+    points, _ = PointKinematics(model, scene.base, bodies, positions)(
+        rows[QPOS], rows[QVEL][:0]
+    )
+    count = len(axes.bodies)
+    mount = map(torch.as_tensor, scene.fixed_base_pose)
+    rotation = base_pose(scene.base, rows[QPOS], *mount)[1]
+    corners, places = points[:, count:], points[:, :count]
+    where = rotation, corners, places
+    return motion(rows[QPOS], rows[QVEL], torque, *where, period)
+
+
+def mujoco_acceleration(scene, rows, period=0.0, torque=None):
+    """Solved with the mass matrix and the bias of MuJoCo, nothing touching."""
+    model = copy.copy(scene.model)
+    data, found = mujoco.MjData(model), []
+    matrix = np.zeros((model.nv, model.nv))
+    pushes = [0.0] * len(rows) if torque is None else torque.numpy()
+    for row, push in zip(rows, pushes, strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qpos, data.qvel = row[QPOS].numpy(), row[QVEL].numpy()
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, matrix)
+        force = data.qfrc_passive - data.qfrc_bias + push
+        braked = matrix + 0.5 * period * np.diag(model.dof_damping)
+        found.append(np.linalg.solve(braked, force))
+    return torch.from_numpy(np.array(found))
+
+
+@pytest.mark.parametrize("is_driven", [False, True])
+@pytest.mark.parametrize("period", [0.0, 0.1])
+@pytest.mark.parametrize("scene", SUPPORTED, ids=lambda scene: scene.name)
+def test_it_is_mujocos_own(scene, period, is_driven, generator):
+    rows, torque = random_transitions(scene, ROWS, generator), None
+    if is_driven:
+        torque = torch.randn(ROWS, scene.model.nv, generator=generator).double()
+        torque[:, : 6 * scene.base.is_floating] = 0.0  # no motor moves a free base
+    want = mujoco_acceleration(scene, rows, period, torque)
+    got = free_acceleration(scene, rows, period, torque)
+    scale = want.abs().amax(-1, keepdim=True) + 1.0
+    assert ((got - want).abs() / scale).max() < 1e-9
+
+
+def test_other_joints_are_refused():
+    ball = make_scene("""<mujoco><worldbody><body><joint type="ball"/><geom size="1"/>
+      </body></worldbody></mujoco>""")
+    with pytest.raises(ValueError, match="one to a body, to foresee what they do, got"):
+        JointAxes.of(ball.model, ball.base)

@@ -1,0 +1,98 @@
+"""The interface of analytic steps, and the forces that they do not model."""
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict
+from typing import Any, ClassVar, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.configs import StepConfig
+from torchrl_nerd.scenes.contact_points import own_contacts
+from torchrl_nerd.scenes.scene import Scene
+
+
+class StepResult(NamedTuple):
+    """The state one control step later, and an estimate of the step's own error."""
+
+    qpos: Tensor  # (*batch, nq)
+    qvel: Tensor  # (*batch, nv)
+    velocity_defect: Tensor  # (*batch, K): embedded error estimate, rad/s and m/s
+
+
+class AnalyticStep(nn.Module, ABC):
+    """A control step from the equation of motion: no weights, no history.
+
+    | attribute | meaning |
+    |---|---|
+    | ``scene`` | the robot and its ground |
+    | ``config`` | which step it is, as a checkpoint's card stores it |
+    | ``num_defects`` | K, width of ``velocity_defect``; dof after dof, repeated |
+
+    Args:
+        scene: the robot and its ground.
+        config: which step it is.
+        num_defects: K.
+    """
+
+    kind: ClassVar[str] = "analytic"
+    compile_single_threaded: ClassVar[bool] = True
+
+    def __init__(self, scene: Scene, config: StepConfig, num_defects: int) -> None:
+        super().__init__()
+        self.scene, self.config, self.num_defects = scene, config, num_defects
+
+    def with_terrain(self, scene: Scene) -> "AnalyticStep":
+        """The same step for the same robot over another ground."""
+        make = cast(
+            Any, type(self)
+        )  # whose arguments are the fields of its configuration
+        return make(scene, **asdict(self.config)).to(self.device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next((x.device for x in self.buffers()), torch.device("cpu"))
+
+    @abstractmethod
+    def forward(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> StepResult:
+        """The state after one control step.
+
+        Args:
+            qpos: ``(*batch, nq)``, float64.
+            qvel: ``(*batch, nv)``.
+            joint_torque: ``(*batch, num_actuated)``, N m and N, held over the step.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+        """
+
+
+def unsupported_forces(scene: Scene) -> dict[str, bool]:
+    """Forces that no analytic step models, and whether the scene has them."""
+    model = scene.model
+    return {
+        "dry friction": bool(model.dof_frictionloss.any()),
+        "air or water": bool(model.opt.density or model.opt.viscosity),
+        "self-contact": len(own_contacts(model)) > 0,
+        "gravity compensation": bool(model.body_gravcomp.any()),
+    }
+
+
+def check_supported(scene: Scene) -> None:
+    """Refuse a scene with forces that no analytic step models.
+
+    Raises:
+        ValueError: in one sentence, naming all of them.
+    """
+    found = [name for name, is_there in unsupported_forces(scene).items() if is_there]
+    if found:
+        raise ValueError(
+            "expected a robot moved by actuators, gravity, springs, damping, limits and "
+            f"contact with the ground alone, got scene '{scene.name}' with "
+            f"{', '.join(found)}"
+        )

@@ -1,0 +1,239 @@
+"""One free body over level ground with penalty contacts, and parameters to fit.
+
+The contact law is that of `scenes.penalty_law`, plus two properties of real bodies: a
+centre of mass that is not the body frame's origin, and friction that fades under load,
+``mu / (1 + normal force * fading)``, as that of elastic asperities (J. F. Archard,
+"Elastic deformation and the laws of friction", 1957). A few substeps with a backward
+Euler spring are stable at any stiffness.
+Every operation is differentiable, and so are the physical parameters: a rollout through it
+fits them to recordings.
+"""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.analytic.base import AnalyticStep, StepResult
+from torchrl_nerd.configs import FreeBodyConfig
+from torchrl_nerd.geometry.penalty import friction_force, normal_force
+from torchrl_nerd.geometry.rotations import quat_normalize
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw
+from torchrl_nerd.scenes.scene import Scene
+
+# what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
+# move little, so that one step size suits all
+SCALED = {
+    "gravity": 0.1,
+    "size": 0.1,
+    "inertia": 0.5,
+    "friction": 0.3,
+    "stiffness": 2.0,
+    "damping": 2.0,
+    "slip": 4.0,
+}
+# what a unit of ``raw`` is of the parameters that are zero in a scene
+SHIFTED = {
+    "ground": 0.005,  # m, its height
+    "centre_x": 0.005,  # m, of mass, in body axes
+    "centre_y": 0.005,
+    "centre_z": 0.005,
+    "fading": 0.01,  # 1/N, of friction under load
+}
+PARAMETERS = (*SCALED, *SHIFTED)
+MIN_SLIP = 1e-4  # m/s: keeps the direction of slip defined at rest
+
+# rotation matrix, row by row, from the 16 products of a quaternion's entries
+_MATRIX = torch.zeros(16, 9, dtype=torch.float64)
+for _entry, _terms in enumerate(
+    (
+        {0: 1, 5: 1, 10: -1, 15: -1},
+        {6: 2, 3: -2},
+        {7: 2, 2: 2},
+        {6: 2, 3: 2},
+        {0: 1, 5: -1, 10: 1, 15: -1},
+        {11: 2, 1: -2},
+        {7: 2, 2: -2},
+        {11: 2, 1: 2},
+        {0: 1, 5: -1, 10: -1, 15: 1},
+    )
+):
+    for _product, _factor in _terms.items():
+        _MATRIX[_product, _entry] = _factor
+# q (0, w) from the 12 products of q's and w's entries
+_SPIN = torch.zeros(12, 4, dtype=torch.float64)
+for _index, (_row, _sign) in enumerate(
+    (
+        *((1, 1), (2, 1), (3, 1), (0, -1), (3, 1), (2, -1)),
+        *((3, -1), (0, -1), (1, 1), (2, 1), (1, -1), (0, -1)),
+    )
+):
+    _SPIN[_index, _row] = _sign
+
+
+class FreeBodyPenaltyStep(AnalyticStep):
+    """One control step of a single free body above the plane z = 0; see `AnalyticStep`.
+
+    ``velocity_defect (*batch, 6)`` is the velocity change by contact, linear in world axes,
+    angular in the body's.
+
+    ``raw (12,)`` holds the `PARAMETERS`: the logarithms of what multiplies the scene's own,
+    in units of `SCALED`, then those that scenes lack, in units of `SHIFTED`. All zero for
+    the scene as it is.
+
+    Args:
+        scene: a single free body with point contacts that follow the penalty law.
+        num_substeps: semi-implicit Euler steps per control step.
+
+    Raises:
+        ValueError: another kind of robot or contact.
+    """
+
+    compile_single_threaded: ClassVar[bool] = False
+    points: Tensor
+    inertia: Tensor
+    nominal: Tensor
+    share: Tensor
+    shift: Tensor
+    matrix: Tensor
+    spin: Tensor
+
+    def __init__(self, scene: Scene, num_substeps: int = 8) -> None:
+        super().__init__(scene, FreeBodyConfig(num_substeps), num_defects=6)
+        model, name = scene.model, scene.name
+        if model.njnt != 1 or not scene.base.is_floating or len(scene.contacts) == 0:
+            raise ValueError(
+                f"expected a single free body on a ground, got scene '{name}'"
+            )
+        body = int(model.jnt_bodyid[0])
+        law = PenaltyLaw.of_bodies(model, [body])
+        values = {
+            "gravity": -model.opt.gravity[2],
+            "size": 1.0,
+            "inertia": 1.0,
+            "friction": law.friction.item(),
+            "stiffness": law.stiffness.item(),
+            "damping": law.damping.item(),
+            "slip": law.slip.item(),
+        }
+        self.num_substeps = num_substeps
+        self.step_size = scene.control_step / num_substeps
+        self.mass = float(model.body_mass[body])
+        points = torch.as_tensor(scene.contacts.positions, dtype=torch.float64)
+        inertia = torch.as_tensor(model.body_inertia[body], dtype=torch.float64)
+        reach = points.square().sum(-1).amax() / inertia.amin()
+        self.lightest = float(1.0 / (1.0 / self.mass + reach))  # kg, at a point
+        nominal = torch.tensor([values[key] for key in SCALED], dtype=torch.float64)
+        for key, value in (
+            ("points", points.clone()),
+            ("inertia", inertia.clone()),
+            ("nominal", nominal),
+            ("share", torch.tensor([*SCALED.values()], dtype=torch.float64)),
+            ("shift", torch.tensor([*SHIFTED.values()], dtype=torch.float64)),
+            ("matrix", _MATRIX),
+            ("spin", _SPIN),
+        ):
+            self.register_buffer(key, value.clone(), persistent=False)
+        self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
+
+    def scaled(self) -> Tensor:
+        """The `PARAMETERS` ``(12,)``, SI units; size and inertia per the scene's."""
+        count = len(SCALED)
+        factors = (self.share * self.raw[:count]).exp()
+        return torch.cat((self.nominal * factors, self.shift * self.raw[count:]))
+
+    def values(self) -> dict[str, float]:
+        """`scaled` by name."""
+        return dict(zip(PARAMETERS, self.scaled().tolist(), strict=True))
+
+    @torch.no_grad()
+    def set_values(self, values: dict[str, float]) -> None:
+        """Take over parameters as `values` gives them; those not named stay."""
+        wanted = self.nominal.new_tensor([*(self.values() | values).values()])
+        count = len(SCALED)
+        self.raw[:count] = (wanted[:count] / self.nominal).log() / self.share
+        self.raw[count:] = wanted[count:] / self.shift
+
+    def forward(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor | None = None,
+        terrain: Tensor | None = None,
+    ) -> StepResult:
+        """See `AnalyticStep.forward`; a free body has no torque and no other ground.
+
+        The backward Euler spring adds ``h k`` to the damping, which is small only beside
+        ``mass / substep``: 90 N s/m at a corner of the measured cube.
+        """
+        batch = qpos.shape[:-1]
+        found = self._step(qpos.reshape(-1, 7), qvel.reshape(-1, 6))
+        return StepResult(*(x.reshape(*batch, x.shape[-1]) for x in found))
+
+    def _step(self, qpos: Tensor, qvel: Tensor) -> StepResult:
+        """One control step of ``N`` bodies, ``qpos (N, 7)``, ``qvel (N, 6)``."""
+        scaled = self.scaled()
+        gravity, size, heavier, mu, ke, kd, kf, ground, *_, fading = scaled.unbind()
+        centre, inertia = scaled[-4:-1], heavier * self.inertia
+        h, points = self.step_size, size * self.points - centre
+        soften = 1.0 + h * (kd + h * ke) / self.lightest  # backward Euler at a point
+        spring, damper = ke / soften, (kd + h * ke) / soften
+        slip = kf / (1.0 + h * kf / self.lightest)
+        cross = _cross_matrices(points)  # (P, 3, 3): w -> w x point
+        velocities = cross.reshape(-1, 3).mT  # (3, 3 P)
+        torques = cross.reshape(-1, 3)  # force -> point x force, (3 P, 3)
+        fall = torch.zeros_like(qvel[:1, :3])
+        fall[:, 2] = 1.0
+        fall = fall * (h * gravity)
+        quat, angular = qpos[:, 3:], qvel[:, 3:]
+        rotation = self._rotation(quat)
+        position = qpos[:, :3] + rotation @ centre
+        linear = qvel[:, :3] + _swing(rotation, angular, centre)
+        by_contact = torch.zeros_like(qvel)
+        for _ in range(self.num_substeps):
+            linear = linear - fall
+            up = rotation[:, 2]  # of the world, in body axes
+            in_body = (linear[:, None] @ rotation)[:, 0]
+            depth = ground - position[:, 2:] - up @ points.mT
+            moving = (angular @ velocities).unflatten(1, (-1, 3)) + in_body[:, None]
+            rising = (moving @ up[:, :, None])[..., 0]
+            sliding = moving - rising[..., None] * up[:, None]
+            speed = (sliding.square().sum(-1) + MIN_SLIP**2).sqrt()
+            normal = normal_force(spring, damper, depth, rising)
+            faded = mu / (1.0 + fading * normal)
+            drag = friction_force(slip, faded, normal, speed) / speed
+            force = normal[..., None] * up[:, None] - drag[..., None] * sliding
+            push = (rotation @ force.sum(1)[..., None])[..., 0]
+            moment = force.flatten(1) @ torques
+            change = torch.cat(((h / self.mass) * push, h * moment / inertia), 1)
+            by_contact = by_contact + change
+            gyro = torch.linalg.cross(angular, inertia * angular)
+            linear = linear + change[:, :3]
+            angular = angular + change[:, 3:] - h * gyro / inertia
+            position = position + h * linear
+            turn = (quat[:, :, None] * (0.5 * h * angular)[:, None]).flatten(1)
+            quat = quat_normalize(quat + turn @ self.spin)
+            rotation = self._rotation(quat)
+        position = position - rotation @ centre
+        linear = linear - _swing(rotation, angular, centre)
+        after = torch.cat((position, quat), 1), torch.cat((linear, angular), 1)
+        return StepResult(*after, by_contact)
+
+    def _rotation(self, quat: Tensor) -> Tensor:
+        """Rotation matrices ``(rows, 3, 3)``, body to world."""
+        products = (quat[:, :, None] * quat[:, None]).flatten(1)
+        return (products @ self.matrix).unflatten(1, (3, 3))
+
+
+def _swing(rotation: Tensor, angular: Tensor, point: Tensor) -> Tensor:
+    """Velocity ``(rows, 3)``, world, of a point of the body beside its origin's."""
+    moving = torch.linalg.cross(angular, point.expand_as(angular))
+    return (rotation @ moving[..., None])[..., 0]
+
+
+def _cross_matrices(points: Tensor) -> Tensor:
+    """Matrices of ``w -> w x point``, ``(P, 3) -> (P, 3, 3)``."""
+    x, y, z = points.unbind(-1)
+    o = torch.zeros_like(x)
+    rows = (o, z, -y, -z, o, x, y, -x, o)
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))

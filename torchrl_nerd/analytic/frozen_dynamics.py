@@ -1,0 +1,152 @@
+"""The dynamics of a robot at one time, held while substeps integrate contact forces."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.base import BasePose
+from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.kinematics import PointKinematics, cross
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
+from torchrl_nerd.geometry.spd import BranchSparsity, spd_inverse
+from torchrl_nerd.scenes.contact_points import shape_points
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.terrain_distance import TerrainDistance
+
+
+class FrozenDynamics(NamedTuple):
+    """Dynamics at one state, in the base frame there; batch last."""
+
+    jacobian: Tensor  # (3, P, C, N): of each contact point, by its C own dofs, m or 1
+    normal: Tensor  # (3, P, N)
+    depth: Tensor  # (P, N), m
+    qacc_smooth: Tensor  # (nv, N): acceleration without contacts and limits
+    mass_matrix_inv: Tensor  # (nv, nv, N)
+    rotation: Tensor  # (N, 3, 3), of the base, world
+
+
+class DynamicsEvaluation(nn.Module):
+    """Evaluates the `FrozenDynamics` of a robot over its ground.
+
+    | attribute | meaning |
+    |---|---|
+    | ``jacobian_dofs`` | dofs that the columns of the contact Jacobian belong to, C of each
+      of the P points, flat; a floating base's linear velocity moves every point |
+    | ``num_base_dofs`` | 3 for a floating base (its angular ones come next), else 0 |
+
+    Args:
+        scene: a robot of hinges and slides, on a free base or a fixed one, over a ground.
+        axes: its joints.
+        damping_period: s, over which joint damping is implicit; 0: explicit.
+
+    Raises:
+        ValueError: a scene without ground.
+    """
+
+    joints: Tensor
+    jacobian_dofs: Tensor
+    joint_weights: Tensor
+    radii: Tensor
+    is_slide: Tensor
+
+    def __init__(self, scene: Scene, axes: JointAxes, damping_period: float) -> None:
+        super().__init__()
+        model, points = scene.model, scene.contacts
+        if scene.terrain is None:
+            raise ValueError(f"expected a scene with a ground, got '{scene.name}'")
+        self.damping_period = damping_period
+        self.num_points, self.num_axes = len(points), len(axes.joints)
+        self.branches = BranchSparsity.of(model)
+        self.rigid_body = RigidBodyDynamics(model, scene.base, axes, scene.actuated)
+        bodies = points.bodies + axes.bodies + self.rigid_body.bodies
+        places = points.positions, axes.positions, self.rigid_body.positions
+        places = np.concatenate(places)
+        self.kinematics = PointKinematics(model, scene.base, bodies, places)
+        self.pose = BasePose(scene.base, scene.fixed_base_pose)
+        self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
+        self.num_base_dofs = 3 * scene.base.is_floating
+        # points of several bodies in one place act together, each moved by its own joints
+        weights = points.merged @ axes.ancestry(shape_points(model)[0]).T
+        weights /= points.merged.sum(1, keepdims=True)  # (P, J)
+        longest = int((weights > 0.0).sum(1).max(initial=0))
+        # a point's own joints first, then others of weight zero, to fill the row
+        joints = np.argsort(-weights, 1, kind="stable")[:, :longest]
+        self.shape = joints.shape
+        angular = range(self.num_base_dofs, 2 * self.num_base_dofs)
+        dofs = [[*angular, *(2 * self.num_base_dofs + row)] for row in joints]
+        # tensors, since torch.compile guards every entry of a list
+        for name, numbers in (
+            ("joints", joints.flatten()),
+            ("jacobian_dofs", np.concatenate(dofs)),
+        ):
+            index = torch.from_numpy(np.array(numbers, dtype=np.int64))
+            self.register_buffer(name, index, persistent=False)
+        keep_constants(
+            self,
+            joint_weights=np.take_along_axis(weights, joints, 1)[..., None],
+            radii=points.radii[:, None],
+            is_slide=axes.is_slide[joints][..., None],
+        )
+
+    def forward(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        dtype: torch.dtype,
+    ) -> FrozenDynamics:
+        """The dynamics at a state.
+
+        Args:
+            qpos: ``(N, nq)``.
+            qvel: ``(N, nv)``.
+            joint_torque: ``(N, num_actuated)``.
+            terrain: ``(N, terrain.size)``; None for the scene's own ground.
+            dtype: of the result but for the base's rotation, which is float64.
+        """
+        found, _ = self.kinematics(qpos, qvel)
+        sizes = self.num_points, 2 * self.num_axes
+        points, places, corners = found.split(
+            (*sizes, found.shape[-2] - sum(sizes)), -2
+        )
+        position, rotation = self.pose(qpos)
+        distance, normal = self.ground(points, terrain, position, rotation)
+        matrix, force = self.rigid_body.mass_matrix_and_force(
+            qpos, qvel, joint_torque, rotation, corners, places, self.damping_period
+        )
+        inverse, qacc = spd_inverse(matrix, force, self.branches)
+        depth, normal = self.radii - distance.mT, rows_last(normal, 2)
+        # a sphere's contact is halfway between its surface and the ground, as MuJoCo's
+        points = (
+            rows_last(points, 2) - (self.radii - 0.5 * depth.clamp_min(0.0)) * normal
+        )
+        jacobian = self._jacobian(points, rows_last(places, 2))
+        parts = jacobian, normal, depth, qacc, inverse
+        jacobian, normal, depth, qacc, inverse = (
+            x.to(dtype).contiguous() for x in parts
+        )
+        return FrozenDynamics(jacobian, normal, depth, qacc, inverse, rotation)
+
+    def point_velocity(self, jacobian: Tensor, qvel: Tensor) -> Tensor:
+        """Velocities ``(3, P, N)`` of the contact points, m/s, at ``qvel (nv, N)``."""
+        own = qvel[self.jacobian_dofs].unflatten(0, jacobian.shape[1:3])
+        velocity = (jacobian * own).sum(2)
+        return velocity + qvel[:3, None] if self.num_base_dofs else velocity
+
+    def _jacobian(self, points: Tensor, places: Tensor) -> Tensor:
+        """Contact Jacobian ``(3, P, C, N)``: velocity of each point by each of its dofs."""
+        anchor, tip = places.chunk(2, 1)
+        axis, anchor = (
+            x[:, self.joints].unflatten(1, self.shape) for x in (tip - anchor, anchor)
+        )
+        turning = cross(axis, points[:, :, None] - anchor)
+        jacobian = self.joint_weights * torch.where(self.is_slide > 0.0, axis, turning)
+        if not self.num_base_dofs:
+            return jacobian
+        one = torch.eye(3, dtype=points.dtype, device=points.device)
+        base = cross(one[:, None, :, None], points[:, :, None])
+        return torch.cat((base, jacobian), 2)

@@ -1,0 +1,124 @@
+"""Unconstrained (contact-free) forward dynamics over one control step.
+
+MuJoCo's semi-implicit Euler method moves on by the accelerations at the starts of its n
+substeps. Their mean is, to second order, the acceleration at the mean of those times,
+``(h - h/n) / 2``. The step evaluates the dynamics twice: at the start, to predict the state
+at that time, and there. This midpoint rule shares the error of the substeps instead of
+adding its own. Joint limits change faster and are solved anew several times per step.
+"""
+
+import mujoco
+import numpy as np
+from torch import Tensor
+
+from torchrl_nerd.analytic.base import AnalyticStep, StepResult, check_supported
+from torchrl_nerd.analytic.joint_limits import JointLimits
+from torchrl_nerd.configs import UnconstrainedConfig
+from torchrl_nerd.geometry.base import BasePose
+from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
+from torchrl_nerd.geometry.spd import spd_inverse
+from torchrl_nerd.scenes.scene import Scene
+
+NO_FIRST_ORDER_ERROR = (int(mujoco.mjtIntegrator.mjINT_RK4),)
+
+
+class UnconstrainedStep(AnalyticStep):
+    """One control step of a robot that touches nothing; see `AnalyticStep`.
+
+    Limits act on the joints of a robot with a fixed base, see `JointLimits`; a floating
+    base's joints move as if they had none. ``velocity_defect (*batch, nv)`` is by how much
+    the second dynamics evaluation changed the step's velocity.
+
+    Args:
+        scene: a robot of hinges and slides, on a floating or a fixed base, without dry
+            friction. A ground is allowed and ignored.
+
+    Raises:
+        ValueError: in one sentence, another robot.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        check_supported(scene)
+        super().__init__(scene, UnconstrainedConfig(), scene.layout.nv)
+        model, self.step_size = scene.model, scene.control_step
+        # s: substep whose first-order error the step shares
+        is_exact = model.opt.integrator in NO_FIRST_ORDER_ERROR
+        self.lag = 0.0 if is_exact else float(model.opt.timestep)
+        axes = JointAxes.of(model, scene.base)
+        self.num_places = len(axes.bodies)
+        self.rigid_body = RigidBodyDynamics(model, scene.base, axes, scene.actuated)
+        bodies = axes.bodies + self.rigid_body.bodies
+        positions = np.concatenate((axes.positions, self.rigid_body.positions))
+        self.kinematics = PointKinematics(model, scene.base, bodies, positions)
+        self.pose, self.layout = (
+            BasePose(scene.base, scene.fixed_base_pose),
+            scene.layout,
+        )
+        is_limited = model.jnt_limited[axes.joints] != 0
+        self.limits, self.num_solves = None, 1
+        if is_limited.any() and not scene.base.is_floating:
+            # MuJoCo's shortest time constant follows from the scene's own substep
+            substep = scene.control_step / (scene.substeps // scene.reference_ratio)
+            self.limits = JointLimits(model, axes, substep)
+            self.num_solves = self.limits.num_solves(self.step_size)
+        low, high = model.jnt_range[axes.joints].T
+        margin = model.jnt_margin[axes.joints]
+        low = np.where(is_limited, low + margin, -np.inf)
+        keep_constants(self, low=low, high=np.where(is_limited, high - margin, np.inf))
+
+    def forward(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> StepResult:
+        """See `AnalyticStep.forward`."""
+        ahead = 0.5 * (self.step_size - self.lag)
+        state, solves = (qpos, qvel), self.num_solves
+        start = self._dynamics(*state, joint_torque, 2.0 * ahead)
+        middle = self._integrate(*state, start, ahead, solves // 2)
+        dynamics = self._dynamics(*middle, joint_torque, 2.0 * self.lag)
+        next_qpos, next_qvel = self._integrate(*state, dynamics, self.step_size, solves)
+        return StepResult(
+            next_qpos, next_qvel, self.step_size * (dynamics[0] - start[0])
+        )
+
+    def _dynamics(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, period: float
+    ) -> tuple[Tensor, Tensor | None]:
+        """Unconstrained acceleration ``(*batch, nv)``, inverse mass matrix ``(nv, nv, N)``.
+
+        The inverse is None where no limit needs it.
+        """
+        points, _ = self.kinematics(qpos, qvel)
+        count = points.shape[-2] - self.num_places
+        places, corners = points.split((self.num_places, count), -2)
+        _, rotation = self.pose(qpos)
+        where = qpos, qvel, joint_torque, rotation, corners, places, period
+        if self.limits is None:
+            return self.rigid_body(*where), None
+        inverse, qacc = spd_inverse(*self.rigid_body.mass_matrix_and_force(*where))
+        return qacc.movedim(0, -1).reshape(qvel.shape), inverse
+
+    def _integrate(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        dynamics: tuple[Tensor, Tensor | None],
+        period: float,
+        num_solves: int,
+    ) -> tuple[Tensor, Tensor]:
+        """The state after ``period`` s under one evaluation of the dynamics."""
+        qacc, inverse = dynamics
+        if self.limits is None or inverse is None:
+            moved = period * (qvel + 0.5 * (period + self.lag) * qacc)
+            return integrate_pos(self.layout, qpos, moved), qvel + period * qacc
+        rows = [rows_last(x, 1) for x in (qpos, qvel, qacc)]
+        state = self.limits(*rows, inverse, period, num_solves, self.lag)
+        next_qpos, next_qvel = (x.movedim(0, -1).reshape(qpos.shape) for x in state)
+        return next_qpos, next_qvel

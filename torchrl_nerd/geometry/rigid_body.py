@@ -1,0 +1,227 @@
+"""Rigid-body dynamics without contact: mass matrix, bias forces, acceleration.
+
+A rigid body has the same inertia as four points of a quarter of its mass each, at the even
+corners of a box about its centre. From the positions of these points and of the joint axes
+follow the mass matrix (composite rigid bodies) and the bias forces (Newton-Euler), in the
+base frame, batched.
+Source: Featherstone, Rigid Body Dynamics Algorithms, chapters 5 and 6.
+"""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.kinematics import cross
+from torchrl_nerd.geometry.rotations import quat_matrix
+from torchrl_nerd.geometry.spd import matvec, spd_solve
+
+CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float)
+
+
+class _Inertia(NamedTuple):
+    """Mass ``(n, 1)`` and its moments about the base frame's origin, rows last."""
+
+    mass: Tensor
+    first: Tensor  # (3, n, N)
+    second: Tensor  # (3, 3, n, N)
+
+    def momentum(self, spin: Tensor, slide: Tensor) -> tuple[Tensor, Tensor]:
+        """Angular and linear, of bodies that turn and move so, ``(3, n, N)``."""
+        trace = self.second[0, 0] + self.second[1, 1] + self.second[2, 2]
+        turning = trace * spin - (self.second * spin).sum(1)
+        return (
+            turning + cross(self.first, slide),
+            self.mass * slide + cross(spin, self.first),
+        )
+
+    def of_groups(self, members: Tensor) -> "_Inertia":
+        """Of several together, ``members (groups, n)``."""
+        return _Inertia(*(matvec(members, moment) for moment in self))
+
+
+class RigidBodyDynamics(nn.Module):
+    """Acceleration of a robot without contacts and limits.
+
+    | attribute | meaning |
+    |---|---|
+    | ``bodies`` | of the points that it needs: four of every body with mass |
+    | ``positions`` | ``(4 B, 3)``, m, in the body's frame |
+
+    Args:
+        model: compiled.
+        base: of the robot.
+        axes: its joints.
+        actuated: dofs that actuators drive.
+    """
+
+    mass: Tensor
+    ancestry: Tensor
+    together: Tensor
+    gravity: Tensor
+    damping: Tensor
+    stiffness: Tensor
+    rest: Tensor
+    armature: Tensor
+    is_slide: Tensor
+
+    def __init__(
+        self, model: mujoco.MjModel, base: Base, axes: JointAxes, actuated: list[int]
+    ) -> None:
+        super().__init__()
+        self.actuated = actuated
+        has_mass = (model.body_weldid != 0) & (model.body_mass > 0.0)
+        found = np.flatnonzero(has_mass).tolist()
+        self.bodies = [body for body in found for _ in CORNERS]
+        self.positions = np.concatenate([_four_points(model, body) for body in found])
+        self.num_base_dofs = 6 * base.is_floating  # dofs that move every body
+        joints, below = axes.joints, axes.bodies[: len(axes.joints)]
+        self.qpos_addresses = model.jnt_qposadr[joints].tolist()
+        ancestry = np.ones((model.nv, len(found)))
+        ancestry[self.num_base_dofs :] = axes.ancestry(found)
+        together = np.ones((model.nv, model.nv))
+        together[self.num_base_dofs :] = 0.0
+        together[self.num_base_dofs :, self.num_base_dofs :] = axes.ancestry(below)
+        keep_constants(
+            self,
+            mass=model.body_mass[found, None],
+            ancestry=ancestry,
+            together=together,
+            gravity=model.opt.gravity,
+            damping=model.dof_damping,
+            stiffness=model.jnt_stiffness[joints],
+            rest=model.qpos_spring[self.qpos_addresses],
+            armature=model.dof_armature,
+            is_slide=axes.is_slide[:, None],
+        )
+
+    def forward(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor | None,
+        rotation: Tensor,
+        corners: Tensor,
+        places: Tensor,
+        period: float | Tensor = 0.0,
+    ) -> Tensor:
+        """Acceleration ``(*batch, nv)``, in the axes of ``qvel``.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+            joint_torque: ``(*batch, num_actuated)``; None for none.
+            rotation: of the base, ``(*batch, 3, 3)``.
+            corners: where ``positions`` are, ``(*batch, 4 B, 3)``, m, in B_t.
+            places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m, in B_t.
+            period: s, over which damping is implicit (taken at its middle).
+        """
+        where = rotation, corners, places
+        parts = self.mass_matrix_and_force(qpos, qvel, joint_torque, *where, period)
+        acceleration = spd_solve(*parts).movedim(0, -1).reshape(qvel.shape)
+        if not self.num_base_dofs:
+            return acceleration
+        linear = (rotation @ acceleration[..., :3, None])[..., 0]
+        return torch.cat((linear, acceleration[..., 3:]), -1)
+
+    def mass_matrix_and_force(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor | None,
+        rotation: Tensor,
+        corners: Tensor,
+        places: Tensor,
+        period: float | Tensor = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        """Mass matrix ``(nv, nv, N)`` and smooth forces ``(nv, N)`` without contacts.
+
+        Arguments as of `forward`. A floating base's linear velocity is in B_t here, in a
+        frame that moves with the base.
+        """  # noqa: D417
+        rate, position = rows_last(qvel, 1), rows_last(qpos, 1)
+        spin, slide = self._axes(rows_last(places, 2))
+        four = rows_last(corners, 2).unflatten(1, (-1, len(CORNERS)))
+        second = (four[:, None] * four).sum(3) * (self.mass / len(CORNERS))
+        bodies = _Inertia(self.mass, four.mean(2) * self.mass, second)
+        moment, force = bodies.of_groups(self.ancestry).momentum(spin, slide)
+        products = (
+            spin[:, :, None] * moment[:, None] + slide[:, :, None] * force[:, None]
+        )
+        upper = self.together[..., None] * products.sum(0)
+        lower = (1.0 - self.together)[..., None] * upper.transpose(0, 1)
+        extra = torch.diag(self.armature + 0.5 * period * self.damping)
+        mass_matrix = upper + lower + extra[..., None]
+        gravity = rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
+        push = -self._bias(bodies, spin, slide, rate, gravity)
+        push = push - self.damping[:, None] * rate
+        if joint_torque is not None:
+            driven = torch.zeros_like(rate)
+            driven[self.actuated] = rows_last(joint_torque, 1)
+            push = push + driven
+        stretch = self.rest[:, None] - position[self.qpos_addresses]
+        stretch = self.stiffness[:, None] * stretch
+        push = torch.cat(
+            (push[: self.num_base_dofs], push[self.num_base_dofs :] + stretch)
+        )
+        return mass_matrix, push
+
+    def _axes(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """How each dof turns, and moves the base frame's origin, ``(3, nv, N)``."""
+        anchor, tip = places.chunk(2, 1)
+        axis = tip - anchor
+        spin = (1.0 - self.is_slide) * axis
+        slide = cross(anchor, spin) + self.is_slide * axis
+        if self.num_base_dofs:
+            one = torch.eye(6, dtype=axis.dtype, device=axis.device)
+            one = one[..., None].expand(6, 6, axis.shape[-1])
+            slide, spin = (
+                torch.cat((one[k : k + 3], x), 1) for k, x in ((0, slide), (3, spin))
+            )
+        return spin, slide
+
+    def _bias(
+        self,
+        bodies: _Inertia,
+        spin: Tensor,
+        slide: Tensor,
+        rate: Tensor,
+        gravity: Tensor,
+    ) -> Tensor:
+        """Bias forces ``(nv, N)``: Coriolis, centrifugal and gravitational.
+
+        In a frame that moves with the base's origin at its present velocity.
+        """
+        if self.num_base_dofs:
+            rate = torch.cat((torch.zeros_like(rate[:3]), rate[3:]))
+        turned, moved = rate * spin, rate * slide
+        omega, velocity = (matvec(self.together.mT, x) for x in (turned, moved))
+        bend = cross(omega, turned), cross(omega, moved) + cross(velocity, turned)
+        omega, velocity = (matvec(self.ancestry.mT, x) for x in (turned, moved))
+        alpha, acceleration = (matvec(self.ancestry.mT, x) for x in bend)
+        moment, force = bodies.momentum(alpha, acceleration - gravity[:, None])
+        angular, linear = bodies.momentum(omega, velocity)
+        force = force + cross(omega, linear)
+        moment = moment + cross(omega, angular) + cross(velocity, linear)
+        moment, force = (matvec(self.ancestry, x) for x in (moment, force))
+        return (spin * moment + slide * force).sum(0)
+
+
+def rows_last(x: Tensor, size: int) -> Tensor:
+    """``(*batch, n, d)`` (its last ``size`` dimensions) as ``(d, n, N)``."""
+    batch = x.ndim - size
+    flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])
+    return flat.permute(tuple(reversed(range(flat.ndim))))
+
+
+def _four_points(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """Places ``(4, 3)`` of a quarter of the body's mass each, m, in its frame."""
+    inertia = model.body_inertia[body]
+    spread = (inertia.sum() / 2.0 - inertia).clip(0.0) / model.body_mass[body]
+    turn = quat_matrix(model.body_iquat[body])
+    return model.body_ipos[body] + (CORNERS * np.sqrt(spread)) @ turn.T

@@ -1,0 +1,93 @@
+"""Hybrid dynamics: an analytic step plus a learned residual."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_nerd.analytic import AnalyticStep, make_step
+from torchrl_nerd.configs import FeatureConfig
+from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD, NetworkConfig
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms import Stats
+
+GATE_SCALE = (
+    1.0  # root mean square of the normalised velocity defect at which it is open
+)
+MAX_CHANGE = 1e6  # normalised; the analytic change of absurd torques overflows
+
+
+class HybridNeRD(NeRD):
+    """An analytic step whose error a network corrects.
+
+        change = analytic change + gate * network(features, defect, analytic change)
+        gate   = min(rms(defect) / GATE_SCALE, 1)
+
+    The defect is the step's own error estimate, see `StepResult`, in standard deviations of
+    the velocity change. Where it is zero, as in free fall without rotation, the network has
+    no influence. The analytic change stays float64. It may exceed all changes in the
+    data, so the sum is bounded by the largest speeds alone.
+
+    Args:
+        scene: the robot and its ground.
+        step: of that scene, or of its reference solver.
+        features: as for `NeRD`.
+        network: as for `NeRD`; its last layer is zero at first.
+        stats: as for `NeRD`.
+    """
+
+    kind: ClassVar[str] = "hybrid"
+    compile_single_threaded: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        scene: Scene,
+        step: AnalyticStep,
+        features: FeatureConfig,
+        network: NetworkConfig,
+        stats: Mapping[NestedKey, Stats] | None = None,
+    ) -> None:
+        self._num_defects = step.num_defects  # the base class asks for `token_size`
+        super().__init__(scene, features, network, stats)
+        self.analytic_step = step
+        last = [m for m in self.network.head.modules() if isinstance(m, nn.Linear)][-1]
+        for weight in last.parameters():
+            nn.init.zeros_(weight)
+
+    @property
+    def token_size(self) -> int:
+        """Width of the features, the defect and the analytic change."""
+        return self.scene_features.size + self._num_defects + self.state_delta.size
+
+    def encode(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Encoded:
+        """See `NeRD.encode`; the base is the step's change, the gate follows its defect."""
+        features = self.features(qpos, qvel, joint_torque, terrain)
+        result = self.analytic_step(qpos, qvel, joint_torque, terrain)
+        change = self.state_delta.delta(qpos, qvel, result.qpos, result.qvel)
+        change = _finite(self.normalize.normalize(TARGET, change))
+        scale = self.normalize.std(TARGET)[: self.scene.layout.nv]
+        defect = result.velocity_defect
+        defect = _finite(defect / scale.repeat(defect.shape[-1] // len(scale)))
+        rms = defect.square().mean(-1, keepdim=True).sqrt()
+        token = self.training_range.clamp_features(features)
+        token = torch.cat((token, defect, change), -1).to(self.dtype)
+        return Encoded(features, token, change, (rms / GATE_SCALE).clamp_max(1.0))
+
+    def bounded(self, change: Tensor) -> Tensor:
+        """Denormalised change, bounded by the largest speeds of the data."""
+        change = self.normalize.denormalize(TARGET, change)
+        return self.training_range.clamp_change(change, self.scene.control_step)
+
+    def copy_for(self, scene: Scene) -> "HybridNeRD":
+        """See `NeRD.copy_for`."""
+        step = make_step(scene, self.analytic_step.config)
+        return HybridNeRD(scene, step, self.scene_features.config, self.config)
+
+
+def _finite(x: Tensor) -> Tensor:
+    """``x`` bounded, zero where it is not a number: the features carry the fault."""
+    return x.nan_to_num(0.0).clamp(-MAX_CHANGE, MAX_CHANGE)

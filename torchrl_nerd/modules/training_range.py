@@ -1,0 +1,177 @@
+"""Bounds of the training data, within which a model's inputs and outputs are kept.
+
+A network returns something for any input, far from its training data too. So features are
+clamped to the range that the data filled, changes of the state stay within the largest in
+the data, speeds within twice the largest, displacements within what those speeds reach, and
+limited joints stop where the data end. Nothing inside the range is changed; whatever is
+outside stays finite and bounded.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.scenes.scene import Scene
+
+MARGIN = 0.1  # of a range's width, on either side
+SPEED_MARGIN = 2.0  # times the largest speed in the data
+UNBOUNDED = 1e300  # finite, so that a share of it is a number
+MAX_POSITION = (
+    1e6  # m and rad: beyond it a joint did not overshoot, the state is broken
+)
+MIN_WIDTH = 1e-3  # of a normalised feature's range, for `TrainingRange.excess`
+
+
+class TrainingRange(nn.Module):
+    """Bounds of the training data; bounds nothing until `fit`.
+
+    Args:
+        scene: the robot.
+        num_features: width F of features.
+        num_outputs: width D of targets.
+    """
+
+    feature_low: Tensor
+    feature_high: Tensor
+    target_low: Tensor
+    target_high: Tensor
+    speed: Tensor
+    qpos_low: Tensor
+    qpos_high: Tensor
+    is_limited: Tensor
+
+    def __init__(self, scene: Scene, num_features: int, num_outputs: int) -> None:
+        super().__init__()
+        self.vectors = vector_dofs(scene)
+        self.limited = _limited(scene)
+        self.joint_of = [0] * scene.model.nv  # qpos of each dof's joint, if limited
+        is_limited = torch.zeros(scene.model.nv, dtype=torch.float64)
+        for q, v in self.limited:
+            self.joint_of[v], is_limited[v] = q, 1.0
+        self.register_buffer("is_limited", is_limited, persistent=False)
+        one = torch.ones((), dtype=torch.float64)
+        sizes = {"feature": num_features, "target": num_outputs, "qpos": scene.model.nq}
+        for name, size in sizes.items():
+            self.register_buffer(f"{name}_low", one.new_full((size,), -UNBOUNDED))
+            self.register_buffer(f"{name}_high", one.new_full((size,), UNBOUNDED))
+        self.register_buffer("speed", one.new_full((scene.model.nv,), UNBOUNDED))
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the model knows what it was trained on."""
+        return bool((self.feature_high < UNBOUNDED).all())
+
+    @torch.no_grad()
+    def fit(
+        self, features: Tensor, targets: Tensor, qpos: Tensor, qvel: Tensor
+    ) -> None:
+        """Take the bounds of a data set, in place of any before.
+
+        Args:
+            features: normalised, ``(samples, F)``.
+            targets: normalised, ``(samples, D)``.
+            qpos: ``(samples, nq)``.
+            qvel: ``(samples, nv)``.
+        """
+        for q, _ in self.limited:
+            low, high = qpos[:, q].amin(), qpos[:, q].amax()
+            margin = MARGIN * (high - low)
+            self.qpos_low[q], self.qpos_high[q] = low - margin, high + margin
+        for name, x in (("feature", features), ("target", targets)):
+            low, high = x.amin(0), x.amax(0)
+            margin = MARGIN * (high - low)
+            self.get_buffer(f"{name}_low").copy_(low - margin)
+            self.get_buffer(f"{name}_high").copy_(high + margin)
+        self.speed.copy_(SPEED_MARGIN * magnitudes(self.vectors, qvel).amax(0))
+
+    @torch.no_grad()
+    def widen(self, other: "TrainingRange") -> None:
+        """Include another one's bounds; unchanged where that one was never fitted."""
+        if not other.is_fitted:
+            return
+        for name in ("feature", "target", "qpos"):
+            for end, wider in (("low", torch.minimum), ("high", torch.maximum)):
+                mine = self.get_buffer(f"{name}_{end}")
+                theirs = other.get_buffer(f"{name}_{end}").to(mine.device)
+                mine.copy_(wider(mine, theirs))
+        self.speed.copy_(torch.maximum(self.speed, other.speed.to(self.speed.device)))
+
+    def clamp_features(self, features: Tensor) -> Tensor:
+        """Normalised features ``(*batch, F)`` within the range; NaN stays."""
+        return features.clamp(self.feature_low, self.feature_high)
+
+    def clamp_target(self, target: Tensor) -> Tensor:
+        """Normalised changes of the state ``(*batch, D)`` within the range."""
+        return target.clamp(self.target_low, self.target_high)
+
+    def clamp_change(self, change: Tensor, step: float) -> Tensor:
+        """Changes ``(*batch, 2 nv)`` no larger than from the largest speed to its opposite.
+
+        Args:
+            change: of velocities, then of positions beside the trapezoid, see `StateDelta`.
+            step: s, in which they happen.
+        """
+        largest = torch.cat((2.0 * self.speed, step * self.speed))
+        return change.clamp(-largest, largest)
+
+    def limit_motion(self, motion: Tensor, time: float = 1.0) -> Tensor:
+        """Motions ``(*batch, nv)`` no farther than the largest speed leads.
+
+        Args:
+            motion: velocities, or tangents of positions.
+            time: s, that it takes.
+        """
+        farthest = time * self.speed
+        size = magnitudes(self.vectors, motion)
+        return motion * (farthest / torch.maximum(size, farthest))
+
+    def stop_joints(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
+        """The state with limited joints no farther than in the data, and none going on.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+        """
+        if not self.limited:
+            return qpos, qvel
+        within = qpos.clamp(self.qpos_low, self.qpos_high)
+        within = torch.where(qpos.abs() < MAX_POSITION, within, qpos)  # faults stay
+        push = (within - qpos)[..., self.joint_of] * self.is_limited
+        slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
+        return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
+
+    def excess(self, features: Tensor) -> Tensor:
+        """How far outside the range the farthest feature lies, in widths ``(*batch,)``."""
+        low, high = self.feature_low, self.feature_high
+        outside = torch.maximum(low - features, features - high).clamp(min=0.0)
+        return (outside / (high - low).clamp(min=MIN_WIDTH)).amax(-1)
+
+
+def magnitudes(vectors: tuple[int, ...], qvel: Tensor) -> Tensor:
+    """Magnitudes ``(*batch, nv)``; whole vectors count where free and ball joints are.
+
+    Args:
+        vectors: see `vector_dofs`.
+        qvel: ``(*batch, nv)``.
+    """
+    sizes = qvel.abs()
+    for start in vectors:
+        norm = torch.linalg.vector_norm(qvel[..., start : start + 3], dim=-1)
+        sizes[..., start : start + 3] = norm[..., None]
+    return sizes
+
+
+def vector_dofs(scene: Scene) -> tuple[int, ...]:
+    """Where in ``qvel`` the three components of each vector begin."""
+    linear = [scene.base.dof_address] if scene.base.is_floating else []
+    return (*linear, *(v for _, v in scene.layout.rotations))
+
+
+def _limited(scene: Scene) -> tuple[tuple[int, int], ...]:
+    """Addresses in ``qpos`` and ``qvel`` of every hinge and slide with limits."""
+    model = scene.model
+    return tuple(
+        (int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+        for joint in range(model.njnt)
+        if model.jnt_limited[joint] and int(model.jnt_type[joint]) in (HINGE, SLIDE)
+    )
