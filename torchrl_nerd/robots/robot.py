@@ -41,7 +41,8 @@ class Preset:
     |---|---|
     | ``protocol`` | its test rollouts; built at each call, since tasks compile models |
     | ``data`` | how much training data |
-    | ``train`` | how the model is trained |
+    | ``train`` | how its learned model is trained |
+    | ``hybrid`` | how its hybrid is trained; None where learning does not help the step |
     | ``task`` | its resets start the validation; None: the scene's sampling ranges |
     | ``strategy`` | how training states are drawn, see `data.strategies`; None: from the
       scene's sampling ranges |
@@ -52,6 +53,7 @@ class Preset:
     protocol: Callable[[], EvaluationProtocol]
     data: DataConfig
     train: TrainConfig
+    hybrid: TrainConfig | None = None
     task: str | None = None
     strategy: str | None = None
     exports: Literal["best", "last"] = "best"

@@ -20,18 +20,20 @@ def protocol() -> EvaluationProtocol:
 PRESETS = {
     "ant": Preset(
         protocol,
-        DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(
-            network="grounded-halves",
-            steps=20_000,
-            rollout_steps=0,
+        DataConfig(trajectories=50_000, steps=100),
+        TrainConfig(  # the first stage of ant-mlp; `make model-ant-mlp` continues it
+            network="mlp-4x160",
+            predicted_force=True,
+            steps=46_000,
+            rollout_steps=6_000,
+            rollout_restarts=2,
             single_step_fraction=1.0,
+            use_symmetry=True,
             loss_eps=0.02,
-            validate_every=4_000,
+            validate_every=5_000,
             bf16_fraction=0.85,
         ),
         task="ant/run",
-        exports="last",  # passive starts, which validate, say little about driven motion
     )
 }
 # As in the paper's reference code (rl_games), except that its step size follows the

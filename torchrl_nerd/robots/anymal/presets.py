@@ -14,17 +14,16 @@ PRESETS = {
     "anymal": Preset(
         protocol,
         DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(
-            network="grounded-halves",
-            steps=20_000,
-            rollout_steps=0,
+        TrainConfig(  # the first stage of anymal-mlp; `make model-anymal-mlp` continues it
+            network="mlp-4x128",
+            predicted_force=True,
+            steps=15_000,
+            rollout_steps=1_000,
             single_step_fraction=1.0,
             loss_eps=0.02,
-            validate_every=4_000,
             bf16_fraction=0.8,
         ),
         task="anymal/forward",
-        exports="last",  # passive starts, which validate, say little about driven motion
     )
 }
 # As in the paper's reference code (rl_games), except that its step size follows the

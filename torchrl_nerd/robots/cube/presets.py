@@ -1,5 +1,7 @@
 """Presets of the cubes: data, training, test rollouts."""
 
+from dataclasses import replace
+
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.robots.cube.tasks import CubeToss, RealCubeToss, SlopeToss
 from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
@@ -24,13 +26,16 @@ def slope_protocol() -> EvaluationProtocol:
 
 _DATA = DataConfig(trajectories=8_000, steps=100)
 _TRAIN = TrainConfig(
-    network="grounded",
-    steps=10_000,
-    rollout_steps=0,
+    network="mlp-4x128",
+    predicted_force=True,
+    steps=12_000,
+    rollout_steps=600,
     single_step_fraction=1.0,
     loss_eps=0.02,
-    validate_every=5_000,
+    validate_every=3_000,
+    bf16_fraction=0.85,
 )
+_SHORTER = replace(_TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500)
 PRESETS = {
     "cube": Preset(
         protocol,
@@ -38,17 +43,18 @@ PRESETS = {
         _TRAIN,
         task="cube/toss",
         strategy="resting",
-        exports="last",
     ),
     "cube_real": Preset(
-        real_protocol, _DATA, _TRAIN, task="cube_real/toss", exports="last"
+        real_protocol,
+        _DATA,
+        replace(_SHORTER, predicted_force=False),
+        task="cube_real/toss",
     ),
     "cube_slope": Preset(
         slope_protocol,
         _DATA,
-        _TRAIN,
+        _SHORTER,
         task="cube_slope/toss",
         strategy="resting",
-        exports="last",
     ),
 }

@@ -27,7 +27,15 @@ PRESETS = {
         protocol,
         DataConfig(trajectories=30_000, steps=100),
         TrainConfig(
-            network="grounded",
+            network="transformer-2x96",
+            steps=36_000,
+            rollout_steps=4_000,
+            single_step_fraction=0.0,
+            loss_eps=1.0,
+        ),
+        hybrid=TrainConfig(
+            network="mlp-2x64",
+            step="penalty-contact",
             steps=20_000,
             rollout_steps=0,
             single_step_fraction=1.0,

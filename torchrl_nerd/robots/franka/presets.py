@@ -26,12 +26,13 @@ def gravity_protocol() -> EvaluationProtocol:
 
 
 _TRAIN = TrainConfig(
-    network="free",
-    steps=6_000,
-    rollout_steps=500,
+    network="mlp-4x128",
+    steps=12_000,
+    rollout_steps=600,
     single_step_fraction=1.0,
     loss_eps=0.0001,
-    validate_every=1_000,
+    validate_every=3_000,
+    bf16_fraction=0.85,
 )
 _DATA = DataConfig(trajectories=12_000, steps=100)
 PRESETS = {
@@ -39,7 +40,7 @@ PRESETS = {
     "franka_gravity": Preset(
         gravity_protocol,
         _DATA,
-        _TRAIN,
+        replace(_TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500),
         task="franka_gravity/reach_torque",
         strategy="correlated",
     ),
