@@ -13,23 +13,26 @@ from tensordict.utils import NestedKey
 from torch import Generator, Tensor, nn
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd.analytic import STEPS, AnalyticStep, make_step
 from torchrl_nerd.checkpoint import CARD
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig, UnconstrainedConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import (
+    AnalyticDynamics,
     DMControlDynamics,
     Dynamics,
+    Model,
     MujocoDynamics,
     MujocoWarpDynamics,
     NeRDDynamics,
 )
+from torchrl_nerd.dynamics.nerd import Inference
 from torchrl_nerd.dynamics.warp_setup import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
-from torchrl_nerd.modules.correction import FreeConfig
-from torchrl_nerd.modules.free import FreeNeRD
-from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
+from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.networks import NETWORKS, STEPS
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import SCENES, load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import cover, data_stats
@@ -38,8 +41,9 @@ from torchrl_nerd.transforms import Stats
 HAS_COMPILER = any(map(which, ("g++", "clang++")))  # what inductor looks for
 
 LEARNED = ("streaming", "window")
+MODELS = (*LEARNED, "hybrid", "analytic")
 TRUE = ("mujoco", "dm_control")
-DYNAMICS = (*LEARNED, *TRUE)
+DYNAMICS = (*MODELS, *TRUE)
 WARP = pytest.param("mujoco_warp", marks=pytest.mark.slow)
 
 each_dynamics = pytest.mark.parametrize("dynamics", DYNAMICS)
@@ -49,38 +53,46 @@ warp_too = pytest.mark.parametrize(
 """With MuJoCo Warp where it is installed, on the CPU, where it takes minutes."""
 
 
-def is_free(scene: Scene) -> bool:
-    """Whether nothing but a `UnconstrainedStep` moves the robot."""
+def supports(scene: Scene, step: str) -> bool:
+    """Whether the analytic step of that name can step the scene."""
     try:
-        FreeNeRD(scene, FreeConfig())
+        make_step(scene, STEPS[step])
     except ValueError:
         return False
     return True
 
 
-def is_grounded(scene: Scene, parts: int = 1) -> bool:
-    """Whether a `PenaltyContactStep` of so many parts can move the robot."""
-    try:
-        PenaltyContactStep(scene, parts=parts)
-    except ValueError:
-        return False
-    return True
+def covering_steps() -> list[tuple[Scene, str]]:
+    """Every registered scene with an analytic step that moves it as a whole.
+
+    Each scene at least once, each step at least twice. A scene with a ground is left to
+    the steps that know of contacts.
+    """
+    scenes = [load_scene(name) for name in SCENES]
+
+    def fits(scene: Scene, step: str) -> bool:
+        is_unconstrained = isinstance(STEPS[step], UnconstrainedConfig)
+        return is_unconstrained == (scene.terrain is None) and supports(scene, step)
+
+    pairs: list[tuple[Scene, str]] = []
+
+    def uses(step: str) -> int:
+        return sum(name == step for _, name in pairs)
+
+    for scene in scenes:
+        pairs.append((scene, min((s for s in STEPS if fits(scene, s)), key=uses)))
+    for step in STEPS:
+        others = [s for s in scenes if (s, step) not in pairs and fits(s, step)]
+        others.sort(key=lambda scene: sum(s is scene for s, _ in pairs))
+        pairs += [(scene, step) for scene in others[: max(0, 2 - uses(step))]]
+    return pairs
 
 
-FREE = [load_scene(name) for name in SCENES if is_free(load_scene(name))]
-GROUNDED = [load_scene(name) for name in SCENES if is_grounded(load_scene(name))]
-STEPPED = [
-    (scene, name)
-    for name, config in STEPS.items()
-    for scene in (FREE if isinstance(config, FreeConfig) else GROUNDED)
-    if isinstance(config, FreeConfig) or is_grounded(scene, config.parts)
-]
-each_free = pytest.mark.parametrize("scene", FREE, ids=lambda scene: scene.name)
-each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)
-each_stepped = pytest.mark.parametrize(
-    ("scene", "network"), STEPPED, ids=lambda x: getattr(x, "name", x)
+ANALYTIC = covering_steps()
+each_analytic = pytest.mark.parametrize(
+    ("scene", "step"), ANALYTIC, ids=lambda x: getattr(x, "name", x)
 )
-"""Every robot that a step moves, with the name of the network that corrects it."""
+"""Every scene, and every analytic step, in pairs."""
 
 
 def enliven(network: nn.Module, generator: Generator) -> nn.Module:
@@ -106,20 +118,61 @@ def little_data(scene: Scene) -> TensorDict:
     return data[is_sound(data)]
 
 
-def scene_stats(scene: Scene) -> dict[NestedKey, Stats]:
+@cache
+def scene_stats(
+    scene: Scene, features: FeatureConfig = NO_PREDICTIONS
+) -> dict[NestedKey, Stats]:
     """Statistics of it."""
-    return data_stats(scene, little_data(scene))
+    return data_stats(scene, little_data(scene), features)
 
 
 def random_model(
-    scene: Scene, generator: Generator, network: str = "transformer-2x64"
+    scene: Scene,
+    generator: Generator,
+    network: str = "transformer-2x64",
+    features: FeatureConfig = NO_PREDICTIONS,
 ) -> NeRD:
-    """A model of the right scale that has learned nothing."""
-    data = little_data(scene)
-    model = NeRD(scene, NETWORKS[network], scene_stats(scene))
-    cover(model, data)
+    """A learned model of the right scale that has learned nothing."""
+    model = NeRD(scene, features, NETWORKS[network], scene_stats(scene, features))
+    cover(model, little_data(scene))
     enliven(model.network, generator)
     return model
+
+
+def analytic_step(scene: Scene, step: str | None = None) -> AnalyticStep:
+    """The analytic step of that name, or the one of `ANALYTIC` or of every other scene."""
+    if step is None:
+        step = next((name for s, name in ANALYTIC if s is scene), None)
+    return make_step(scene, None if step is None else STEPS[step])
+
+
+def hybrid_model(
+    scene: Scene,
+    step: str | None,
+    generator: Generator,
+    network: str = "mlp-2x32",
+    features: FeatureConfig = NO_PREDICTIONS,
+) -> HybridNeRD:
+    """A hybrid of the right scale whose network has learned nothing, see `analytic_step`.
+
+    Its network is in float64: contacts may magnify float32's rounding a thousand times.
+    """
+    stats = scene_stats(scene, features)
+    hybrid = analytic_step(scene, step), features, NETWORKS[network], stats
+    model = HybridNeRD(scene, *hybrid)
+    cover(model, little_data(scene))
+    enliven(model.network, generator)
+    model.network.double()
+    return model
+
+
+def model_of_kind(kind: str, scene: Scene, generator: Generator) -> Model:
+    """A model for dynamics of one of `MODELS`."""
+    if kind == "analytic":
+        return analytic_step(scene)
+    if kind == "hybrid":
+        return hybrid_model(scene, None, generator)
+    return double_model(scene, generator)
 
 
 def double_model(
@@ -161,16 +214,23 @@ def in_small_steps(model: NeRD) -> NeRD:
     return model
 
 
+def inference_of(kind: str) -> Inference:
+    """How dynamics of that kind infer."""
+    return "window" if kind == "window" else "streaming"
+
+
 class DynamicsMaker:
     """Dynamics of one kind, as often as asked, with the same weights."""
 
     def __init__(self, scene: Scene, kind: str, generator: Generator) -> None:
         self.scene, self.kind = scene, kind
-        self.model = double_model(scene, generator) if kind in LEARNED else None
+        self.model = model_of_kind(kind, scene, generator) if kind in MODELS else None
 
     def __call__(self) -> Dynamics:
+        if isinstance(self.model, AnalyticStep):
+            return AnalyticDynamics(self.model)
         if self.model is not None:
-            return NeRDDynamics(self.model, inference=self.kind)
+            return NeRDDynamics(self.model, inference=inference_of(self.kind))
         if self.kind == "mujoco":
             return MujocoDynamics(self.scene, num_threads=2)
         if self.kind == "mujoco_warp":
@@ -194,14 +254,14 @@ class EnvMaker:
         self.task, self.dynamics = make_task(task_id), dynamics
         if horizon is not None:
             self.task.horizon = horizon
-        is_learned, scene = dynamics in LEARNED, self.task.scene
-        self.model = double_model(scene, generator) if is_learned else None
+        is_model, scene = dynamics in MODELS, self.task.scene
+        self.model = model_of_kind(dynamics, scene, generator) if is_model else None
 
     def __call__(self, num_envs: int = 3, seed: int = 0) -> SceneEnv:
         if self.model is None:
             return GroundTruthEnv(self.task, self.dynamics, num_envs, seed)
-        model, inference = self.model, self.dynamics
-        return NeRDEnv(self.task, model, num_envs, seed, inference=inference)
+        inference = inference_of(self.dynamics)
+        return NeRDEnv(self.task, self.model, num_envs, seed, inference=inference)
 
 
 def random_actions(env: SceneEnv, steps: int, generator: Generator) -> Tensor:

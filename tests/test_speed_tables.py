@@ -12,9 +12,9 @@ import torch
 from stability_table import FIGURES
 from tensordict import TensorDict
 
+from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
 from torchrl_nerd.evaluation.bench.rates import Rate
 from torchrl_nerd.evaluation.bench.report import BenchReport
-from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
 from torchrl_nerd.robots import load_scene
 
 
