@@ -1,9 +1,9 @@
 """Files that were spoilt are refused in one sentence, and nothing in them is ever run."""
 
-import pickle
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import corruptions
@@ -16,6 +16,7 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.cube_tosses import LARGEST_LOG, read_log
 from torchrl_nerd.data.generate import load_data
+from torchrl_nerd.data.store import chunk_path, read_chunk, write_chunk
 from torchrl_nerd.evaluation.policy import load_policy
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.robots import load_scene
@@ -42,6 +43,11 @@ def make(kind: str, folder: Path) -> Path:
     return folder
 
 
+def rewrite_chunk(folder: Path, number: int, change: Callable) -> None:
+    path = chunk_path(folder, number)
+    write_chunk(change(read_chunk(path, 2).clone()), path)
+
+
 def edit(path: Path, **changes: object) -> None:
     write_json(path, {**read_json(path), **changes})
 
@@ -58,32 +64,43 @@ def test_spoilt_files_are_refused_or_sound(kind, tmp_path, rng):
         assert len(list(tmp_path.iterdir())) == 2, f"{done}: a file outside"
 
 
-@pytest.mark.parametrize("name", ["NonTensorData", "NonTensorStack", "TensorDict"])
-@pytest.mark.parametrize("where", [".", "next"])
-def test_a_data_set_that_asks_to_be_unpickled_is_not(name, where, tmp_path):
-    folder, marker = make("data", tmp_path / "data"), tmp_path / "marker"
-    place = folder / where
-    edit(
-        place / "meta.json",
-        _type=f"<class 'tensordict.tensorclass.{name}'>",
-        data="pickle.pkl",
-    )
-    for file in ("other.pickle", "pickle.pkl"):
-        (place / file).write_bytes(pickle.dumps(corruptions.Marker(marker)))
-    with pytest.raises(ValueError, match="expected tensors by name"):
-        load_data(load_scene(SCENE), folder)
-    assert not marker.exists()
-
-
 @pytest.mark.parametrize("change", [-8, 8])
 def test_a_data_file_of_another_size_is_refused_and_left(change, tmp_path):
-    path = make("data", tmp_path / "data") / "qpos.memmap"
+    path = chunk_path(make("data", tmp_path / "data"), 0)
     size = path.stat().st_size + change
     with open(path, "rb+") as file:
         file.truncate(size)
-    with pytest.raises(ValueError, match=f"bytes in .*qpos.memmap, found {size}"):
+    with pytest.raises(ValueError, match="chunk-00000.safetensors is truncated or no"):
         load_data(load_scene(SCENE), path.parent)
     assert path.stat().st_size == size
+
+
+def test_a_missing_chunk_and_a_chunk_of_another_set_are_refused(tmp_path):
+    folder = make("data", tmp_path / "data")
+    shutil.copy(chunk_path(folder, 0), chunk_path(folder, 1))
+    rewrite_chunk(folder, 1, lambda data: data[:1])
+    with pytest.raises(ValueError, match=f"expected 6 trajectories in {folder}, found"):
+        load_data(load_scene(SCENE), folder)
+    chunk_path(folder, 1).unlink()
+    with pytest.raises(ValueError, match="chunk-00001.safetensors, found no file"):
+        load_data(load_scene(SCENE), folder)
+
+
+@pytest.mark.parametrize("key", ["qvel", ("next", "joint_torque")])
+def test_a_chunk_of_another_layout_is_refused(key, tmp_path):
+    folder = make("data", tmp_path / "data")
+    name = key if isinstance(key, str) else "/".join(key)
+    for change in (
+        lambda data: data.exclude(key),
+        lambda data: data.set(key, data[key].float()),
+        lambda data: data.set(key, data[key][..., :0]),
+        lambda data: data.set("extra", data[key]),
+    ):
+        place = shutil.copytree(folder, tmp_path / "changed")
+        rewrite_chunk(place, 0, change)
+        with pytest.raises(ValueError, match=f"'{name}' of shape|'extra' of shape"):
+            load_data(load_scene(SCENE), place)
+        shutil.rmtree(place)
 
 
 @pytest.mark.parametrize(
@@ -100,10 +117,13 @@ def test_a_data_card_with_impossible_counts(changes, tmp_path):
 
 def test_data_that_are_not_finite(tmp_path, rng):
     folder = make("data", tmp_path / "data")
-    path = folder / "next" / "qvel.memmap"
-    values = np.fromfile(path)
-    values[rng.integers(len(values))] = np.nan
-    values.tofile(path)
+
+    def spoil(data):
+        values = data["next", "qvel"].view(-1)
+        values[rng.integers(len(values))] = np.nan
+        return data
+
+    rewrite_chunk(folder, 0, spoil)
     with pytest.raises(ValueError, match="expected finite numbers in .*next/qvel"):
         load_data(load_scene(SCENE), folder)
 

@@ -8,20 +8,21 @@ from helpers import true_step
 from tensordict import TensorDict
 
 from torchrl_nerd.configs import DataConfig
-from torchrl_nerd.data.generate import (
-    LARGEST,
-    generate,
-    is_sound,
-    load_data,
-    load_data_sets,
-    simulate,
-)
+from torchrl_nerd.data.generate import generate, load_data
+from torchrl_nerd.data.simulate import LARGEST, is_sound, simulate
 from torchrl_nerd.files import read_json
-from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.seeds import fold_in
 
 SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 STATE = ("qpos", "qvel")
+DRIVEN = [
+    scene
+    for scene in map(load_scene, SCENES)
+    if scene.actuated and scene.sampling.drive is None
+]
+each_driven = pytest.mark.parametrize("scene", DRIVEN, ids=lambda scene: scene.name)
+"""Every robot with motors whose torques are drawn at random."""
 
 
 def unequal(data: TensorDict, expected: TensorDict) -> list:
@@ -57,12 +58,12 @@ def test_sets_follow_each_other_in_the_order_given(scene, tmp_path, seed):
         generate(scene, config, folder, quiet=True)
     for order in (folders, folders[::-1], folders[:1]):
         parts = [load_data(scene, folder) for folder in order]
-        assert not unequal(load_data_sets(scene, order), torch.cat(parts))
+        assert not unequal(load_data(scene, *order), torch.cat(parts))
     generate(scene, DataConfig(trajectories=2, steps=3), tmp_path / "d", quiet=True)
     with pytest.raises(ValueError, match=f"of 2 steps in {tmp_path}/d, as .*/a, got 3"):
-        load_data_sets(scene, [*folders, tmp_path / "d"])
+        load_data(scene, *[*folders, tmp_path / "d"])
     with pytest.raises(ValueError, match=f"data set in {tmp_path}/none"):
-        load_data_sets(scene, [*folders, tmp_path / "none"])
+        load_data(scene, *[*folders, tmp_path / "none"])
 
 
 def test_every_transition_obeys_the_true_dynamics(scene, generator):
@@ -101,10 +102,9 @@ def test_starts_and_torques_lie_within_the_ranges(scene, generator):
         assert (torque <= torch.tensor(ranges.torque)).all()
 
 
+@each_driven
 def test_passive_and_quiet_rows_have_their_shares(scene, generator):
     rows, steps = 1000, 30
-    if scene.sampling.drive or not scene.actuated:
-        return  # torques of another kind, or none
     data = simulate(scene, rows, steps, generator)
     relative = data["next", "joint_torque"] / torch.tensor(scene.sampling.torque)
     peak = relative.abs().amax((1, 2))
@@ -155,9 +155,8 @@ def test_soundness_is_finite_and_bounded(generator):
             assert torch.equal(is_sound(wrapped), expected)
 
 
+@each_driven
 def test_broken_trajectories_are_dropped_and_counted(scene, tmp_path, seed):
-    if scene.sampling.drive or not scene.actuated:
-        return  # nothing to be made stronger
     strong = tuple(1e9 * torque for torque in scene.sampling.torque)
     ranges = {"torque": strong, "zero_torque_fraction": 0.5, "low_torque_fraction": 0.0}
     wild = replace(scene, sampling=replace(scene.sampling, **ranges))

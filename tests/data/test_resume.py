@@ -19,8 +19,11 @@ from torchrl_nerd.robots import load_scene
 CHUNK, CHUNKS = 4, 5
 SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 CONFIG = DataConfig(trajectories=CHUNK * CHUNKS - 1, steps=3, seed=5)
-MOMENTS = {"simulate": 2, "is_sound": 1, "write_json": 2}
+FIRST = {"simulate": 1, "is_sound": 1, "write_chunk": 1, "write_json": 2}
 """Functions of the module -> the call that belongs to the first chunk."""
+MOMENTS = [(name, chunk) for name in FIRST for chunk in range(CHUNKS)]
+USUAL = [("simulate", 2), ("write_chunk", 0), ("write_json", CHUNKS - 1)]
+"""Tested always; all other moments are slow."""
 
 KILLED = """
 import os, signal, sys
@@ -30,7 +33,7 @@ from torchrl_nerd.robots import load_scene
 
 module.CHUNK = {chunk}
 statuses = []
-for name, call in {moments}:
+for name, chunk, call in {moments}:
     if child := os.fork():
         statuses.append(os.waitpid(child, 0)[1])
         continue
@@ -44,7 +47,7 @@ for name, call in {moments}:
 
     setattr(module, name, dying)
     config = module.DataConfig(**{config})
-    folder = Path(sys.argv[1]) / f"{{name}}-{{call}}"
+    folder = Path(sys.argv[1]) / f"{{name}}-{{chunk}}"
     module.generate(load_scene("{scene}"), config, folder, quiet=True)
     os._exit(0)
 assert statuses == [signal.SIGKILL] * len(statuses), statuses
@@ -56,17 +59,21 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(module, "CHUNK", CHUNK)
 
 
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory) -> Path:
-    """Folders ``function-call`` of processes that ended at that call."""
-    root = tmp_path_factory.mktemp("killed")
-    moments = [(n, c + k) for n, c in MOMENTS.items() for k in range(CHUNKS)]
+def kill(moments: list[tuple[str, int]], root: Path) -> Path:
+    """Make folders ``function-chunk`` of processes that ended at these moments."""
+    calls = [(name, chunk, FIRST[name] + chunk) for name, chunk in moments]
     code = KILLED.format(
-        chunk=CHUNK, moments=moments, config=asdict(CONFIG), scene=SCENE.name
+        chunk=CHUNK, moments=calls, config=asdict(CONFIG), scene=SCENE.name
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", code, str(root)], check=True, env=environment)
     return root
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Path:
+    """Folders of the usual moments."""
+    return kill(USUAL, tmp_path_factory.mktemp("killed"))
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +100,12 @@ def snapshot(folder: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
-@pytest.mark.parametrize("chunk", range(CHUNKS))
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_a_killed_run_goes_on_to_the_same_bits(moment, chunk, killed, whole, tmp_path):
-    cut_short = killed / f"{moment}-{MOMENTS[moment] + chunk}"
-    folder = shutil.copytree(cut_short, tmp_path / "killed")
-    if chunk:
-        is_ahead = moment == "simulate"  # the chunk before may not be written yet
+def assert_finishes(moment: tuple[str, int], root: Path, whole, place: Path) -> None:
+    """What was killed at a moment is refused, and finished to the bits of the whole."""
+    name, chunk = moment
+    folder = shutil.copytree(root / f"{name}-{chunk}", place)
+    if (folder / "data.json").exists():
+        is_ahead = name == "simulate"  # the chunk before may not be written yet
         done = read_json(folder / "data.json")["chunks_done"]
         assert chunk - is_ahead <= done <= chunk
     with pytest.raises(ValueError, match=r"not finished|found no data\.json"):
@@ -109,6 +115,18 @@ def test_a_killed_run_goes_on_to_the_same_bits(moment, chunk, killed, whole, tmp
     card = read_json(folder / "data.json")
     assert card["trajectories"] + card["dropped"] == CONFIG.trajectories
     assert not list(folder.glob(".*.tmp"))
+
+
+@pytest.mark.parametrize("moment", USUAL, ids=str)
+def test_a_killed_run_goes_on_to_the_same_bits(moment, killed, whole, tmp_path):
+    assert_finishes(moment, killed, whole, tmp_path / "killed")
+
+
+@pytest.mark.slow
+def test_at_every_moment(whole, tmp_path):
+    kill(MOMENTS, tmp_path)
+    for name, chunk in MOMENTS:
+        assert_finishes((name, chunk), tmp_path, whole, tmp_path / f"{name}_{chunk}")
 
 
 def test_a_finished_data_set_is_left_as_it_is(tmp_path):
@@ -146,7 +164,7 @@ def test_a_run_killed_in_its_first_chunk_is_never_mixed_with_another(
     change, killed, tmp_path
 ):
     config = replace(CONFIG, **change)
-    folder = shutil.copytree(killed / "is_sound-1", tmp_path / "killed")
+    folder = shutil.copytree(killed / "write_chunk-0", tmp_path / "killed")
     try:
         generate(SCENE, config, folder, quiet=True)
     except ValueError as error:

@@ -14,7 +14,7 @@ from torchrl_nerd.checkpoint import (
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import CARD, generate, load_data_sets
+from torchrl_nerd.data.generate import CARD, generate, load_data
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.modules.nerd import NeRD
@@ -115,7 +115,7 @@ class Train(DeviceCommand):
         protocol = protocol_of(scene)
         trainer = Trainer(
             scene,
-            load_data_sets(scene, folders),
+            load_data(scene, *folders),
             source_of(scene),
             self.config,
             out,

@@ -5,7 +5,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_nerd.data.generate import as_transitions
+from torchrl_nerd.data.simulate import as_transitions
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import append_frame, frame_stack_of

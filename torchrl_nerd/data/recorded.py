@@ -11,7 +11,12 @@ from torchrl_nerd import __version__
 from torchrl_nerd.data.cube_tosses import Tosses, make_tosses, read_log, split_tosses
 from torchrl_nerd.data.generate import CARD
 from torchrl_nerd.data.physics_checks import check_log
-from torchrl_nerd.data.store import create_store, expect_finite, read_store
+from torchrl_nerd.data.store import (
+    chunk_path,
+    expect_finite,
+    read_chunk,
+    write_chunk,
+)
 from torchrl_nerd.files import writable_folder, write_json
 from torchrl_nerd.scenes import Scene
 
@@ -54,7 +59,7 @@ def write_tosses(path: Path, scene: Scene, folder: Path) -> dict[str, Any]:
     for number, members in enumerate(split.values()):
         part[members] = number
     data["part"] = part[data["collector", "traj_ids"]]
-    create_store(data, writable_folder(folder)).update_(data)
+    write_chunk(data, chunk_path(writable_folder(folder), 0))
     card = {
         "scene": scene.name,
         "scene_hash": scene.hash,
@@ -75,6 +80,6 @@ def read_transitions(folder: Path) -> TensorDict:
     Raises:
         ValueError: in one sentence, what is missing or broken.
     """
-    data = read_store(folder)
+    data = read_chunk(chunk_path(folder, 0), 1)
     expect_finite(data, folder)
     return data

@@ -7,8 +7,9 @@ from typing import Any, cast
 from tensordict import TensorDict
 from torch import Generator
 
-from torchrl_nerd.data.generate import Draw, simulate
+from torchrl_nerd.data.generate import Draw
 from torchrl_nerd.data.policy_data import policy_data
+from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.data.starts import PerturbedRestStates, SettledStates, TaskResets
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.robots import make_task, preset_of

@@ -1,0 +1,65 @@
+"""Random trajectories of the ground truth: NeRD appendix A.2, no task."""
+
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics.mujoco import MujocoDynamics
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.sampling import sample_torques
+
+SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
+LARGEST = 1e5  # reference code: a trajectory beyond this has diverged
+
+
+def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> TensorDict:
+    """Trajectories ``[rows, steps]`` from the scene's ranges, diverged ones included."""
+    dynamics = MujocoDynamics(scene)
+    start, scale = scene.sample_initial(rows, generator)
+    terrain = start.pop(TERRAIN, None)
+    state = TensorDict(start, batch_size=[rows])
+    dynamics.reset(state)
+    states, torques = [state[:, None]], []
+    if scene.sampling.drive is None:
+        drawn = sample_torques(
+            scene.sampling, scale, steps, scene.control_step, generator
+        )
+        for held in drawn.split(SEGMENT, 1):
+            last = cast(TensorDict, states[-1][:, -1])
+            torques.append(held)
+            states.append(dynamics.rollout(last, held, terrain))
+    else:
+        for _ in range(steps):
+            last = cast(TensorDict, states[-1][:, -1])
+            torque = scene.sampling.drive(last[QPOS], last[QVEL], scale, generator)
+            torques.append(torque[:, None])
+            states.append(dynamics.rollout(last, torques[-1], terrain))
+    return as_transitions(states, torques, terrain)
+
+
+def as_transitions(
+    states: list[TensorDictBase], torques: list[Tensor], terrain: Tensor | None
+) -> TensorDict:
+    """A data set ``[rows, steps]`` in TorchRL's layout.
+
+    Args:
+        states: parts of trajectories, ``[rows, *]``, in order: steps + 1 states in all.
+        torques: of the steps between them, parts of ``(rows, *, num_actuated)``.
+        terrain: ``(rows, terrain.size)`` where the ground varies.
+    """
+    path = cast(TensorDict, TensorDict.cat(states, 1))
+    data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))
+    data["next"] = after.set("joint_torque", torch.cat(torques, 1))
+    if terrain is not None:
+        steps = data.batch_size[1]
+        data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
+    return data
+
+
+def is_sound(data: TensorDictBase) -> Tensor:
+    """Which trajectories ``[rows, steps]`` stay finite and within bounds, ``(rows,)``."""
+    state = torch.cat((data["next", QPOS], data["next", QVEL]), -1)
+    return (state.abs() < LARGEST).all(-1).all(-1)
