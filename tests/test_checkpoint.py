@@ -16,6 +16,7 @@ from dynamics_helpers import edit_card, random_drive, random_model, roll, unequa
 
 import torchrl_nerd
 from torchrl_nerd import from_pretrained, load_scene
+from torchrl_nerd.analytic import FreeBodyPenaltyStep
 from torchrl_nerd.checkpoint import (
     CARD,
     PRETRAINED,
@@ -23,9 +24,10 @@ from torchrl_nerd.checkpoint import (
     load_checkpoint,
     make_card,
     save_checkpoint,
+    shipped_card,
     shipped_models,
 )
-from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.configs import FeatureConfig, TrainConfig
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json, write_atomically, write_json
 from torchrl_nerd.modules.networks import NETWORKS
@@ -42,7 +44,9 @@ def folder(tmp_path, generator) -> Path:
     return save_checkpoint(model, tmp_path / "model", make_card(model))
 
 
-@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru", "small"])
+@pytest.mark.parametrize(
+    "network", ["transformer-2x64", "mlp-4x64", "gru", "transformer-4x128"]
+)
 def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
     model = random_model(scene, generator, network)
     card = make_card(model, {"note": "made by a test"})
@@ -59,29 +63,46 @@ def test_round_trip_keeps_every_bit(scene, network, tmp_path, generator):
     assert json.loads((tmp_path / CARD).read_text()) == json.loads(json.dumps(card))
 
 
-FORESEEING = [name for name in SCENES if load_scene(name).foresees_forces]
-
-
-@pytest.mark.parametrize("free_motion", [False, True])
-@pytest.mark.parametrize("name", FORESEEING)
-def test_a_model_keeps_the_features_it_learned_on(
-    name, free_motion, tmp_path, generator
-):
-    scene = load_scene(name).foreseeing(True, free_motion)
-    plain = random_model(scene.foreseeing(False), generator)
-    card = make_card(plain)
-    for key in ("foresees_forces", "foresees_free_motion"):
-        del card[key]  # as in the cards of before
-    save_checkpoint(plain, tmp_path / "plain", card)
-    foreseeing = random_model(scene, generator)
-    save_checkpoint(foreseeing, tmp_path / "new", make_card(foreseeing))
+@pytest.mark.parametrize("config", [FeatureConfig(True), FeatureConfig(True, True)])
+@pytest.mark.parametrize("name", ["ant", "double_pendulum"])
+def test_a_model_keeps_the_features_it_learned_on(name, config, tmp_path, generator):
+    scene = load_scene(name)
+    model = random_model(scene, generator, features=config)
+    card = make_card(model)
+    assert card["features"] == asdict(config)
+    loaded = load_checkpoint(save_checkpoint(model, tmp_path, card), scene)
+    assert loaded.scene_features.config == config
     drive = random_drive(scene, 4, 5, generator)
-    for model, folder in (plain, "plain"), (foreseeing, "new"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            loaded = load_checkpoint(tmp_path / folder, scene)
-        expected = roll(NeRDDynamics(model), *drive)
-        assert not unequal_keys(roll(NeRDDynamics(loaded), *drive), expected)
+    paths = [roll(NeRDDynamics(m), *drive) for m in (model, loaded)]
+    assert not unequal_keys(*paths)
+
+
+def test_an_analytic_step_keeps_its_parameters(tmp_path):
+    scene = load_scene("cube_real")
+    step = FreeBodyPenaltyStep(scene, num_substeps=5)
+    step.set_values({"friction": 0.3, "centre_z": 0.004})
+    card = make_card(step)
+    assert card["kind"] == "analytic" and card["network"] is None
+    loaded = load_checkpoint(save_checkpoint(step, tmp_path, card))
+    assert loaded.kind == "analytic" and loaded.config == step.config
+    assert loaded.values() == step.values()
+
+
+@pytest.mark.parametrize("name", shipped_models())
+def test_every_shipped_card_says_its_kind(name):
+    card, model = shipped_card(name), from_pretrained(name)
+    assert card["kind"] == model.kind
+    is_hybrid = name.split("-")[1:2] == ["hybrid"]
+    assert (card["kind"] == "hybrid") == is_hybrid
+    assert (card["network"] is None) == (card["kind"] == "analytic")
+    assert (card["step"] is None) == (card["kind"] == "learned")
+    if card["kind"] == "learned":
+        assert ("-mlp" in name) == (card["network"]["kind"] == "mlp")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_name_of_a_scene_is_its_learned_model(name):
+    assert from_pretrained(name).kind == "learned"
 
 
 def test_saving_again_replaces_the_old_model(folder, generator):
@@ -177,25 +198,25 @@ def test_nothing_is_ever_unpickled():
 MADE_BY_MAKE = re.findall(r"^model-([\w-]+):", (ROOT / "Makefile").read_text(), re.M)
 
 
-@pytest.mark.parametrize(
-    "name", sorted(set(shipped_models()) & set(PRESETS) - set(MADE_BY_MAKE))
-)
-def test_recipes_are_those_of_the_shipped_models(name):
+MODELS = ("cartpole", "double_pendulum", "franka-mlp", "cube-mlp")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_presets_are_those_of_the_shipped_models(name):
     made = read_json(PRETRAINED / name / CARD)["training"]
-    preset = PRESETS[name]
-    assert not made.get("start")
-    assert made["trajectories"] == preset.data.trajectories
+    preset = PRESETS[name.removesuffix("-mlp")]
+    assert not made.get("init_from")
     expect_settings(made, asdict(preset.train))
 
 
 @pytest.mark.parametrize("name", MADE_BY_MAKE)
 def test_so_are_make_targets_of_models_that_take_more(name):
     made = read_json(PRETRAINED / name / CARD)["training"]
-    assert bool(made["start"]) == name.endswith("-mlp")  # learned on
+    assert bool(made["init_from"]) == name.endswith("-mlp")  # learned on
     preset = PRESETS[name.removesuffix("-mlp")]
     changes, trajectories = last_training(f"model-{name}")
     assert made["trajectories"] == trajectories
-    expect_settings(made, asdict(preset.train) | changes)
+    expect_settings(made, {**asdict(preset.train), **changes})
 
 
 def expect_settings(made: dict, settings: dict) -> None:

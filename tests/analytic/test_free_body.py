@@ -7,10 +7,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
-from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.parameter_fit import CENTRE
-from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 
 ROWS = 32
 
@@ -30,12 +29,12 @@ def test_flight_is_mujocos(real_cube, generator):
     truth = MujocoDynamics(real_cube, num_threads=1)
     truth.reset(state)
     expected = truth.step(state, qpos[:, :0])
-    found_qpos, found_qvel, push = step(qpos, qvel)
+    found_qpos, found_qvel, defect = step(qpos, qvel)
     torch.testing.assert_close(found_qpos[:, :3], expected["qpos"][:, :3])
     torch.testing.assert_close(found_qvel, expected["qvel"])
     # one turns by half angles, the other by their sine and cosine
     assert (found_qpos[:, 3:] - expected["qpos"][:, 3:]).abs().max() < 1e-6
-    assert not push.any()
+    assert not defect.any()
 
 
 def test_where_it_is_and_faces_does_not_matter(real_cube, generator):
@@ -80,7 +79,7 @@ def test_it_comes_to_rest_on_the_ground_at_any_stiffness(real_cube, generator, h
     qpos, qvel = falling(real_cube, generator, height=0.02)
     with torch.no_grad():
         for _ in range(700):
-            qpos, qvel, push = step(qpos, qvel)
+            qpos, qvel, _ = step(qpos, qvel)
     assert qvel.abs().max() < 0.05
     lowest = real_cube.clearances(qpos).amin(-1)
     # a quarter of the weight on each of four springs, and what damping adds to it
@@ -92,7 +91,9 @@ def test_a_centre_of_mass_falls_freely(real_cube, generator):
     """In flight it draws a parabola, whatever the frame does."""
     step = FreeBodyPenaltyStep(real_cube)
     centre = 0.01 * torch.randn(3, generator=generator).double()
-    step.set_values(dict(zip(CENTRE, centre.tolist(), strict=True)))
+    step.set_values(
+        dict(zip(("centre_x", "centre_y", "centre_z"), centre.tolist(), strict=True))
+    )
     qpos, qvel = falling(real_cube, generator, height=1.0)
 
     def place(qpos):
@@ -136,7 +137,7 @@ def test_parameters_are_taken_over(real_cube, generator):
 
 
 def test_gradients_are_those_of_the_motion(real_cube, generator):
-    step = FreeBodyPenaltyStep(real_cube, substeps=2)
+    step = FreeBodyPenaltyStep(real_cube, num_substeps=2)
     qpos, qvel = falling(real_cube, generator, height=-0.002)
 
     def end(raw):

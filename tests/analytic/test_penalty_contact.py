@@ -1,11 +1,10 @@
-"""A step along springs: MuJoCo's substeps, but for what changes between two looks."""
+"""The penalty-contact step: MuJoCo's substeps, but for what is interpolated."""
 
 from dataclasses import replace
 
 import mujoco
 import pytest
 import torch
-from dynamics_helpers import GROUNDED, each_grounded
 from helpers import (
     in_ground,
     make_scene,
@@ -14,9 +13,9 @@ from helpers import (
     with_points_in_order,
 )
 
+from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 
@@ -26,19 +25,23 @@ BALL = """<mujoco><option cone="{cone}" timestep="0.001"/><worldbody>
   <geom size="0.1" density="200"/></body></worldbody></mujoco>"""
 
 
-each_looks = pytest.mark.parametrize("looks", [1, 2, 3])
-coarse_looks = pytest.mark.parametrize("looks", [1, 2])
+GROUNDED = [
+    load_scene(n) for n in ("double_pendulum", "ant", "anymal", "cube", "cube_slope")
+]
+each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)
+each_stages = pytest.mark.parametrize("stages", [1, 2, 3])
+coarse_stages = pytest.mark.parametrize("stages", [1, 2])
 
 
-def moved(scene, rows, looks=2, stride=1, parts=1, **how):
-    """The step's next state of ``rows``."""
+def moved(scene, rows, stages=2, merged=1, outer=1, precision="float64"):
+    """The step's next state of ``rows``, and its defect."""
     inputs = rows[QPOS], rows[QVEL], rows[JOINT_TORQUE], rows.get(TERRAIN, None)
-    return PenaltyContactStep(scene, looks, stride, parts)(*inputs, **how)
+    return PenaltyContactStep(scene, stages, outer, merged, precision)(*inputs)
 
 
-def errors(scene, rows, looks=2, parts=1):
+def errors(scene, rows, stages=2, outer=1):
     """Error of velocities and places, over the true change of velocity, of each row."""
-    qpos, qvel, _ = moved(scene, rows, looks, parts=parts)
+    qpos, qvel, _ = moved(scene, rows, stages, outer=outer)
     truth = rows["next"]
     size = (truth[QVEL] - rows[QVEL]).norm(dim=-1).clamp_min(1e-6)
     fast = (qvel - truth[QVEL]).norm(dim=-1) / size
@@ -46,15 +49,15 @@ def errors(scene, rows, looks=2, parts=1):
     return fast, slip / (size * scene.control_step)
 
 
-def teacher(scene, looks):
-    """Whose next state that many looks lead to."""
-    return scene.reference if looks == 3 else scene
+def solver_scene(scene, stages):
+    """Whose next state that many stages approximate."""
+    return scene.reference if stages == 3 else scene
 
 
-def touching(scene, generator, looks=2):
+def touching(scene, generator, stages=2):
     rows = in_ground(scene, ROWS, generator)
     torque = rows[JOINT_TORQUE]
-    return true_step(teacher(scene, looks), rows.exclude("next"), torque)
+    return true_step(solver_scene(scene, stages), rows.exclude("next"), torque)
 
 
 def air(scene, generator):
@@ -74,8 +77,8 @@ def air(scene, generator):
 
 
 @each_grounded
-@coarse_looks
-def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, looks, generator):
+@coarse_stages
+def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, stages, generator):
     """What the law leaves out is in proportion to their impedance."""
     model = scene.with_substeps(scene.substeps).model
     one, found = replace(scene, model=model, substeps=1), []
@@ -85,83 +88,83 @@ def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, looks, genera
     for impedance in (1e-3, 1e-4):  # MuJoCo's least
         for solimp in (model.geom_solimp, model.jnt_solimp):
             solimp[:, :2] = impedance
-        fast, slip = errors(one, true_step(one, rows, torque), looks)
+        fast, slip = errors(one, true_step(one, rows, torque), stages)
         assert fast.median() < 20.0 * impedance and slip.median() < 20.0 * impedance
         found.append(fast.median())
     assert found[1] < 0.3 * found[0]  # a tenth, but for rows that lose touch
 
 
 @each_grounded
-@each_looks
-def test_it_goes_where_mujoco_goes(scene, looks, generator):
-    fast, slip = errors(scene, touching(scene, generator, looks), looks)
-    most = {1: 0.25, 2: 0.05, 3: 0.05}[looks]
+@each_stages
+def test_it_goes_where_mujoco_goes(scene, stages, generator):
+    fast, slip = errors(scene, touching(scene, generator, stages), stages)
+    most = {1: 0.25, 2: 0.05, 3: 0.05}[stages]
     assert fast.median() < most and slip.median() < most
 
 
 @each_grounded
-def test_a_second_look_sees_more(scene, generator):
+def test_two_stages_are_more_accurate_than_one(scene, generator):
     rows = touching(scene, generator)
-    (once, _), (twice, _) = (errors(scene, rows, looks) for looks in (1, 2))
+    (once, _), (twice, _) = (errors(scene, rows, stages) for stages in (1, 2))
     assert twice.median() < once.median()
 
 
 @each_grounded
-def test_looks_in_every_part_see_more_still(scene, generator):
+def test_two_outer_steps_are_more_accurate_still(scene, generator):
     rows = touching(scene, generator)
-    parts = next(k for k in (2, 5) if scene.substeps % k == 0)
-    (whole, _), (halves, _) = (errors(scene, rows, 2, n) for n in (1, parts))
+    outer = next(k for k in (2, 5) if scene.substeps % k == 0)
+    (whole, _), (halves, _) = (errors(scene, rows, 2, n) for n in (1, outer))
     assert halves.median() < whole.median()
 
 
 @each_grounded
-def test_a_third_look_sees_what_the_finer_teacher_does(scene, generator):
-    rows = touching(scene, generator, looks=3)
-    (twice, _), (thrice, _) = (errors(scene, rows, looks) for looks in (2, 3))
+def test_three_stages_are_nearer_to_the_reference_solver(scene, generator):
+    rows = touching(scene, generator, stages=3)
+    (twice, _), (thrice, _) = (errors(scene, rows, stages) for stages in (2, 3))
     assert thrice.median() < 0.8 * twice.median()
 
 
 @each_grounded
-@each_looks
-def test_substeps_at_once_are_longer_substeps(scene, looks, generator):
+@each_stages
+def test_merged_substeps_are_longer_substeps(scene, stages, generator):
     rows = touching(scene, generator)
-    stride = max(k for k in (2, 3, 5) if scene.substeps % k == 0)
-    longer = scene.with_substeps(scene.substeps // stride)
-    pairs = moved(scene, rows, looks, stride), moved(longer, rows, looks)
+    merged = max(k for k in (2, 3, 5) if scene.substeps % k == 0)
+    longer = scene.with_substeps(scene.substeps // merged)
+    pairs = moved(scene, rows, stages, merged), moved(longer, rows, stages)
     for one, other in zip(*pairs, strict=True):
         torch.testing.assert_close(one, other)
 
 
 @each_grounded
-@each_looks
-def test_parts_are_shorter_control_steps(scene, looks, generator):
-    rows = touching(scene, generator, looks)
-    parts = next(k for k in (2, 5) if scene.substeps % k == 0)
-    shorter = replace(scene, substeps=scene.substeps // parts)
-    now, wrong = rows, []
-    for _ in range(parts):
-        qpos, qvel, off = moved(shorter, now, looks)
+@each_stages
+def test_outer_steps_are_shorter_control_steps(scene, stages, generator):
+    rows = touching(scene, generator, stages)
+    outer = next(k for k in (2, 5) if scene.substeps % k == 0)
+    shorter = replace(scene, substeps=scene.substeps // outer)
+    now, defects = rows, []
+    for _ in range(outer):
+        qpos, qvel, defect = moved(shorter, now, stages)
         now = rows.clone().update({QPOS: qpos, QVEL: qvel})
-        wrong.append(off)
-    expected = qpos, qvel, torch.cat(wrong, -1)
-    for one, other in zip(expected, moved(scene, rows, looks, 1, parts), strict=True):
+        defects.append(defect)
+    expected = qpos, qvel, torch.cat(defects, -1)
+    for one, other in zip(expected, moved(scene, rows, stages, 1, outer), strict=True):
         torch.testing.assert_close(other, one)
 
 
 @each_grounded
-@each_looks
-def test_half_a_step_in_the_air_has_an_eighth_of_the_error(scene, looks, generator):
+@each_stages
+def test_half_a_step_in_the_air_has_an_eighth_of_the_error(scene, stages, generator):
     """A quarter of it after a single look, a sixteenth of a velocity's after three."""
     rows, found = air(scene, generator), []
-    for parts in (1, 2):
+    for shorter in (1, 2):
         model = scene.with_substeps(scene.substeps).model
-        model.opt.timestep /= parts
+        model.opt.timestep /= shorter
         here = replace(scene, model=model)
         start = rows.exclude("next")
-        truth = true_step(teacher(here, looks), start, rows[JOINT_TORQUE])
-        fast, slip = errors(here, truth, looks)
+        truth = true_step(solver_scene(here, stages), start, rows[JOINT_TORQUE])
+        fast, slip = errors(here, truth, stages)
         found.append((fast.median(), slip.median()))  # the fastest are far off
-    less = {1: (1.5, 1.5), 2: (2.5, 2.5), 3: (5.0, 2.5)}[looks]
+    less = {1: (1.5, 1.5), 2: (2.5, 2.5), 3: (5.0, 2.5)}[stages]
     for coarse, fine, times in zip(*found, less, strict=True):  # relative: over a half
         assert fine < max(coarse / times, 1e-7)
 
@@ -169,7 +172,7 @@ def test_half_a_step_in_the_air_has_an_eighth_of_the_error(scene, looks, generat
 @each_grounded
 def test_springs_are_as_good_in_float32(scene, generator):
     rows = touching(scene, generator)
-    expected, got = moved(scene, rows), moved(scene, rows, dtype=torch.float32)
+    expected, got = moved(scene, rows), moved(scene, rows, precision="float32")
     size = (expected[1] - rows[QVEL]).norm(dim=-1)
     error = (got[1] - expected[1]).norm(dim=-1)
     assert (error < 1e-3 * (1.0 + size)).float().mean() > 0.97  # some lose touch by it
@@ -190,7 +193,7 @@ def test_any_batch_is_a_batch_of_rows(scene, generator):
 def test_it_has_gradients(generator):
     scene = load_scene("cube")
     rows = touching(scene, generator)[:8]
-    step = PenaltyContactStep(scene)
+    step = PenaltyContactStep(scene, precision="float64")
     speed = rows[QVEL].clone().requires_grad_()
     (found,) = torch.autograd.grad(
         step(rows[QPOS], speed, speed[:, :0])[1].sum(), speed
@@ -220,7 +223,9 @@ def test_a_rolling_ball_is_turned_by_its_rim():
     scene = ball()
     qpos = torch.tensor([[0.0, 0.0, 0.0995, 1.0, 0.0, 0.0, 0.0]]).double()
     qvel = torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]).double()
-    _, after, _ = PenaltyContactStep(scene)(qpos, qvel, qpos[:, :0])
+    _, after, _ = PenaltyContactStep(scene, precision="float64")(
+        qpos, qvel, qpos[:, :0]
+    )
     assert after[0, 0] < 1.0 and after[0, 4] > 0.0
     inertia = 0.4 * 0.1  # over m r: of a solid sphere
     torch.testing.assert_close(
@@ -231,7 +236,7 @@ def test_a_rolling_ball_is_turned_by_its_rim():
 @pytest.mark.parametrize(
     ("scene", "sentence"),
     [
-        (load_scene("franka"), "expected a ground to step on, got scene 'franka'"),
+        (load_scene("franka"), "expected a scene with a ground, got 'franka'"),
         (GROUNDED[0].reference, "expected substeps of mjINT_EULER, got mjINT_RK4"),
         (ball("pyramidal"), "expected elliptic friction cones, got pyramidal ones"),
     ],
@@ -241,16 +246,16 @@ def test_what_it_does_not_know_is_refused(scene, sentence):
         PenaltyContactStep(scene)
 
 
-def test_nobody_looks_four_times():
+def test_nobody_stages_four_times():
     with pytest.raises(ValueError, match="expected one look, two or three, got 4"):
-        PenaltyContactStep(GROUNDED[0], looks=4)
+        PenaltyContactStep(GROUNDED[0], stages=4)
 
 
-@pytest.mark.parametrize("parts", [0, 3])
-def test_parts_of_unlike_lengths_are_refused(parts):
-    sentence = f"expected parts of equal numbers of substeps, got {parts} of 16"
+@pytest.mark.parametrize("outer", [0, 3])
+def test_outer_steps_of_unlike_lengths_are_refused(outer):
+    sentence = f"expected outer steps that divide 16 substeps, got {outer}"
     with pytest.raises(ValueError, match=sentence):
-        PenaltyContactStep(load_scene("ant"), parts=parts)
+        PenaltyContactStep(load_scene("ant"), num_outer_steps=outer)
 
 
 def test_so_are_contacts_and_limits_of_another_law():
@@ -264,9 +269,9 @@ def test_so_are_contacts_and_limits_of_another_law():
 
 
 @each_grounded
-@each_looks
-def test_points_in_another_order_push_alike(scene, looks, generator):
-    rows = touching(scene, generator, looks)
+@each_stages
+def test_points_in_another_order_push_alike(scene, stages, generator):
+    rows = touching(scene, generator, stages)
     order = torch.randperm(len(scene.contacts), generator=generator)
-    got = moved(with_points_in_order(scene, order), rows, looks)
-    torch.testing.assert_close(got, moved(scene, rows, looks), rtol=1e-6, atol=1e-6)
+    got = moved(with_points_in_order(scene, order), rows, stages)
+    torch.testing.assert_close(got, moved(scene, rows, stages), rtol=1e-6, atol=1e-6)

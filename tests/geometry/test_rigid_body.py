@@ -85,5 +85,5 @@ def test_it_is_mujocos_own(scene, period, is_driven, generator):
 def test_other_joints_are_refused():
     ball = make_scene("""<mujoco><worldbody><body><joint type="ball"/><geom size="1"/>
       </body></worldbody></mujoco>""")
-    with pytest.raises(ValueError, match="one to a body, to foresee what they do, got"):
+    with pytest.raises(ValueError, match="one to a body, for the equation of motion"):
         JointAxes.of(ball.model, ball.base)

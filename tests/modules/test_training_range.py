@@ -2,12 +2,10 @@
 
 import torch
 from dynamics_helpers import LEARNED, little_data, random_drive, random_model
-from safetensors.torch import load_file, save_file
 
-from torchrl_nerd.checkpoint import WEIGHTS, load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.geometry.manifold import differentiate_pos
-from torchrl_nerd.modules.coverage import Coverage
+from torchrl_nerd.modules.training_range import TrainingRange, magnitudes
 from torchrl_nerd.training.sequences import cover, normalised
 
 ROWS = 16
@@ -16,13 +14,13 @@ ROWS = 16
 def test_training_data_are_left_as_they_are(scene, generator):
     model, data = random_model(scene, generator), little_data(scene)
     tokens, targets = normalised(model, data)
-    assert torch.equal(model.coverage.clamp_token(tokens), tokens)
-    assert torch.equal(model.coverage.clamp_target(targets), targets)
+    assert torch.equal(model.training_range.clamp_features(tokens), tokens)
+    assert torch.equal(model.training_range.clamp_target(targets), targets)
     qvel = data["next", "qvel"]
-    assert torch.equal(model.coverage.limit_motion(qvel), qvel)
+    assert torch.equal(model.training_range.limit_motion(qvel), qvel)
     qpos = data["next", "qpos"]
     for kept, given in zip(
-        model.coverage.stop_joints(qpos, qvel), (qpos, qvel), strict=True
+        model.training_range.stop_joints(qpos, qvel), (qpos, qvel), strict=True
     ):
         assert torch.equal(kept, given)
 
@@ -30,7 +28,7 @@ def test_training_data_are_left_as_they_are(scene, generator):
 def test_one_training_state_in_a_hundred_is_called_unfamiliar(scene, generator):
     model = random_model(scene, generator)
     tokens, _ = normalised(model, little_data(scene))
-    share = (model.coverage.distance(tokens.flatten(0, -2)) > 1.0).double().mean()
+    share = (model.ood_score(tokens.flatten(0, -2)) > 1.0).double().mean()
     assert 0.005 < share < 0.015
 
 
@@ -39,68 +37,73 @@ def test_whatever_comes_in_speeds_and_motions_stay_bounded(scene, generator):
     state, torques, terrain = random_drive(scene, ROWS, 20, generator)
     wild = 10.0 ** (6.0 * torch.rand(ROWS, 1, generator=generator).double())
     state["qvel"] = wild * state["qvel"]
-    limit = model.coverage.speed * (1.0 + 1e-9)
+    limit = model.training_range.speed * (1.0 + 1e-9)
     for inference in LEARNED:
         dynamics, now = NeRDDynamics(model, inference), state
         for torque in wild * torques:
             before, now = now, dynamics.step(now, torque, terrain)
             assert now["qpos"].isfinite().all()
-            assert (model.coverage.sizes(now["qvel"]) <= limit).all()
+            assert (
+                magnitudes(model.training_range.vectors, now["qvel"]) <= limit
+            ).all()
             moved = differentiate_pos(scene.layout, before["qpos"], now["qpos"])
             farthest = scene.control_step * limit + 1e-6
-            is_within = model.coverage.sizes(before["qvel"]) <= model.coverage.speed
-            assert (model.coverage.sizes(moved) <= farthest)[is_within].all()
+            is_within = (
+                magnitudes(model.training_range.vectors, before["qvel"])
+                <= model.training_range.speed
+            )
+            assert (magnitudes(model.training_range.vectors, moved) <= farthest)[
+                is_within
+            ].all()
 
 
-def test_widened_bounds_hold_both_and_trust_stays(scene, generator):
+def test_widened_bounds_hold_both(scene, generator):
     model, other = (random_model(scene, generator) for _ in range(2))
     data = little_data(scene)[::2]
     data["next", "qvel"] = 3.0 * data["next", "qvel"]
     cover(other, data)
-    mine, trust = model.coverage, ("center", "whitening", "reach", "still")
+    mine, theirs = model.training_range, other.training_range
     before = {key: value.clone() for key, value in mine.state_dict().items()}
-    mine.widen(Coverage(scene, model.tokens.size, model.state_delta.size))  # saw none
+    sizes = model.scene_features.size, model.state_delta.size
+    mine.widen(TrainingRange(scene, *sizes))  # never fitted
     assert all(torch.equal(mine.state_dict()[k], v) for k, v in before.items())
-    mine.widen(other.coverage)
+    mine.widen(theirs)
     for key, value in mine.state_dict().items():
-        theirs = other.coverage.state_dict()[key]
-        if key in trust:
-            assert torch.equal(value, before[key])
-        else:
-            wider = torch.minimum if key.endswith("low") else torch.maximum
-            assert torch.equal(value, wider(before[key], theirs)), key
+        wider = torch.minimum if key.endswith("low") else torch.maximum
+        assert torch.equal(value, wider(before[key], theirs.state_dict()[key])), key
     assert (mine.speed > before["speed"]).any()
 
 
 def test_joints_with_limits_stop_where_the_data_end(scene, generator):
-    coverage, layout = random_model(scene, generator).coverage, scene.layout
+    layout = scene.layout
+    bounds = random_model(scene, generator).training_range
     shape = (ROWS, layout.nq + layout.nv)
     wild = 100.0 * torch.randn(shape, dtype=torch.float64, generator=generator)
     qpos, qvel = wild.split((layout.nq, layout.nv), -1)
-    place, speed = coverage.stop_joints(qpos, qvel)
-    for q, v in coverage.limited:
-        low, high = coverage.qpos_low[q], coverage.qpos_high[q]
+    place, speed = bounds.stop_joints(qpos, qvel)
+    for q, v in bounds.limited:
+        low, high = bounds.qpos_low[q], bounds.qpos_high[q]
         assert ((place[:, q] >= low) & (place[:, q] <= high)).all()
         assert (speed[:, v][qpos[:, q] > high] <= 0.0).all()
         assert (speed[:, v][qpos[:, q] < low] >= 0.0).all()
-    free_q = [q for q in range(layout.nq) if q not in dict(coverage.limited)]
-    free_v = [v for v in range(layout.nv) if v not in dict(coverage.limited).values()]
+    free_q = [q for q in range(layout.nq) if q not in dict(bounds.limited)]
+    free_v = [v for v in range(layout.nv) if v not in dict(bounds.limited).values()]
     assert torch.equal(place[:, free_q], qpos[:, free_q])
     assert torch.equal(speed[:, free_v], qvel[:, free_v])
 
 
 def test_beyond_the_box_is_beyond_trust(scene, generator):
     model = random_model(scene, generator)
-    coverage = model.coverage
+    bounds = model.training_range
     tokens, _ = normalised(model, little_data(scene))
     tokens = tokens.flatten(0, -2)[:ROWS].double()
     entry = torch.randint(tokens.shape[-1], (ROWS,), generator=generator)
     step = 1e-6 + torch.rand(ROWS, generator=generator).double()
     rows = torch.arange(ROWS)
-    tokens[rows, entry] = coverage.token_high[entry] + step
-    assert (coverage.distance(tokens) > 1.0).all()
+    tokens[rows, entry] = bounds.feature_high[entry] + step
+    assert (model.ood_score(tokens) > 1.0).all()
     assert torch.equal(
-        coverage.clamp_token(tokens)[rows, entry], coverage.token_high[entry]
+        bounds.clamp_features(tokens)[rows, entry], bounds.feature_high[entry]
     )
 
 
@@ -108,25 +111,19 @@ def test_gradients_are_finite_at_rest(scene, generator):
     model = random_model(scene, generator)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     qvel = torch.zeros_like(state["qvel"]).requires_grad_()
-    token = model.encode(state["qpos"], qvel, torques[0], terrain)
-    output = model.network.step(token, model.network.empty_memory(ROWS))
-    _, after = model.decode(state["qpos"], qvel, output)
+    memory = model.network.empty_memory(ROWS)
+    _, after, _ = model.step(
+        (state["qpos"], qvel),
+        torques[0],
+        terrain,
+        lambda token: model.network.step(token, memory),
+    )
     after.square().sum().backward()
     assert qvel.grad is not None and qvel.grad.isfinite().all()
 
 
-def test_weights_of_before_it_load_and_are_bounded_by_nothing(
-    scene, generator, tmp_path
-):
-    model = random_model(scene, generator)
-    save_checkpoint(model, tmp_path, make_card(model))
-    assert load_checkpoint(tmp_path, scene).coverage.is_fitted
-    tensors = load_file(tmp_path / WEIGHTS)
-    old = {
-        k: v for k, v in tensors.items() if not k.startswith(("coverage.", "check."))
-    }
-    save_file(old, tmp_path / WEIGHTS)
-    loaded = load_checkpoint(tmp_path, scene).coverage
-    assert not loaded.is_fitted
-    wild = 1e9 * torch.randn(ROWS, loaded.token_low.numel(), generator=generator)
-    assert torch.equal(loaded.clamp_token(wild.double()), wild.double())
+def test_a_model_that_saw_no_data_is_bounded_by_nothing(scene, generator):
+    bounds = TrainingRange(scene, 5, 2 * scene.model.nv)
+    assert not bounds.is_fitted
+    wild = 1e9 * torch.randn(ROWS, 5, generator=generator).double()
+    assert torch.equal(bounds.clamp_features(wild), wild)

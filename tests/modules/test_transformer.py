@@ -36,7 +36,7 @@ def view(config: TransformerConfig) -> int:
     return config.layers * (config.band - 1) + 1
 
 
-def fold_in(network: nn.Module, tokens: Tensor, resets: Tensor | None = None) -> Tensor:
+def stream(network: nn.Module, tokens: Tensor, resets: Tensor | None = None) -> Tensor:
     """Token by token; ``resets (rows, T)`` empties histories before a token."""
     memory = network.empty_memory(len(tokens))
     outputs = []
@@ -72,7 +72,7 @@ def test_streaming_equals_the_full_sequence(config, dtype, tolerance, generator)
     tokens = randn(generator, 4, view(config) + 15, INPUTS, dtype=dtype)
     resets = random_resets(4, tokens.shape[1], generator)
     with torch.no_grad():
-        streamed = fold_in(network, tokens, resets)
+        streamed = stream(network, tokens, resets)
         expected = episodes(network, tokens, resets)
     scale = float(expected.abs().max())  # random weights: not of order one
     torch.testing.assert_close(streamed, expected, atol=tolerance * scale, rtol=0.0)
@@ -89,7 +89,7 @@ def test_gradients_through_streaming_equal_the_full_sequence(
     resets = random_resets(3, tokens.shape[1], generator) & has_resets
     wanted = [tokens, *network.parameters()]
     streamed = torch.autograd.grad(
-        (weight * fold_in(network, tokens, resets)).sum(), wanted
+        (weight * stream(network, tokens, resets)).sum(), wanted
     )
     expected = torch.autograd.grad(
         (weight * episodes(network, tokens, resets)).sum(), wanted
@@ -146,7 +146,7 @@ def test_nothing_of_a_cleared_history_leaks(config, generator):
     resets = torch.zeros(4, tokens.shape[1], dtype=torch.bool)
     resets[1, start] = True
     with torch.no_grad():
-        polluted, clean = fold_in(network, junk, resets), fold_in(network, tokens)
+        polluted, clean = stream(network, junk, resets), stream(network, tokens)
         fresh = network(tokens[1:2, start:])
     assert torch.equal(polluted[~row], clean[~row])
     torch.testing.assert_close(polluted[row, start:], fresh, atol=1e-12, rtol=1e-12)
@@ -159,8 +159,8 @@ def test_rows_do_not_mix(config, dtype, tolerance, generator):
     network = build(config, generator, dtype)
     tokens = randn(generator, 6, config.band + 5, INPUTS, dtype=dtype)
     with torch.no_grad():
-        together = fold_in(network, tokens)
-        alone = torch.cat([fold_in(network, row[None]) for row in tokens])
+        together = stream(network, tokens)
+        alone = torch.cat([stream(network, row[None]) for row in tokens])
     scale = float(together.abs().max())  # random weights: not of order one
     torch.testing.assert_close(together, alone, atol=tolerance * scale, rtol=0.0)
 
@@ -176,7 +176,7 @@ def test_outputs_do_not_share_memory_with_the_history(config, generator):
             outputs.append(output.clone())
             output.fill_(torch.nan)
             token.fill_(torch.nan)
-        assert torch.equal(torch.stack(outputs, 1), fold_in(network, tokens))
+        assert torch.equal(torch.stack(outputs, 1), stream(network, tokens))
 
 
 @pytest.mark.parametrize("name", PRESETS)

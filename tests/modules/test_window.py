@@ -21,7 +21,7 @@ def randn(generator: Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-def fold_in(network: nn.Module, tokens: Tensor, resets: Tensor) -> Tensor:
+def stream(network: nn.Module, tokens: Tensor, resets: Tensor) -> Tensor:
     memory, outputs = network.empty_memory(len(tokens)), []
     for t, token in enumerate(tokens.unbind(1)):
         memory.clear(resets[:, t])
@@ -52,7 +52,7 @@ def test_window_is_the_network_on_the_last_tokens(name, size, generator):
     resets[0] = False
     resets[1, STEPS // 2] = True
     with torch.no_grad():
-        streamed = fold_in(window, tokens, resets)
+        streamed = stream(window, tokens, resets)
         expected = recompute(window, tokens, resets)
     torch.testing.assert_close(streamed, expected, atol=1e-12, rtol=1e-12)
 
@@ -62,8 +62,8 @@ def test_depth_widens_the_streaming_view_beyond_the_window(generator):
     tokens = randn(generator, ROWS, STEPS, INPUTS)
     never = torch.zeros(ROWS, STEPS, dtype=torch.bool)
     with torch.no_grad():
-        streamed = fold_in(window.network, tokens, never)
-        windowed = fold_in(window, tokens, never)
+        streamed = stream(window.network, tokens, never)
+        windowed = stream(window, tokens, never)
     size = window.size
     torch.testing.assert_close(
         streamed[:, :size], windowed[:, :size], atol=1e-12, rtol=1e-12
@@ -81,7 +81,7 @@ def test_nothing_of_a_cleared_history_leaks(name, generator):
     junk = tokens.clone()
     junk[1, :when] = torch.nan
     with torch.no_grad():
-        polluted, clean = (fold_in(window, x, resets) for x in (junk, tokens))
+        polluted, clean = (stream(window, x, resets) for x in (junk, tokens))
     others = [0, 2, 3]
     assert torch.equal(polluted[others], clean[others])
     assert torch.equal(polluted[1, when:], clean[1, when:])
@@ -92,7 +92,7 @@ def test_gradients_reach_every_token_of_the_window(name, generator):
     window = build(name, 4, generator)
     tokens = randn(generator, 1, 9, INPUTS).requires_grad_()
     never = torch.zeros(1, 9, dtype=torch.bool)
-    last = fold_in(window, tokens, never)[0, -1].square().sum()
+    last = stream(window, tokens, never)[0, -1].square().sum()
     (gradient,) = torch.autograd.grad(last, tokens)
     expected = window.network(tokens[:, 5:])[0, -1].square().sum()
     (wanted,) = torch.autograd.grad(expected, tokens)

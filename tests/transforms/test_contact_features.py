@@ -120,27 +120,26 @@ def test_features_are_mujocos_distances_and_velocities(scene, generator):
 
 
 @touching_scene
-def test_foreseen_depths_are_those_of_the_coming_states(scene, generator):
-    """At constant velocity; along free motion, see test_foresight."""
-    scene = scene.foreseeing(scene.foresees_forces, False)
-    rows, foreseen = near_ground(scene, generator), 0
+def test_predicted_depths_are_those_of_the_coming_states(scene, generator):
+    """At constant velocity; along unconstrained motion, see test_feature_config."""
+    rows, predicted = near_ground(scene, generator), 0
     rows[QVEL] /= rows[QVEL].abs().amax(-1, keepdim=True)
     features, points = contact_features(scene, rows), scene.contacts
-    glances = features[CONTACT_DEPTH].shape[-1]
+    times = features[CONTACT_DEPTH].shape[-1]
     for index in range(ROWS):
         gate = mujoco_contacts(scene, rows[index])[0] - points.margins
         gate = np.clip(gate / (FADE * (points.radii - points.margins)), 0.0, 1.0)
-        for glance in range(glances):
+        for number in range(times):
             later, qpos = rows[index].clone(), rows[QPOS][index].numpy().copy()
-            time = scene.control_step * glance / glances
+            time = scene.control_step * number / times
             mujoco.mj_integratePos(scene.model, qpos, rows[QVEL][index].numpy(), time)
             later[QPOS] = torch.from_numpy(qpos)
             distance = mujoco_contacts(scene, later)[0]
             want = gate * np.maximum(points.radii - distance, 0.0)
-            got = features[CONTACT_DEPTH][index, :, glance]
+            got = features[CONTACT_DEPTH][index, :, number]
             np.testing.assert_allclose(got, want, 0.0, 1e-5)
-            foreseen += (want > 0.0).sum()
-    assert foreseen > 0
+            predicted += (want > 0.0).sum()
+    assert predicted > 0
 
 
 @touching_scene

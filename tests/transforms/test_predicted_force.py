@@ -1,4 +1,4 @@
-"""Forces foreseen for springs: MuJoCo's own where nothing moves, or hardly."""
+"""Predicted penalty forces: MuJoCo's own where nothing moves, or hardly."""
 
 import copy
 from dataclasses import replace
@@ -9,28 +9,27 @@ import pytest
 import torch
 from helpers import HANDMADE, in_ground, make_scene
 
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.geometry.rotations import rotate_inverse
 from torchrl_nerd.keys import CONTACT_FORCE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import ContactFeatures, RobotCentric
 
-ROWS = 60
-SPRINGY = [load_scene(name) for name in SCENES]
-SPRINGY = [scene for scene in SPRINGY if scene.terrain is not None]
-springy_scene = pytest.mark.parametrize(
-    "scene", [s.foreseeing(True) for s in SPRINGY], ids=lambda s: s.name
-)
+ROWS, FORCES = 60, FeatureConfig(predicted_force=True)
+PENALTY = [load_scene(name) for name in SCENES]
+PENALTY = [scene for scene in PENALTY if scene.terrain is not None]
+penalty_scene = pytest.mark.parametrize("scene", PENALTY, ids=lambda s: s.name)
 
 
-def foreseen(scene, rows):
+def predicted(scene, rows):
     """Forces of contacts and of limits on every dof, ``(rows, nv)``, in B_t."""
-    contact, robot = ContactFeatures(scene), RobotCentric(scene)
+    contact, robot = ContactFeatures(scene, FORCES), RobotCentric(scene, FORCES)
     values = contact.contact_features(rows[QPOS], rows[QVEL], rows.get(TERRAIN, None))
     force = dict(zip(contact.out_keys, values, strict=True))[CONTACT_FORCE].clone()
-    pressed = robot.joints.pressed
-    if pressed:
+    limited = robot.joints.predicted
+    if limited:
         state = robot.state_features(rows[QPOS], rows[QVEL])
-        force[:, pressed] += state[:, -len(pressed) :]
+        force[:, limited] += state[:, -len(limited) :]
     return force
 
 
@@ -70,14 +69,14 @@ def expect_near(scene, got, want):
     assert (want.abs().amax(-1) > 10.0).any(), "nothing touched"
 
 
-@springy_scene
+@penalty_scene
 def test_at_rest_they_are_what_mujoco_pushes_with(scene, generator):
     rows = in_ground(scene, ROWS, generator)
     rows[QVEL].zero_()
-    expect_near(scene, foreseen(scene, rows), mujoco_force(scene, rows))
+    expect_near(scene, predicted(scene, rows), mujoco_force(scene, rows))
 
 
-@springy_scene
+@penalty_scene
 def test_a_moment_of_motion_is_damped_and_held_back_as_by_mujoco(scene, generator):
     """In a control step so short that the way along it is nothing."""
     rows = in_ground(scene, ROWS, generator)
@@ -85,14 +84,14 @@ def test_a_moment_of_motion_is_damped_and_held_back_as_by_mujoco(scene, generato
     model = copy.copy(scene.model)
     model.opt.timestep = 1e-9
     short = replace(scene, model=model, substeps=5)
-    expect_near(scene, foreseen(short, rows), mujoco_force(scene, rows))
+    expect_near(scene, predicted(short, rows), mujoco_force(scene, rows))
 
 
-def test_what_is_not_foreseen_is_refused():
+def test_what_cannot_be_predicted_is_refused():
     several = HANDMADE["floater"]
-    with pytest.raises(ValueError, match="one to a body, to foresee what they do, got"):
-        ContactFeatures(several.foreseeing(True))
+    with pytest.raises(ValueError, match="one to a body, for the equation of motion"):
+        ContactFeatures(several, FORCES)
     hard = make_scene("""<mujoco><worldbody><geom type="plane" size="0 0 1"/>
       <body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>""")
     with pytest.raises(ValueError, match="springs and dampers"):
-        ContactFeatures(hard.foreseeing(True))
+        ContactFeatures(hard, FORCES)

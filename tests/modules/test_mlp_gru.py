@@ -5,7 +5,8 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
+from torchrl_nerd.modules.gru import GRUConfig
+from torchrl_nerd.modules.mlp import MLPConfig
 
 INPUTS, OUTPUTS, ROWS, STEPS = 5, 3, 4, 14
 CONFIGS = {
@@ -25,7 +26,7 @@ def randn(generator: Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-def fold_in(
+def stream(
     network: nn.Module, tokens: Tensor, cleared: Tensor, when: int
 ) -> tuple[Tensor, Tensor]:
     """Outputs before and after the step at which ``cleared`` rows forget."""
@@ -47,7 +48,7 @@ def test_stepping_equals_the_full_sequence(config, dtype, tolerance, generator):
     tokens = randn(generator, ROWS, STEPS, INPUTS).to(dtype)
     rows = torch.tensor([False, True, False, True])
     with torch.no_grad():
-        before, after = fold_in(network, tokens, rows, 6)
+        before, after = stream(network, tokens, rows, 6)
         whole, restarted = network(tokens), network(tokens[:, 6:])
     close = {"atol": tolerance, "rtol": tolerance}
     torch.testing.assert_close(before, whole[:, :6], **close)
@@ -63,8 +64,8 @@ def test_nothing_of_a_cleared_history_leaks(config, generator):
     junk = tokens.clone()
     junk[1, :6] = torch.nan
     with torch.no_grad():
-        _, polluted = fold_in(network, junk, rows, 6)
-        _, clean = fold_in(network, tokens, rows, 6)
+        _, polluted = stream(network, junk, rows, 6)
+        _, clean = stream(network, tokens, rows, 6)
     assert torch.equal(polluted, clean)
 
 
@@ -73,7 +74,7 @@ def test_gradients_through_stepping_equal_the_full_sequence(config, generator):
     network = build(config, generator)
     tokens = randn(generator, ROWS, STEPS, INPUTS).requires_grad_()
     rows = torch.tensor([False, True, False, True])
-    before, after = fold_in(network, tokens, rows, 6)
+    before, after = stream(network, tokens, rows, 6)
     whole, restarted = network(tokens), network(tokens[:, 6:])
     later = torch.where(rows[:, None, None], restarted, whole[:, 6:])
     wanted = [tokens, *network.parameters()]
