@@ -25,9 +25,8 @@ BALL = """<mujoco><option cone="{cone}" timestep="0.001"/><worldbody>
   <geom size="0.1" density="200"/></body></worldbody></mujoco>"""
 
 
-GROUNDED = [
-    load_scene(n) for n in ("double_pendulum", "ant", "anymal", "cube", "cube_slope")
-]
+NAMES = "double_pendulum", "ant", "anymal", "cube", "cube_slope"
+GROUNDED = [load_scene(name) for name in NAMES]
 each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)
 each_stages = pytest.mark.parametrize("stages", [1, 2, 3])
 coarse_stages = pytest.mark.parametrize("stages", [1, 2])

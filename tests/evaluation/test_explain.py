@@ -3,9 +3,9 @@
 import mujoco
 import pytest
 from helpers import every_scene, make_scene
+from torchrl_nerd.modules.scene_tokens import SceneTokens
 
 from torchrl_nerd.evaluation.explain import explain
-from torchrl_nerd.modules.scene_tokens import SceneTokens
 from torchrl_nerd.robots import load_scene
 
 CROSSED = """

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
 from torchrl_nerd.data.cube_tosses import Tosses
 from torchrl_nerd.evaluation.parameter_fit import (
     CENTRE,
@@ -11,7 +12,6 @@ from torchrl_nerd.evaluation.parameter_fit import (
     moved,
 )
 from torchrl_nerd.evaluation.toss_error import path_errors
-from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
 
 TOSSES, STATES = 12, 16
 

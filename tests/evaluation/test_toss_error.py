@@ -5,6 +5,7 @@ import math
 import torch
 from tensordict import TensorDict
 
+from torchrl_nerd.analytic.free_body import FreeBodyPenaltyStep
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.parameter_fit import CENTRE
 from torchrl_nerd.evaluation.system_identification import (
@@ -20,7 +21,6 @@ from torchrl_nerd.evaluation.toss_error import (
     summarize_both,
     toss_errors,
 )
-from torchrl_nerd.analytic.free_body import FreeBodyPenaltyStep
 
 
 class Replay:

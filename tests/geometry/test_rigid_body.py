@@ -9,9 +9,9 @@ import torch
 from helpers import make_scene, random_transitions
 
 from torchrl_nerd.geometry.base import base_pose
-from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import SCENES, load_scene
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from helpers import every_scene, random_transitions, true_step
 from torch import Tensor, nn
+from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 
 from torchrl_nerd.data.generate import is_sound, simulate
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.robots import SCENES, load_scene

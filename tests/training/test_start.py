@@ -4,6 +4,8 @@ import pytest
 import torch
 from dynamics_helpers import little_data, random_drive, random_model
 from torch import Generator
+from torchrl_nerd.modules.correction import ResidualConfig
+from torchrl_nerd.modules.residual import ResidualNeRD
 
 from torchrl_nerd.checkpoint import (
     from_pretrained,
@@ -16,10 +18,8 @@ from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json
-from torchrl_nerd.modules.correction import ResidualConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.modules.residual import ResidualNeRD
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.training import validation
 from torchrl_nerd.training.sequences import Symmetry, cover, data_stats

@@ -3,16 +3,16 @@
 import pytest
 import torch
 from torch import Generator
+from torchrl_nerd.modules.baselines import MLPConfig
 
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.baselines import MLPConfig
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.images import Images
