@@ -6,10 +6,10 @@ from dynamics_helpers import (
     ANALYTIC,
     each_analytic,
     enliven,
-    hybrid_model,
     little_data,
     random_drive,
     roll,
+    scene_stats,
     unequal_keys,
 )
 from helpers import in_ground, random_transitions
@@ -17,11 +17,13 @@ from torch import nn
 
 from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import AnalyticDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.stability.states import turned
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.training_range import magnitudes
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training.sequences import cover
@@ -29,8 +31,14 @@ from torchrl_nerd.training.sequences import cover
 ROWS = 32
 
 
+def fresh(scene, step):
+    made = make_step(scene, STEPS[step])
+    stats = scene_stats(scene)
+    return HybridNeRD(scene, made, NO_PREDICTIONS, NETWORKS["mlp-2x64"], stats)
+
+
 def lively(scene, step, generator):
-    model = hybrid_model(scene, step)
+    model = fresh(scene, step)
     enliven(model.network, generator)
     return model
 
@@ -47,7 +55,7 @@ def test_a_fresh_one_moves_as_its_step_does(scene, step, generator):
     given = rows.select(QPOS, QVEL), rows[JOINT_TORQUE], rows.get(TERRAIN, None)
     expected = AnalyticDynamics(make_step(scene, STEPS[step])).step(*given)
     for dtype in (torch.float64, torch.float32, torch.bfloat16):
-        after = advance(hybrid_model(scene, step).to(dtype), rows)
+        after = advance(fresh(scene, step).to(dtype), rows)
         for key in (QPOS, QVEL):
             torch.testing.assert_close(after[key], expected[key], atol=1e-9, rtol=1e-9)
 
@@ -55,7 +63,7 @@ def test_a_fresh_one_moves_as_its_step_does(scene, step, generator):
 @each_analytic
 def test_changes_are_bounded_by_speed_and_not_by_the_data(scene, step, generator):
     """The analytic step knows harder impacts than any in the data."""
-    model, rows = hybrid_model(scene, step), random_transitions(scene, ROWS, generator)
+    model, rows = fresh(scene, step), random_transitions(scene, ROWS, generator)
     expected = advance(model, rows)
     cover(model, little_data(scene))
     bounds, limit = model.training_range, model.training_range.speed
@@ -164,8 +172,8 @@ def test_where_the_defect_is_zero_the_network_has_no_influence(generator):
     speed[:, 2] += float(scene.model.opt.gravity[2]) * scene.control_step
     torch.testing.assert_close(after, speed, atol=1e-5, rtol=1e-5)
     turning = random_transitions(scene, ROWS, generator)
-    fresh = hybrid_model(scene, "penalty-contact")
-    difference = advance(model, turning)[QVEL] - advance(fresh, turning)[QVEL]
+    plain = fresh(scene, "penalty-contact")
+    difference = advance(model, turning)[QVEL] - advance(plain, turning)[QVEL]
     assert difference.abs().max() > 1e-3
 
 
@@ -182,6 +190,6 @@ def test_compiled_equals_eager(scene, step, generator):
 
 
 def test_its_last_layer_is_zero_at_first_and_no_other_is(generator):
-    model = hybrid_model(load_scene("double_pendulum"), "penalty-contact")
+    model = fresh(load_scene("double_pendulum"), "penalty-contact")
     linear = [m for m in model.network.modules() if isinstance(m, nn.Linear)]
     assert not linear[-1].weight.any() and all(m.weight.any() for m in linear[:-1])
