@@ -1,12 +1,18 @@
-"""Fixtures of every test: fresh random numbers, and all registered robots and tasks.
+"""Fixtures of every test: random numbers, and all registered robots and tasks.
 
 A test that takes ``scene`` or ``task_id`` runs once for each one registered, so a new
-robot is tested by being there. Random inputs are drawn anew at every run; a failure shows
-its seed, and ``pytest --seed N`` draws the same again.
+robot is tested by being there. Where a test has several parameters, a few cases cover every
+value of each; the rest of the product is marked slow, see `cover_products`.
+
+Random inputs of a test are the same at every run. ``pytest --seed N`` draws others,
+``--seed random`` new ones at every run; a failure shows its seed.
 """
 
 import logging
 import secrets
+from collections import Counter
+from itertools import groupby
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -20,15 +26,53 @@ from torchrl_nerd.scenes import Scene
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 
 
+PRODUCT = 8
+"""Cases of a test with several parameters up to which all of them run by default."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--seed", type=int, help="draw the random inputs of this seed")
+    parser.addoption("--seed", help="a number, or 'random'; each test's own otherwise")
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for _, cases in groupby(items, lambda item: item.nodeid.partition("[")[0]):
+        cover_products([case for case in cases if isinstance(case, pytest.Function)])
+
+
+def cover_products(cases: list[pytest.Function]) -> None:
+    """Mark slow all but a few cases of a test in which every parameter's values occur.
+
+    Which values meet depends on the test's name, so that other pairs meet in other tests.
+    """
+    expensive = ("slow", "gpu")
+    cases = [case for case in cases if not any(map(case.get_closest_marker, expensive))]
+    values = {  # the same object in every case that has it
+        case: {(name, id(value)) for name, value in case.callspec.params.items()}
+        for case in cases
+        if hasattr(case, "callspec")
+    }
+    missing = set().union(*values.values())
+    counts = Counter(name for name, _ in missing)
+    if len(cases) <= PRODUCT or sum(count > 1 for count in counts.values()) < 2:
+        return
+    order = sorted(cases, key=lambda case: crc32(case.nodeid.encode()))
+    while missing:
+        best = max(order, key=lambda case: len(values[case] & missing))
+        missing -= values[best]
+        order.remove(best)
+    for case in order:
+        case.add_marker("slow")
 
 
 @pytest.fixture
 def seed(request: pytest.FixtureRequest) -> int:
-    """A fresh seed for this test, printed if it fails."""
+    """A seed of this test's own, printed if it fails."""
     given = request.config.getoption("--seed")
-    value = secrets.randbits(31) if given is None else given
+    if given is None:
+        value = crc32(request.node.nodeid.encode()) >> 1
+    else:
+        value = secrets.randbits(31) if given == "random" else int(given)
     request.node.add_report_section("call", "seed", f"--seed {value}")
     torch.manual_seed(value)
     return value
