@@ -21,6 +21,7 @@ import tyro
 from scaling import stepper
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor, nn
+from torchrl_nerd.training.muon import Muon
 from tqdm import trange
 
 from torchrl_nerd.configs import TrainConfig
@@ -39,7 +40,6 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import PRESETS, load_scene
 from torchrl_nerd.training.losses import one_step_loss
-from torchrl_nerd.training.muon import Muon
 from torchrl_nerd.training.trainer import split_parameters
 from torchrl_nerd.transforms import Stats
 

@@ -6,32 +6,21 @@ in one sentence, of what differs.
 """
 
 import os
-import platform
 import warnings
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import torch
 
-from torchrl_nerd import __version__
 from torchrl_nerd.analytic import make_step
-from torchrl_nerd.configs import (
-    FeatureConfig,
-    FreeBodyConfig,
-    PenaltyContactConfig,
-    StepConfig,
-    UnconstrainedConfig,
-)
+from torchrl_nerd.card import FORMAT, make_card, network_config_of, step_config_of
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
-from torchrl_nerd.modules.gru import GRUConfig
 from torchrl_nerd.modules.hybrid import HybridNeRD
-from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
-from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.selfcheck import PREFIX as CHECK
@@ -43,59 +32,8 @@ from torchrl_nerd.selfcheck import (
 )
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
-FORMAT = 2
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
-MAX_SIZE = 2**14  # of any number in a network's configuration
-NETWORK_KINDS: dict[str, type] = {
-    "transformer": TransformerConfig,
-    "mlp": MLPConfig,
-    "gru": GRUConfig,
-}
-STEP_KINDS: dict[str, type] = {
-    "unconstrained": UnconstrainedConfig,
-    "penalty-contact": PenaltyContactConfig,
-    "free-body": FreeBodyConfig,
-}
-
-
-def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str, Any]:
-    """What a checkpoint says of itself.
-
-    Args:
-        model: the weights' owner.
-        training: how they were made: configuration, data, measured error curve.
-    """
-    scene = model.scene
-    card: dict[str, Any] = {
-        "format": FORMAT,
-        "kind": model.kind,
-        "scene": scene.name,
-        "scene_hash": scene.hash,
-        "reference_ratio": scene.reference_ratio,
-        "control_step": scene.control_step,
-        "network": None,
-        "step": None,
-    }
-    step = model if not isinstance(model, NeRD) else None
-    if isinstance(model, NeRD):
-        card["network"] = _described(NETWORK_KINDS, model.config)
-        card["features"] = asdict(model.scene_features.config)
-    if isinstance(model, HybridNeRD):
-        step = model.analytic_step
-    if step is not None:
-        card["step"] = _described(STEP_KINDS, step.config)
-    return card | {
-        "training_ranges": scene.sampling.ranges(),
-        "versions": {
-            "torchrl_nerd": __version__,
-            "mujoco": mujoco.__version__,
-            "torch": torch.__version__,
-            "python": platform.python_version(),
-        },
-        "licence": "MIT",
-        **(training or {}),
-    }
 
 
 def save_checkpoint(model: Model, folder: Path, card: dict[str, Any]) -> Path:
@@ -212,44 +150,22 @@ def _build(
     try:
         with torch.random.fork_rng(devices=[]):
             if kind == "analytic":
-                config = _config(STEP_KINDS, card.get("step"), "step", folder)
-                return make_step(solver_scene, cast(StepConfig, config))
-            network = _config(NETWORK_KINDS, card.get("network"), "network", folder)
-            network = cast(NetworkConfig, network)
+                config = step_config_of(card, folder)
+                return make_step(solver_scene, config)
+            network = network_config_of(card, folder)
             _expect_room(network, tensors)
             features = FeatureConfig(**card["features"])
             if kind == "learned":
                 return NeRD(scene, features, network)
             if kind == "hybrid":
-                config = _config(STEP_KINDS, card.get("step"), "step", folder)
-                step = make_step(solver_scene, cast(StepConfig, config))
+                config = step_config_of(card, folder)
+                step = make_step(solver_scene, config)
                 return HybridNeRD(scene, step, features, network)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the model in {folder} cannot be built: {error}") from None
     raise ValueError(
         f"expected kind learned, hybrid or analytic in the card in {folder}, got {kind!r}"
     )
-
-
-def _described(kinds: dict[str, type], config: Any) -> dict[str, Any]:
-    """A configuration with the name of its kind."""
-    kind = next(name for name, cls in kinds.items() if type(config) is cls)
-    return {"kind": kind, **asdict(config)}
-
-
-def _config(kinds: dict[str, type], found: Any, what: str, folder: Path) -> Any:
-    """The inverse of `_described`, of a card that may say anything."""
-    fields = dict(found) if isinstance(found, dict) else {}
-    kind = fields.pop("kind", None)
-    sizes = [x for x in fields.values() if not isinstance(x, str)]
-    try:
-        if not all(type(size) is int and 0 < size <= MAX_SIZE for size in sizes):
-            raise TypeError
-        return kinds[str(kind)](**fields)
-    except (KeyError, TypeError):
-        raise ValueError(
-            f"the card in {folder} has a {what} this version cannot build: {found!r}"
-        ) from None
 
 
 def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
@@ -307,3 +223,17 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
             + ", ".join(differing),
             stacklevel=3,
         )
+
+
+__all__ = [
+    "CARD",
+    "PRETRAINED",
+    "WEIGHTS",
+    "from_pretrained",
+    "load_checkpoint",
+    "make_card",
+    "read_checkpoint",
+    "save_checkpoint",
+    "shipped_card",
+    "shipped_models",
+]

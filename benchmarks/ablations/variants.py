@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import cast
 
 from tensordict import TensorDict
-
 from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, Config, NeRD, unit_stats
+
 from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, Config, NeRD, unit_stats
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import stats_of

@@ -14,6 +14,7 @@ from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.torch_step import TorchDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
+from torchrl_nerd.envs.partial_reset import merge_reset
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition
 from torchrl_nerd.keys import (
@@ -260,16 +261,11 @@ class SceneEnv(EnvBase):
         rows = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is None or rows is None or rows.all():
             return super()._reset_proc_data(tensordict, tensordict_reset)
-        rows, fresh = rows.reshape(self.batch_size), dict(tensordict_reset.items())
-        merged = {
-            k: torch.where(_beside(rows, x), fresh[k], x)
-            if k in fresh
-            else _emptied(rows, x)
-            for k, x in tensordict.items()
-            if k != "_reset"
-        }
+        merged = merge_reset(
+            rows.reshape(self.batch_size), tensordict, tensordict_reset
+        )
         tensordict.pop("_reset")
-        return tensordict.update(fresh | merged)
+        return tensordict.update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict[ACTION]
@@ -298,17 +294,3 @@ class SceneEnv(EnvBase):
         return TensorDict._new_unsafe(
             found, batch_size=self.batch_size, device=self.device
         )
-
-
-def _beside(rows: Tensor, value: Tensor) -> Tensor:
-    """The mask ``(num_envs,)`` in as many dimensions as a value ``(num_envs, ...)``."""
-    return rows.reshape(-1, *[1] * (value.ndim - 1))
-
-
-def _emptied(rows: Tensor, value: Any) -> Any:
-    """Zeros in those rows, of a tensor or of all that a tensordict holds."""
-    if isinstance(value, Tensor):
-        return value.masked_fill(_beside(rows, value), 0)
-    if isinstance(value, TensorDictBase):
-        return value.apply(lambda x: _emptied(rows, x))
-    return value

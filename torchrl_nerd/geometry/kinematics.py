@@ -15,17 +15,20 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import BALL, FREE, SLIDE
+from torchrl_nerd.geometry.motion import (
+    Motion,
+    at_rest,
+    cross,
+    join,
+    matmul,
+    pick,
+    rotate_by,
+)
 from torchrl_nerd.geometry.rotations import (
     matrix_from_quat,
     quat_matrix,
     quat_normalize,
 )
-
-Motion = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Of n bodies in N rows: origins ``(3, n, N)`` m, rotations ``(3, 3, n, N)``, angular
-velocities rad/s and velocities of the origins m/s, both ``(3, n, N)``, in B_t and relative
-to it. N is 1 where all rows are alike; velocities may be of the first rows alone. Rows come
-last, so that a product of many small matrices is a few operations on long rows."""
 
 
 def skew(v: np.ndarray) -> np.ndarray:
@@ -176,14 +179,14 @@ class PointKinematics(nn.Module):
             seen by an observer who rides on the base; both in B_t.
         """
         q, v = (x.reshape(-1, x.shape[-1]).T.contiguous() for x in (qpos, qvel))
-        above = _at_rest(q, v)
+        above = at_rest(q, v)
         motions = [above] if self.base.is_floating else []
         for groups in self.depths:
-            moved = [self._move(g, _pick(above, g.parents), q, v) for g in groups]
-            above = _join(moved)
+            moved = [self._move(g, pick(above, g.parents), q, v) for g in groups]
+            above = join(moved)
             motions.append(above)
-        position, rotation, omega, velocity = _pick(_join(motions), self.body_of_point)
-        arm = _turn(rotation, self.points)
+        position, rotation, omega, velocity = pick(join(motions), self.body_of_point)
+        arm = rotate_by(rotation, self.points)
         velocity = velocity + cross(omega, arm[..., : v.shape[-1]])
         return tuple(  # pyright: ignore
             x.expand(*x.shape[:-1], rows.shape[-1])
@@ -198,7 +201,7 @@ class PointKinematics(nn.Module):
         """Motion of a group: its places in the parents, then its joints."""
         position, rotation, omega, velocity = parent
         moving = slice(qvel.shape[-1])  # the rows that have velocities
-        offset = _turn(rotation, getattr(self, f"pos_{group.name}"))
+        offset = rotate_by(rotation, getattr(self, f"pos_{group.name}"))
         position = position + offset
         velocity = velocity + cross(omega, offset[..., moving])
         for slot, kind in enumerate(group.kinds):
@@ -210,99 +213,39 @@ class PointKinematics(nn.Module):
             if kind == BALL:
                 quat = torch.stack([qpos[at : at + 4].T for at in q_at], -3)
                 turn = matrix_from_quat(quat_normalize(quat)).movedim((-2, -1), (0, 1))
-                turned = _matmul(_matmul(rotation, still), turn)
+                turned = matmul(matmul(rotation, still), turn)
                 local = torch.stack([qvel[d : d + 3] for d in v_at], 1)
-                spin = _turn(turned[..., moving], local)
+                spin = rotate_by(turned[..., moving], local)
             else:
                 q, v = qpos[q_at] - getattr(self, f"rest_{name}"), qvel[v_at]
-                axis = _turn(rotation, getattr(self, f"axis_{name}"))
+                axis = rotate_by(rotation, getattr(self, f"axis_{name}"))
                 if kind == SLIDE:
                     path = axis * q
                     position = position + path
                     velocity = velocity + cross(omega, path[..., moving])
                     velocity = velocity + axis[..., moving] * v
-                    rotation = _matmul(rotation, still)
+                    rotation = matmul(rotation, still)
                     continue
                 turn = torch.addcmul(still, getattr(self, f"cross_{name}"), q.sin())
                 bend = getattr(self, f"square_{name}")
-                turned = _matmul(rotation, torch.addcmul(turn, bend, 1.0 - q.cos()))
+                turned = matmul(rotation, torch.addcmul(turn, bend, 1.0 - q.cos()))
                 spin = axis[..., moving] * v
             if not group.is_at_origin[slot]:  # the body swings about the joint's anchor
-                before = _turn(rotation, getattr(self, f"from_{name}"))
-                after = _turn(turned, getattr(self, f"anchor_{name}"))
+                before = rotate_by(rotation, getattr(self, f"from_{name}"))
+                after = rotate_by(turned, getattr(self, f"anchor_{name}"))
                 velocity = velocity + cross(omega, before[..., moving])
                 velocity = velocity - cross(omega + spin, after[..., moving])
                 position = position + before - after
             omega = omega + spin
             rotation = turned
         if not group.kinds:
-            rotation = _matmul(rotation, getattr(self, f"rot_{group.name}"))
+            rotation = matmul(rotation, getattr(self, f"rot_{group.name}"))
         return position, rotation, omega, velocity
-
-
-def _turn(rotation: Tensor, vector: Tensor) -> Tensor:
-    """``rotation (3, 3, n, N)`` applied to ``vector (3, n, N)``."""
-    x, y, z = vector.unbind(0)
-    product = torch.addcmul(rotation[:, 0] * x, rotation[:, 1], y)
-    return torch.addcmul(product, rotation[:, 2], z)
-
-
-def _matmul(a: Tensor, b: Tensor) -> Tensor:
-    """Products of matrices ``(3, 3, n, N)``."""
-    product = torch.addcmul(a[:, :1] * b[0], a[:, 1:2], b[1])
-    return torch.addcmul(product, a[:, 2:], b[2])
-
-
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross products of vectors ``(3, n, N)``: twice as fast as torch's own here."""
-    pairs = (1, 2), (2, 0), (0, 1)
-    return torch.stack([a[i] * b[j] - a[j] * b[i] for i, j in pairs])
-
-
-def _pick(motion: Motion, places: list[int]) -> Motion:
-    """The motions at these places, in this order."""
-    if places == list(range(motion[0].shape[-2])):
-        return motion
-    position, rotation, omega, velocity = motion
-    return (
-        position[:, places],
-        rotation[:, :, places],
-        omega[:, places],
-        velocity[:, places],
-    )
-
-
-def _join(motions: list[Motion]) -> Motion:
-    """Motions side by side."""
-    if len(motions) == 1:
-        return motions[0]
-    position, rotation, omega, velocity = (
-        _side_by_side(same) for same in zip(*motions, strict=True)
-    )
-    return position, rotation, omega, velocity
-
-
-def _side_by_side(parts: tuple[Tensor, ...]) -> Tensor:
-    """Bodies together; where all rows of a part are alike, there as many as elsewhere."""
-    counts = [part.shape[-1] for part in parts]
-    rows = min(counts) and max(counts)  # a batch may be empty
-    return torch.cat([part.expand(*part.shape[:-1], rows) for part in parts], -2)
-
-
-def _at_rest(qpos: Tensor, qvel: Tensor) -> Motion:
-    """The base itself, one body."""
-    zero, still = qpos.new_zeros(3, 1, 1), qvel.new_zeros(3, 1, min(1, qvel.shape[-1]))
-    return zero, eye_like(qpos)[..., None, None], still, still
 
 
 def _joints(model: mujoco.MjModel, body: int) -> range:
     start = int(model.body_jntadr[body])
     return range(start, start + int(model.body_jntnum[body]))
-
-
-def eye_like(x: Tensor) -> Tensor:
-    """The identity ``(3, 3)`` with the dtype and device of ``x``."""
-    return torch.eye(3, dtype=x.dtype, device=x.device)
 
 
 def _bodies_on_path(model: mujoco.MjModel, base: Base, bodies: list[int]) -> list[int]:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import cross
+from torchrl_nerd.geometry.motion import cross
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.geometry.spd import matvec, spd_solve
 

@@ -18,6 +18,7 @@ from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.scenes.contact_points import ContactPoints
 from torchrl_nerd.scenes.silence import silence_mujoco
 from torchrl_nerd.scenes.support import unit_gravity
 
@@ -84,6 +85,27 @@ class SolverReport:
     points_found: int
     points_merged: int
     points_fixed: int
+
+    @classmethod
+    def of(
+        cls,
+        scene: str,
+        model: mujoco.MjModel,
+        base: Base,
+        substeps: int,
+        contacts: ContactPoints,
+        symmetries: "Symmetries",
+    ) -> "SolverReport":
+        """The report of a scene of that name, from its parts."""
+        fixed = contacts.stands_for.count(-1)
+        found = len(contacts.stands_for)
+        return cls(
+            scene=scene,
+            effects=base_effects(model, base, substeps) + symmetries.effects,
+            points_found=found,
+            points_merged=found - fixed - len(contacts),
+            points_fixed=fixed,
+        )
 
     @property
     def points_kept(self) -> int:

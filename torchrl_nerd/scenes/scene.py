@@ -1,4 +1,4 @@
-"""A scene: one robot, its ground, its controller, and how finely the truth is stepped."""
+"""A scene: one robot, its ground, its controller, and MuJoCo's substeps."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -14,7 +14,6 @@ from torch import Generator
 from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
-from torchrl_nerd.geometry.rotations import quat_normalize
 from torchrl_nerd.scenes.actuators import driven_dofs
 from torchrl_nerd.scenes.contact_points import (
     ContactPoints,
@@ -25,7 +24,6 @@ from torchrl_nerd.scenes.controllers import Controller
 from torchrl_nerd.scenes.explain import (
     SolverReport,
     Symmetries,
-    base_effects,
     find_symmetries,
 )
 from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
@@ -35,18 +33,18 @@ from torchrl_nerd.scenes.importer import (
     import_gymnasium,
     import_mjcf,
 )
-from torchrl_nerd.scenes.sampling import Sampling, sample_scale, uniform
+from torchrl_nerd.scenes.initial_states import draw_initial
+from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.support import check_supported, unit_gravity
 from torchrl_nerd.scenes.terrain import Terrain
 from torchrl_nerd.scenes.terrain_distance import TerrainDistance
 
-LARGEST_REDRAWS = 300  # of starts that are not clear of the ground
 REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's own
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that learned and true dynamics share about a robot and its place.
+    """Everything that all dynamics share about a robot and its surroundings.
 
     | field | meaning |
     |---|---|
@@ -213,16 +211,8 @@ class Scene:
 
         `torchrl_nerd.evaluation.explain.explain` adds features and what else is left out.
         """
-        base = base_effects(self.model, self.base, self.substeps)
-        stands_for = self.contacts.stands_for
-        fixed = stands_for.count(-1)
-        return SolverReport(
-            scene=self.name,
-            effects=base + self.symmetries.effects,
-            points_found=len(stands_for),
-            points_merged=len(stands_for) - fixed - len(self.contacts),
-            points_fixed=fixed,
-        )
+        parts = self.model, self.base, self.substeps
+        return SolverReport.of(self.name, *parts, self.contacts, self.symmetries)
 
     @cached_property
     def hash(self) -> str:
@@ -243,51 +233,9 @@ class Scene:
             ``qpos (rows, nq)``, ``qvel (rows, nv)`` and, where the ground varies,
             ``terrain (rows, terrain.size)``, all float64.
         """
-        ranges = self.sampling
-        if ranges.starts is not None:
-            state = dict(ranges.starts(rows, generator))
-            torque_scale, _ = sample_scale(ranges, rows, generator)
-        else:
-            qpos, qvel = self._draw(rows, generator)
-            torque_scale, speed_scale = sample_scale(ranges, rows, generator)
-            state = {"qpos": qpos, "qvel": speed_scale * qvel}
-        if ranges.ground is not None and "terrain" not in state:
-            state["terrain"] = ranges.ground(state["qpos"], generator)
-        return state, torque_scale
-
-    def _draw(
-        self, rows: int, generator: Generator
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions and velocities within the ranges, clear of the ground."""
-        qpos, qvel = self._draw_anywhere(rows, generator)
-        clearance = self.sampling.clearance
-        if clearance is None:
-            return qpos, qvel
-        for _ in range(LARGEST_REDRAWS):
-            is_low = self.clearances(qpos).amin(-1) < clearance
-            if not is_low.any():
-                return qpos, qvel
-            again = self._draw_anywhere(int(is_low.sum()), generator)
-            qpos[is_low], qvel[is_low] = again
-        raise ValueError(
-            f"expected ranges of '{self.name}' with starts clear of the ground, found "
-            f"none in {LARGEST_REDRAWS} draws: give others, or clearance=None"
+        return draw_initial(
+            self.sampling, self.layout, rows, generator, self.clearances
         )
-
-    def _draw_anywhere(
-        self, rows: int, generator: Generator
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions and velocities within the ranges."""
-        ranges = self.sampling
-        qpos = uniform(ranges.qpos_low, ranges.qpos_high, rows, generator)
-        qvel = uniform(ranges.qvel_low, ranges.qvel_high, rows, generator)
-        if ranges.base is not None:
-            base_pos, base_vel = ranges.base.draw(rows, generator)
-            qpos = torch.cat((base_pos, qpos), -1)
-            qvel = torch.cat((base_vel, qvel), -1)
-        for q, _ in self.layout.rotations:
-            qpos[:, q : q + 4] = quat_normalize(qpos[:, q : q + 4])
-        return qpos, qvel
 
     def clearances(
         self, qpos: torch.Tensor, terrain: torch.Tensor | None = None
