@@ -33,7 +33,7 @@ from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import SCENES, load_scene, make_task
+from torchrl_nerd.robots import SCENES, TASKS, load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.sequences import cover, data_stats
 from torchrl_nerd.transforms import Stats
@@ -93,6 +93,14 @@ each_analytic = pytest.mark.parametrize(
     ("scene", "step"), ANALYTIC, ids=lambda x: getattr(x, "name", x)
 )
 """Every scene, and every analytic step, in pairs."""
+
+
+MOTORS = [name for name in SCENES if load_scene(name).actuated]
+ACTIONS = [name for name in TASKS if make_task(name).controller.num_actions]
+
+each_with_motors = pytest.mark.parametrize("scene", map(load_scene, MOTORS), ids=MOTORS)
+each_with_actions = pytest.mark.parametrize("task_id", ACTIONS)
+"""Robots and tasks that can be driven; a cube cannot."""
 
 
 def enliven(network: nn.Module, generator: Generator) -> nn.Module:

@@ -11,8 +11,7 @@ from dynamics_helpers import HAS_COMPILER, random_actions, random_drive, roll
 from torch import Tensor
 
 from torchrl_nerd import NeRDEnv, from_pretrained
-from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.dynamics import nerd as learned
+from torchrl_nerd.dynamics import NeRDDynamics, torch_step
 from torchrl_nerd.row_threads import WARM, RowThreads, parts_of
 
 TASK, ROWS, STEPS = "double_pendulum/passive", 6, 4
@@ -94,8 +93,8 @@ def test_a_forked_process_has_threads_of_its_own():
 
 
 def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
-    monkeypatch.setattr(learned, "LEAST_WORK", 2)
-    model = from_pretrained("double_pendulum-small")
+    monkeypatch.setattr(torch_step, "MIN_WORK", 2)
+    model = from_pretrained("double_pendulum-hybrid")
     drive = random_drive(model.scene, ROWS, STEPS, generator)
     dynamics = NeRDDynamics(model, compile=True)
     assert dynamics.parts(ROWS) == 2
@@ -115,8 +114,8 @@ def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
 
 def test_what_must_stay_whole_does(generator, monkeypatch):
     """Gradients, a history, one thread."""
-    monkeypatch.setattr(learned, "LEAST_WORK", 2)
-    model = from_pretrained("double_pendulum-small")
+    monkeypatch.setattr(torch_step, "MIN_WORK", 2)
+    model = from_pretrained("double_pendulum-hybrid")
     assert NeRDDynamics(model, differentiable=True).parts(ROWS) == 1
     assert NeRDDynamics(from_pretrained("cartpole")).parts(ROWS) == 1
     torch.set_num_threads(1)

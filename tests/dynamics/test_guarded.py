@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import NeRDEnv
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import (
     GuardedDynamics,
     MujocoDynamics,
@@ -124,6 +125,6 @@ def test_bad_arguments_are_named(scene, generator):
         GuardedDynamics(learned, least_trust=0)
     with pytest.raises(ValueError, match="expected a patience of at least 0, got -1"):
         GuardedDynamics(learned, patience=-1)
-    ignorant = NeRDDynamics(NeRD(scene, NETWORKS["mlp-4x64"]))
+    ignorant = NeRDDynamics(NeRD(scene, NO_PREDICTIONS, NETWORKS["mlp-4x64"]))
     with pytest.raises(ValueError, match="knows what it was trained on"):
         GuardedDynamics(ignorant)

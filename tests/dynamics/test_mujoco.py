@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from dynamics_helpers import random_drive, roll, unequal_keys
+from dynamics_helpers import each_with_motors, random_drive, roll, unequal_keys
 from torch import Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -95,9 +95,8 @@ def test_a_trajectory_in_one_call_is_its_steps(scene, generator):
         torch.testing.assert_close(whole[key], path[key], rtol=0, atol=1e-12 * scale)
 
 
+@each_with_motors
 def test_a_row_that_breaks_on_the_way_is_sound_until_then(scene, generator):
-    if not scene.actuated:
-        return  # no torque to break it with
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
     torques = torques.transpose(0, 1).clone()
     clean = MujocoDynamics(scene).rollout(start, torques, terrain)

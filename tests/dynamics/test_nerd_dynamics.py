@@ -18,8 +18,9 @@ from dynamics_helpers import (
 from torch import Tensor
 
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.nerd import Encoded, NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
 
@@ -28,10 +29,11 @@ each_inference = pytest.mark.parametrize("inference", LEARNED)
 SCENE = load_scene("cartpole")
 
 
-def tokens_of(model: NeRD, state, torques, terrain) -> Tensor:
-    """Tokens ``(rows, steps, F)`` of a path of true or learned states."""
+def encoded(model: NeRD, state, torques, terrain) -> Encoded:
+    """What the model makes ``(rows, steps, ...)`` of a path of true or learned states."""
     ground = None if terrain is None else terrain[:, None].expand(-1, len(torques), -1)
-    return model.encode(state["qpos"], state["qvel"], torques.transpose(0, 1), ground)
+    torques = torques.transpose(0, 1)
+    return model.encode(state["qpos"], state["qvel"], torques, ground)
 
 
 @each_inference
@@ -42,14 +44,15 @@ def test_a_path_is_encode_network_decode(scene, inference, network, generator):
     dynamics = NeRDDynamics(model, inference, window)
     after = roll(dynamics, start, torques, terrain)
     before = torch.cat((start[:, None], after[:, :-1]), 1)
-    tokens = tokens_of(model, before, torques, terrain)
+    found = encoded(model, before, torques, terrain)
+    tokens = found.token
     with torch.no_grad():
         if inference == "streaming":
             outputs = model.network(tokens)
         else:
             parts = [tokens[:, max(0, t - window + 1) : t + 1] for t in range(STEPS)]
             outputs = torch.stack([model.network(part)[:, -1] for part in parts], 1)
-        qpos, qvel = model.decode(before["qpos"], before["qvel"], outputs)
+        qpos, qvel = model.decode((before["qpos"], before["qvel"]), found, outputs)
     # what has learned nothing may fly off, where rounding turns it by whole turns
     is_calm = torch.cat((before["qvel"], qvel), -1).abs().amax(-1) < 1e3
     assert is_calm.any()
@@ -165,7 +168,7 @@ def test_compiled_equals_eager(scene, inference, network, generator):
 
 
 def test_bad_choices_are_refused_in_one_sentence(generator):
-    model = NeRD(SCENE, NETWORKS["mlp-4x64"])
+    model = NeRD(SCENE, NO_PREDICTIONS, NETWORKS["mlp-4x64"])
     with pytest.raises(ValueError, match="'streaming' or 'window', got 'batch'"):
         NeRDDynamics(model, inference="batch")
     with pytest.raises(ValueError, match="window of at least 1.*got 0"):
@@ -174,11 +177,11 @@ def test_bad_choices_are_refused_in_one_sentence(generator):
 
 def test_a_compiled_step_follows_its_weights(generator):
     """Changed in place, put in another's stead, or of another dtype."""
-    model = from_pretrained("double_pendulum-small")
+    model = from_pretrained("double_pendulum-mlp")
     drive = random_drive(model.scene, 4, 3, generator)
     compiled = NeRDDynamics(model, compile=True)
     roll(compiled, *drive)
-    other = from_pretrained("double_pendulum-small").state_dict()
+    other = from_pretrained("double_pendulum-mlp").state_dict()
     for change in (
         lambda: enliven(model.network, generator),
         lambda: model.load_state_dict(other, assign=True),

@@ -169,7 +169,8 @@ def test_bad_arguments_are_refused_in_one_sentence(generator):
             ):
                 make(count)
     with pytest.raises(
-        ValueError, match="unknown dynamics 'newton', expected nerd, mu"
+        ValueError,
+        match="unknown dynamics 'newton', expected nerd, hybrid, analytic, mu",
     ):
         make_env(TASK, dynamics="newton")
     with pytest.raises(

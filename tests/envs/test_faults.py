@@ -8,6 +8,8 @@ from dynamics_helpers import (
     act_all,
     assert_same_motion,
     each_dynamics,
+    each_with_actions,
+    inference_of,
     junk_fill,
     random_actions,
     random_model,
@@ -20,18 +22,18 @@ from tensordict import TensorDict
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
 from torchrl_nerd.cli.main import main
 from torchrl_nerd.evaluation.replay import read_dump, replay
+from torchrl_nerd.modules.nerd import NeRD
 
 ROWS, STEPS = 4, 3
 each_junk = pytest.mark.parametrize("junk", [float("nan"), float("inf"), -float("inf")])
 
 
+@each_with_actions
 @each_dynamics
 @each_junk
 def test_a_bad_action_ends_its_own_row_alone(task_id, dynamics, junk, generator):
     make = EnvMaker(task_id, dynamics, generator)
     env, sound = make(ROWS), make(ROWS)
-    if not env.task.controller.num_actions:
-        return  # no action to be bad
     actions = random_actions(env, 3 * STEPS, generator)
     row = int(torch.randint(ROWS, (), generator=generator))
     bad = actions[STEPS].clone()
@@ -83,6 +85,7 @@ def test_a_row_that_the_physics_cannot_step_ends_alone(task_id, dynamics, genera
     assert state.isfinite().all()
 
 
+@each_with_actions
 @each_dynamics
 def test_actions_beyond_the_limits_act_like_the_limits(task_id, dynamics, generator):
     make = EnvMaker(task_id, dynamics, generator)
@@ -139,7 +142,8 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     if model is None:
         env = GroundTruthEnv("ant/run", dynamics, ROWS, dump_dir=tmp_path)
     else:
-        env = NeRDEnv("ant/run", model, ROWS, inference=dynamics, dump_dir=tmp_path)
+        inference = inference_of(dynamics)
+        env = NeRDEnv("ant/run", model, ROWS, inference=inference, dump_dir=tmp_path)
     env.reset()
     actions = random_actions(env, 5, generator)
     row = int(torch.randint(ROWS, (), generator=generator))
@@ -153,8 +157,8 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     dump = read_dump(path)
     assert dump.about["reason"] == "action" and dump.about["row"] == str(row)
     assert torch.equal(dump.steps["qpos"][1:], good["qpos"][row])
-    assert ("features" in dump.steps.keys()) == (model is not None)
-    if model is not None:
+    assert ("features" in dump.steps.keys()) == isinstance(model, NeRD)
+    if isinstance(model, NeRD):
         given = (dump.steps[k] for k in ("qpos", "qvel", "joint_torque"))
         features = model.features(*given, None).nan_to_num()
         assert torch.equal(dump.steps["features"].nan_to_num(), features)

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.cli import main
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
@@ -232,10 +233,10 @@ def test_control_steps_are_the_tasks(robot):
 def test_a_network_can_step_it(robot, generator):
     state, action = states_and_actions(robot, generator, robot.sampling.clearance)
     torque = robot.controller(action, state[QPOS], state[QVEL])
-    dynamics = NeRDDynamics(NeRD(robot, NETWORKS["transformer-2x64"]))
-    assert dynamics.model.tokens.size == SceneFeatures(robot).size
-    tokens = dynamics.model.tokens(state[QPOS], state[QVEL], torque, None)
-    assert tokens.shape == (ROWS, dynamics.model.tokens.size)
+    dynamics = NeRDDynamics(NeRD(robot, NO_PREDICTIONS, NETWORKS["transformer-2x64"]))
+    features = dynamics.model.scene_features
+    tokens = features(state[QPOS], state[QVEL], torque, None)
+    assert tokens.shape == (ROWS, features.size)
     for after in (
         dynamics.step(state, torque),
         MujocoDynamics(robot, num_threads=1).step(state, torque),
@@ -368,7 +369,7 @@ def test_data_can_be_drawn_from_a_name(tmp_path):
 @pytest.mark.parametrize("is_file", [True, False])
 def test_a_checkpoint_finds_its_robot_again(is_file, tmp_path):
     scene = servo_scene(tmp_path) if is_file else load_scene("gymnasium/Ant-v5")
-    model = NeRD(scene, NETWORKS["transformer-2x64"])
+    model = NeRD(scene, NO_PREDICTIONS, NETWORKS["transformer-2x64"])
     save_checkpoint(model, tmp_path / "checkpoint", make_card(model))
     again = load_checkpoint(tmp_path / "checkpoint", scene if is_file else None)
     assert again.scene.hash == scene.hash
