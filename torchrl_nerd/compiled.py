@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
-from torch._dynamo.exc import BackendCompilerFailed
-from torch._inductor.exc import InductorError
+
+from torchrl_nerd.compat import COMPILER_ERRORS, compile_options
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -50,12 +50,10 @@ class Compiled(Generic[Given, Result]):
             self._calls_to_go -= 1
             return self.function(*args, **kwargs)
         if self._run is None:
-            # isolated: the code of one env counts nothing against that of another
-            options = {"isolate_recompiles": True, **self.options}
-            self._run = torch.compile(self.function, **options)
+            self._run = torch.compile(self.function, **compile_options(self.options))
         try:
             return self._run(*args, **kwargs)
-        except (BackendCompilerFailed, InductorError) as error:
+        except COMPILER_ERRORS as error:
             reason = " ".join(str(error).strip().splitlines()[:2])
             warnings.warn(f"cannot compile, running eagerly: {reason}", stacklevel=3)
             self.is_eager, self._run = True, None

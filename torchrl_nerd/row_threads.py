@@ -1,7 +1,7 @@
 """The rows of a batch in equal parts, each on a thread of its own.
 
-For functions in which no row knows of another, and which let go of Python's lock for most
-of the time, as compiled code does that is wrapped in C++.
+For functions in which rows are independent, and which release Python's lock for most of
+the time, as compiled code does that is wrapped in C++.
 """
 
 import os
@@ -9,11 +9,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from threading import Barrier
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
 Result = TypeVar("Result")
 
@@ -25,12 +24,13 @@ def parts_of(rows: int, least: int) -> int:
 
 
 class RowThreads(Generic[Result]):
-    """A function of tensors whose first dimension is that of rows, as are its results'.
+    """A function of tensors of rows, in parts on threads; its result is one or a tuple of them.
 
-    Its parts record no gradients.
+    The parts record no gradients.
 
     Args:
-        function: also takes arguments that are no tensors, which every part is given.
+        function: of positional arguments. Tensors among them, and what it returns, have
+            the rows as their first dimension; all else goes to every part.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
@@ -39,23 +39,21 @@ class RowThreads(Generic[Result]):
 
     def __call__(self, parts: int, *args: Any) -> Result:
         """What ``function`` gives, in so many parts; raises what it raises."""
-        leaves, form = pytree.tree_flatten(args)
-        split = [
-            x.chunk(parts) if isinstance(x, Tensor) else [x] * parts for x in leaves
-        ]
+        split = [x.chunk(parts) if isinstance(x, Tensor) else [x] * parts for x in args]
         pool, mode = _pool(os.getpid(), parts), torch.is_inference_mode_enabled()
         futures = []
         rows = next(len(x[0]) for x in split if isinstance(x[0], Tensor))
         calls = self._known[rows] = self._known.get(rows, 0) + 1
         for part in zip(*split, strict=True):
-            there = pytree.tree_unflatten(part, form)
-            futures.append(pool.submit(self._work, mode, there))
+            futures.append(pool.submit(self._work, mode, part))
             if calls <= WARM:  # what compiles does so once
                 futures[-1].result()
-        found = [pytree.tree_flatten(future.result()) for future in futures]
-        columns = zip(*(values for values, _ in found), strict=True)
-        joined = [torch.cat(x) if isinstance(x[0], Tensor) else x[0] for x in columns]
-        return pytree.tree_unflatten(joined, found[0][1])
+        found = [future.result() for future in futures]
+        if isinstance(found[0], Tensor):
+            return cast(Result, torch.cat(cast(list[Tensor], found)))
+        columns = zip(*cast(list[tuple], found), strict=True)
+        joined = (torch.cat(x) if isinstance(x[0], Tensor) else x[0] for x in columns)
+        return cast(Result, tuple(joined))
 
     def _work(self, mode: bool, args: tuple) -> Result:
         with torch.inference_mode(mode), torch.no_grad():

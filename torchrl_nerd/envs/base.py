@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.torch_step import TorchDynamics
@@ -291,6 +292,4 @@ class SceneEnv(EnvBase):
             found[key] = found[key].clone()
         if not self.guard:
             found.pop(TRUST, None)
-        return TensorDict._new_unsafe(
-            found, batch_size=self.batch_size, device=self.device
-        )
+        return tensordict_of(found, self.batch_size, self.device)

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_nerd.compat import graph_break
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.envs.faults import find_faults
@@ -64,7 +65,7 @@ class Transition:
         moved, torque = self._control_step(state, given, state.get(TERRAIN))
         trust = moved.get(TRUST)
         for _ in range(self.task.frame_skip - 1):
-            torch._dynamo.graph_break()  # two steps in one piece take minutes to compile
+            graph_break()  # two steps in one piece take minutes to compile
             moved, torque = self._control_step(moved, given, state.get(TERRAIN))
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])
         fault = find_faults(action, moved)

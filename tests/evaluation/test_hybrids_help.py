@@ -1,0 +1,66 @@
+"""Every shipped hybrid earns its place: without its network its error is larger."""
+
+from typing import cast
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_nerd import from_pretrained
+from torchrl_nerd.checkpoint import shipped_card, shipped_models
+from torchrl_nerd.dynamics import AnalyticDynamics, MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.ablate import without_network
+from torchrl_nerd.evaluation.rollout_error import (
+    action_drive,
+    initial_states,
+    open_loop,
+    position_errors,
+)
+from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.robots import protocol_of
+
+HYBRIDS = [n for n in shipped_models() if shipped_card(n)["kind"] == "hybrid"]
+TRAJECTORIES, SEED = 96, 4242  # a test seed: nothing was chosen on it
+LEAST_GAIN = 1.2  # a fifth
+
+
+def test_there_are_some():
+    assert HYBRIDS
+
+
+@pytest.mark.parametrize("drive", ["passive", "driven"])
+@pytest.mark.parametrize("name", HYBRIDS)
+def test_without_its_network_the_error_rises_by_a_fifth(name, drive):
+    """Over all cases of the protocol, and outside the interval of the difference."""
+    model = cast(HybridNeRD, from_pretrained(name))
+    found: dict[str, list[torch.Tensor]] = {}
+    protocol = protocol_of(model.scene)
+    for source in protocol.cases.values():
+        steps = max(protocol.horizons)
+        start = initial_states(source, TRAJECTORIES // len(protocol.cases) + 1, SEED)
+        actions = action_drive(source, len(start), steps, SEED, drive == "driven")
+        truth = open_loop(MujocoDynamics(model.scene), start, steps, actions)
+        for each in (model, without_network(model)):
+            path = open_loop(NeRDDynamics(each), start, steps, actions)
+            errors = position_errors(model.scene, truth, path)
+            for quantity, error in errors.items():
+                found.setdefault(quantity, []).append(error.mean(1))
+    for quantity, parts in found.items():
+        with_it, without = torch.cat(parts[::2]), torch.cat(parts[1::2])
+        assert without.mean() > LEAST_GAIN * with_it.mean(), quantity
+        difference = without - with_it
+        interval = 1.96 * difference.std() / len(difference) ** 0.5
+        assert difference.mean() > interval, quantity
+
+
+@pytest.mark.parametrize("name", HYBRIDS)
+def test_without_its_network_it_is_its_analytic_step(name, generator):
+    model = cast(HybridNeRD, from_pretrained(name))
+    start, torque = model.scene.sample_initial(8, generator)
+    terrain = start.pop("terrain", None)
+    state = TensorDict(start, [8])
+    torque = torque * torch.ones(8, len(model.scene.actuated))
+    bare = NeRDDynamics(without_network(model)).step(state, torque, terrain)
+    step = AnalyticDynamics(model.analytic_step).step(state, torque, terrain)
+    for key in ("qpos", "qvel"):
+        torch.testing.assert_close(bare[key], step[key], atol=1e-9, rtol=1e-9)
