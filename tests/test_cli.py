@@ -2,8 +2,10 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
+from itertools import pairwise
 
 import pytest
 from helpers import slow_but
@@ -76,7 +78,48 @@ def test_every_command_explains_itself(command, capsys):
 
 
 @pytest.mark.parametrize("command", ["data", "train"])
-def test_help_shows_the_recipe_of_the_scene(command, scene, capsys):
+def test_help_explains_every_flag(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    options = [i for i, line in enumerate(lines) if re.match(r"--\w", line)]
+    texts = [
+        " ".join(lines[first:last]).partition("(default:")[0].split()
+        for first, last in pairwise([*options, len(lines)])
+    ]
+    assert len(texts) > 8
+    for words in texts:  # more than names, types and choices
+        told = [w for w in words if w.isalpha() and w.islower() and len(w) > 1]
+        assert len(told) >= 2, words
+
+
+def test_a_hybrid_is_trained_where_the_preset_has_one(capsys):
+    for name, preset in PRESETS.items():
+        argv = ["train", name, "--kind", "hybrid", "--dry-run"]
+        if preset.hybrid is None:
+            assert "a scene whose preset has a hybrid" in refusal(capsys, *argv)
+            continue
+        assert main(argv) == 0
+        text = capsys.readouterr().out
+        assert f"runs/{name}-hybrid" in text and "weights of a hybrid model" in text
+        assert f"for {preset.hybrid.total_steps} updates" in text
+    assert any(preset.hybrid for preset in PRESETS.values())
+
+
+def test_a_step_makes_any_model_a_hybrid(capsys):
+    step = ["--step", "unconstrained", "--dry-run"]
+    assert main(["train", "cartpole", "--kind", "hybrid", *step]) == 0
+    assert "weights of a hybrid model" in capsys.readouterr().out
+    assert "--kind hybrid" in refusal(capsys, "train", "cartpole", *step)
+
+
+def test_the_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"nerd {__version__}\n"
+
+
+@pytest.mark.parametrize("command", ["data", "train"])
+def test_help_shows_the_preset_of_the_scene(command, scene, capsys):
     preset = PRESETS[scene.name]
     with pytest.raises(SystemExit) as stop:
         main([command, scene.name, "--help"])
@@ -120,11 +163,11 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
         "--quiet",
     ]
     assert main(draw) == main(learn) == main([*draw, "--dry-run"]) == 0
-    assert "where 8 are now" in capsys.readouterr().out
+    assert "where 8 exist" in capsys.readouterr().out
     assert main([*learn, "--dry-run"]) == 0
     text = capsys.readouterr().out
     assert "use the data in datasets/cartpole" in text
-    assert "go on with the run in runs/cartpole" in text
+    assert "resume the run in runs/cartpole" in text
 
 
 @pytest.mark.parametrize("command", ["data", "train"])
@@ -260,7 +303,7 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
     assert read(half)["errors"] != content["errors"]  # of other rounding
 
 
-def test_a_robot_of_others_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
+def test_a_third_party_robot_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
     """Default folders, whose names hold no slash; the preset and protocol of any robot."""
     monkeypatch.chdir(tmp_path)
     name, folder = "dm_control/cheetah-run", "dm_control-cheetah-run"

@@ -61,21 +61,15 @@ StepConfig = UnconstrainedConfig | PenaltyContactConfig | FreeBodyConfig
 
 @dataclass(frozen=True)
 class DataConfig:
-    """What to generate.
-
-    | field | meaning |
-    |---|---|
-    | ``trajectories`` | how many are drawn; broken ones are dropped and counted |
-    | ``steps`` | control steps of each |
-    | ``seed`` | every chunk of trajectories has a stream of its own |
+    """Size and seed of a data set.
 
     Raises:
         SettingError: fewer than one trajectory or step.
     """
 
-    trajectories: int = 10_000
-    steps: int = 100
-    seed: int = 0
+    trajectories: int = 10_000  # to draw; those that diverge are dropped and counted
+    steps: int = 100  # control steps of each trajectory
+    seed: int = 0  # of initial states and torques
 
     def __post_init__(self) -> None:
         expect_at_least(1, trajectories=self.trajectories, steps=self.steps)
@@ -83,61 +77,39 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How to train.
-
-    | field | meaning |
-    |---|---|
-    | ``network`` | name in `NETWORKS` |
-    | ``step`` | name of the analytic step in `STEPS` whose residual is learned: a hybrid;
-      None: a learned model |
-    | ``predicted_force``, ``unconstrained_motion`` | features, see `FeatureConfig` |
-    | ``steps`` | updates on one-step targets |
-    | ``rollout_steps`` | further updates on the model's own rollouts |
-    | ``batch_size``, ``sequence_length`` | sequences per update, control steps of each |
-    | ``single_step_fraction`` | share of updates on as many single states instead |
-    | ``use_symmetry`` | show each sample as a random one of its mirror images |
-    | ``rollout_batch_size``, ``rollout_length`` | the same for rollouts |
-    | ``lr``, ``adamw_lr`` | peak step sizes of Muon (matrices) and AdamW (the rest) |
-    | ``rollout_lr_ratio`` | share of the peak at which the rollout updates begin |
-    | ``rollout_restarts`` | how often, in equal parts of them, they begin there anew |
-    | ``warmup`` | updates over which the step size rises from zero |
-    | ``bf16_fraction`` | share of the one-step updates, the first ones, whose matrices are
-      multiplied in bfloat16: faster on processors that have it; all updates on CUDA |
-    | ``loss_eps`` | of the relative loss; see `losses.relative_error` |
-    | ``clip`` | largest norm of the gradient |
-    | ``ema`` | decay of the averaged weights, which are the ones saved |
-    | ``save_every`` | updates between saves: what a kill can lose |
-    | ``validate_every`` | updates between rollouts in true physics |
-    | ``seed`` | of weights and batches |
+    """Settings of a training: one-step targets first, then rollouts of the model.
 
     Raises:
-        SettingError: an unknown network, or a number that is too small.
+        SettingError: a number that is too small.
     """
 
-    network: str = "transformer-2x64"
-    step: str | None = None
-    predicted_force: bool = False
+    network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width
+    step: str | None = None  # analytic step that a hybrid corrects; None: learned model
+    predicted_force: bool = False  # feature: contact forces by the penalty law
+    # feature: contacts along the contact-free motion in place of constant velocity
     unconstrained_motion: bool = False
-    steps: int = 20_000
-    rollout_steps: int = 2_000
-    batch_size: int = 64
-    sequence_length: int = 16
+    steps: int = 20_000  # updates on one-step targets
+    rollout_steps: int = 2_000  # further updates on the model's own rollouts
+    batch_size: int = 64  # sequences per update
+    sequence_length: int = 16  # control steps of a sequence
+    # share of updates on as many single states in place of sequences
     single_step_fraction: float = 0.75
-    use_symmetry: bool = False
-    rollout_batch_size: int = 128
-    rollout_length: int = 8
-    lr: float = 0.01
-    adamw_lr: float = 3e-3
-    rollout_lr_ratio: float = 0.1
-    rollout_restarts: int = 1
-    warmup: int = 200
+    use_symmetry: bool = False  # augment data by the robot's symmetries
+    rollout_batch_size: int = 128  # rollouts per update
+    rollout_length: int = 8  # control steps of a rollout
+    lr: float = 0.01  # peak learning rate of Muon, for weight matrices
+    adamw_lr: float = 3e-3  # peak learning rate of AdamW, for all other weights
+    rollout_lr_ratio: float = 0.1  # learning rates of rollouts, as a share of the peaks
+    rollout_restarts: int = 1  # times that the learning rate of rollouts starts anew
+    warmup: int = 200  # updates over which the learning rate rises from zero
+    # share of the one-step updates, the first ones, in bfloat16; on CUDA all updates are
     bf16_fraction: float = 0.0
-    loss_eps: float = 0.01
-    clip: float = 1.0
-    ema: float = 0.995
-    save_every: int = 1_000
-    validate_every: int = 2_000
-    seed: int = 0
+    loss_eps: float = 0.01  # of the relative loss: keeps samples at rest finite
+    clip: float = 1.0  # largest norm of the gradient
+    ema: float = 0.995  # decay of the averaged weights, which are the ones saved
+    save_every: int = 1_000  # updates between saves: a killed run loses at most these
+    validate_every: int = 2_000  # updates between validations against MuJoCo
+    seed: int = 0  # of weights and batches
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():

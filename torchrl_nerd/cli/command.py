@@ -1,4 +1,4 @@
-"""What commands share: where figures go, a run that does nothing, a device."""
+"""Base classes of commands: options, dry run, record of the results, device."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -16,39 +16,39 @@ class Command(ABC):
     """A command whose fields are its options."""
 
     json: Path | None = None
-    """Write the figures and all settings to this file."""
+    """Write results and all settings to this file."""
     dry_run: bool = False
-    """Say what would be done and with which settings, and do none of it."""
+    """Print what the command would do and all its settings, and exit."""
 
     @abstractmethod
     def run(self) -> dict[str, Any]:
-        """Do it and return the figures."""
+        """Run the command and return its results."""
 
     @property
     def picture(self) -> Path | None:
-        """The film or figure that `run` leaves, where it leaves one."""
+        """The video or figure that `run` writes, where it writes one."""
         return None
 
     @property
     def record(self) -> Path | None:
-        """Where figures and settings go: as asked for, or beside the picture."""
+        """Where results and settings go: ``json``, or beside the video or figure."""
         if self.json is not None or self.picture is None:
             return self.json
         return self.picture.with_name(f"{self.picture.name}.json")
 
     def configuration(self) -> dict[str, Any]:
-        """Every option and its value, with which `run` does the same again."""
+        """Every option and its value, which repeat the command."""
         return {k: v for k, v in asdict(self).items() if k not in ("json", "dry_run")}
 
-    def keep(self, figures: dict[str, Any]) -> None:
-        """Write figures and settings to `record`, where that is asked for."""
+    def keep(self, results: dict[str, Any]) -> None:
+        """Write results and settings to `record`, where there is one."""
         if self.record is not None:
             how: dict[str, Any] = {"command": type(self).__name__.lower()}
             how |= {"version": __version__, "configuration": self.configuration()}
-            write_json(self.record, how | figures)
+            write_json(self.record, how | results)
 
     def plan(self) -> list[str]:
-        """What `run` would do, in sentences; bad input is refused as there."""
+        """What `run` would do, in sentences; bad input is refused as in `run`."""
         return []
 
     def settings(self) -> list[str]:
@@ -58,21 +58,21 @@ class Command(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceCommand(Command):
-    """A command whose model computes where it is told to.
+    """A command that computes on a device.
 
     Raises:
-        SettingError: a device that this machine has not.
+        SettingError: a device that torch does not find.
     """
 
     device: str = "cpu"
-    """Of the model: cpu, cuda, or cuda:1 for the second of several."""
+    """Device of the model: cpu, cuda, or cuda:1 for the second GPU."""
 
     def __post_init__(self) -> None:
         expect_device(self.device)
 
 
 def _leaves(options: Any) -> Iterator[tuple[str, Any]]:
-    """Names and values, those of dataclasses within in their place."""
+    """Names and values of all options, those of nested dataclasses in their place."""
     for field in fields(options):
         value = getattr(options, field.name)
         if is_dataclass(value):

@@ -1,9 +1,9 @@
-"""``nerd data``: random trajectories of the true dynamics, or recorded ones."""
+"""``nerd data``: a data set of random trajectories in MuJoCo, or of recorded ones."""
 
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -11,6 +11,8 @@ from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import (
     Flat,
     Positional,
+    Reference,
+    SceneName,
     real_scene,
     run_name,
     scene_of,
@@ -34,7 +36,9 @@ from torchrl_nerd.training.policy_strategy import along_policy
 
 @dataclass(frozen=True)
 class Data(Command):
-    """Generate random trajectories of the true dynamics, or take over recorded ones.
+    """Generate random trajectories in MuJoCo, or convert recorded ones.
+
+    An interrupted command resumes when it is run again.
 
     Example: nerd data cartpole --out datasets/cartpole --trajectories 20000
 
@@ -45,53 +49,47 @@ class Data(Command):
     Example: nerd data ant --policy runs/ppo_ant --out datasets/ant_policy
     """
 
-    scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
-    or an MJCF file."""
+    scene: Positional[SceneName]
     out: Path | None = None
-    """Folder of the data set; datasets/SCENE by default."""
-    reference: Literal["rk4"] | None = None
-    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
-    substeps."""
+    """Folder of the data set; default datasets/SCENE."""
+    reference: Reference = None
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """Recorded cube tosses (npz or CSV): units and frames are checked by physics."""
+    """File of recorded cube tosses (npz or CSV), whose units and frames are checked."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
     policy: Path | None = None
-    """Folder of a policy, as examples/ppo.py writes it: draw along its way, with noise on
-    its actions, from the starts of its task."""
+    """Folder of a policy (see examples/ppo.py) that acts, from the resets of its task."""
     noise: float = 0.5
-    """Of a policy's actions: a standard deviation from U(0, this) for each trajectory."""
+    """Largest standard deviation of the noise on a policy's actions, in [-1, 1]."""
     ray: str | None = None
-    """Draw on the workers of a Ray cluster: its HOST:PORT, auto, or local for this machine
-    alone. The data are the same."""
+    """Ray cluster that generates the same data: HOST:PORT, auto, or local."""
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     @property
     def folder(self) -> Path:
-        """Where drawn data go."""
+        """Of the data set that is generated."""
         return self.out or Path("datasets") / run_name(self.scene, self.reference)
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
-        """What draws: the policy, or the scene's preset."""
+        """Name and function that draw: the policy's, or the preset's."""
         if self.policy is not None:
             return along_policy(scene, self.policy, self.noise)
         return preset_strategy(scene)
 
     def plan(self) -> list[str]:
-        """How much would be drawn, and how much is there."""
+        """How many trajectories would be drawn, their size, and how many exist."""
         if self.recorded is not None:
             tosses, _ = load_tosses(self.recorded, real_scene(self.scene))
-            return [f"take over {len(tosses)} recorded tosses"]
+            return [f"convert {len(tosses)} recorded tosses"]
         scene, out = scene_of(self.scene, self.reference), self.folder
         _, draw = self.strategy(scene) or plain_strategy(scene)
-        one = draw_chunk(draw, self.config, (0, 1)).bytes()
-        wanted, there = self.config.trajectories, 0
+        size = draw_chunk(draw, self.config, (0, 1)).bytes()
+        wanted, existing = self.config.trajectories, 0
         if (out / CARD).exists():
-            there = read_json(out / CARD)["trajectories"]
+            existing = read_json(out / CARD)["trajectories"]
         return [
-            f"draw {wanted} trajectories of {scene.name}, {one * wanted / 1e9:.2g} GB, "
-            f"in {out}, where {there} are now"
+            f"draw {wanted} trajectories of {scene.name}, {size * wanted / 1e9:.2g} GB, "
+            f"in {out}, where {existing} exist"
         ]
 
     def run(self) -> dict[str, Any]:

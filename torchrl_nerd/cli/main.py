@@ -1,13 +1,15 @@
-"""Picks a command, reads its options, runs it; bad input becomes one sentence."""
+"""The ``nerd`` command: reads options and runs; bad input becomes one sentence."""
 
 import io
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr
+from itertools import pairwise
 from typing import Any
 
 import tyro
 
+from torchrl_nerd import __version__
 from torchrl_nerd.cli.bench import Bench
 from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.data import Data
@@ -41,14 +43,17 @@ COMMANDS: dict[str, type[Command]] = {
 }
 
 
-INTERRUPTED = 130  # what shells say of a process that Ctrl-C ended
+INTERRUPTED = 130  # exit status of a process that Ctrl-C ended
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; bad input is one sentence on stderr and exit status 2."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    if argv == ["--version"]:
+        print(f"nerd {__version__}")
+        return 0
     if not argv or argv[0] in ("-h", "--help"):
-        print("usage: nerd COMMAND ... (each with --help)\n")
+        print("usage: nerd COMMAND ... (each with --help), nerd --version\n")
         for name, command in COMMANDS.items():
             print(f"  {name:<10}{(command.__doc__ or '').splitlines()[0]}")
         return 0
@@ -65,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail((str(error) or repr(error)).splitlines()[0])
     except KeyboardInterrupt:  # Ctrl-C
         return _fail(
-            "interrupted; data and training go on when asked again", INTERRUPTED
+            "interrupted; the same command resumes data and training", INTERRUPTED
         )
     return 0
 
@@ -94,7 +99,7 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
 
 
 def _default(kind: type[Command], args: list[str]) -> Any:
-    """Defaults of a command: a scene's preset where the command has one."""
+    """Defaults of ``data`` and ``train``: the preset of the scene that is named."""
     known = [arg for arg in args if arg in PRESETS]
     scene = next(
         (arg for arg in (*known, *args) if arg in known or is_import(arg)), None
@@ -104,6 +109,9 @@ def _default(kind: type[Command], args: list[str]) -> Any:
     preset = preset_of(scene)
     if kind is Data:
         return Data(scene, config=preset.data)
+    is_hybrid = "--kind=hybrid" in args or ("--kind", "hybrid") in pairwise(args)
+    if is_hybrid and preset.hybrid is not None:
+        return Train(scene, kind="hybrid", config=preset.hybrid)
     return Train(scene, config=preset.train)
 
 

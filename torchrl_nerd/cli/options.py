@@ -1,4 +1,6 @@
-"""What several commands share: kinds of options, and the scene of a recording."""
+"""Options that several commands share, and the scenes that they name."""
+
+from typing import Annotated, Literal
 
 import tyro
 
@@ -9,6 +11,20 @@ from torchrl_nerd.scenes import Scene
 
 Positional = tyro.conf.Positional
 Flat = tyro.conf.OmitArgPrefixes
+SceneName = Annotated[
+    str,
+    tyro.conf.arg(
+        help="Name of the robot: cartpole, ant, dm_control/DOMAIN-TASK, gymnasium/ID, or "
+        "an MJCF file."
+    ),
+]
+Reference = Annotated[
+    Literal["rk4"] | None,
+    tyro.conf.arg(
+        help="Reference solver in place of the scene's own: MuJoCo's RK4 at four times its "
+        "substeps."
+    ),
+]
 
 
 def scene_of(name: str, reference: str | None) -> Scene:

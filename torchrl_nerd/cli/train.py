@@ -1,4 +1,4 @@
-"""``nerd train``: a model as it is shipped, or one of your own."""
+"""``nerd train``: the model that ships for a scene, or one of your own."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,108 +6,124 @@ from typing import Any, Literal
 
 import torch
 
-from torchrl_nerd.checkpoint import (
-    from_pretrained,
-    load_checkpoint,
-    save_checkpoint,
-)
+from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
 from torchrl_nerd.cli.command import DeviceCommand
-from torchrl_nerd.cli.options import Flat, Positional, run_name, scene_of
+from torchrl_nerd.cli.options import (
+    Flat,
+    Positional,
+    Reference,
+    SceneName,
+    run_name,
+    scene_of,
+)
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import CARD, generate, load_data
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.robots import preset_of, protocol_of, source_of
+from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.loggers import LoggerName
 from torchrl_nerd.training.start import begin_from, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
 
+Kind = Literal["learned", "hybrid"]
+
 
 @dataclass(frozen=True)
 class Train(DeviceCommand):
-    """Train a NeRD; without options, exactly as the shipped model of the scene.
+    """Train a model of a scene, by default with the settings of its training preset.
 
-    Robots of others get one preset for all, validated from their own sampling ranges.
-    Missing data are generated first. A killed run goes on where it stopped. On several
-    processors or GPUs: torchrun --nproc-per-node 2 -m torchrl_nerd.cli train SCENE
+    Robots without a preset share one. Missing data are generated first. An interrupted
+    run resumes with the same command. Several processors or GPUs share one training with
+    torchrun --nproc-per-node 2 -m torchrl_nerd.cli train SCENE
 
     Example: nerd train cartpole --out runs/cartpole --network mlp-4x64
 
-    Example: nerd train ant --init-from ant --data datasets/ant datasets/ant_policy
+    Example: nerd train double_pendulum --kind hybrid
+
+    Example: nerd train ant --init-from ant-mlp --data datasets/ant datasets/ant_policy
     """
 
-    scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
-    or an MJCF file."""
+    scene: Positional[SceneName]
+    kind: Kind = "learned"
+    """A learned model, or a hybrid where the preset has one."""
     out: Path | None = None
-    """Folder of the run; runs/SCENE by default."""
+    """Folder of the run; default runs/SCENE, for a hybrid runs/SCENE-hybrid."""
     data: tuple[Path, ...] = ()
-    """Folders of data sets, learned from together; datasets/SCENE by default. A single one
-    is drawn if it is not there."""
+    """Folders of data sets; default datasets/SCENE, generated if it does not exist."""
     init_from: str | None = None
-    """Begin with the weights and statistics of a shipped model, by name, or of a checkpoint
-    folder."""
-    reference: Literal["rk4"] | None = None
-    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
-    substeps."""
+    """Continue training from a shipped model (its name) or a checkpoint (its folder)."""
+    reference: Reference = None
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
-    """Copy the preset's checkpoint, best or last, to this folder when done."""
+    """Folder to copy the checkpoint to that the preset chooses, best or last."""
     logger: LoggerName = "tensorboard"
-    """Where figures go beside log.csv: tensorboard, wandb, mlflow, or csv for nowhere."""
+    """Where metrics go besides log.csv; csv: nowhere else."""
     threads: int | None = None
-    """Processor threads; torch's own choice by default."""
+    """Processor threads of torch; default torch's own choice."""
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.kind == "hybrid") != (self.config.step is not None):
+            known = [name for name, preset in PRESETS.items() if preset.hybrid]
+            raise SettingError(
+                f"expected --kind hybrid with --step, or a scene whose preset has a hybrid "
+                f"({', '.join(known)}), got kind {self.kind} and step {self.config.step}"
+            )
 
     @property
     def folders(self) -> tuple[Path, tuple[Path, ...]]:
         """Of the run and of its data sets."""
         name = run_name(self.scene, self.reference)
-        return self.out or Path("runs") / name, self.data or (Path("datasets") / name,)
+        run = name if self.kind == "learned" else f"{name}-hybrid"
+        return self.out or Path("runs") / run, self.data or (Path("datasets") / name,)
 
-    def begin(self, scene: Scene) -> NeRD | None:
-        """The model to start from, where there is one."""
+    def initial(self, scene: Scene) -> NeRD | None:
+        """The model whose training continues; None: fresh weights."""
         if self.init_from is None:
             return None
         model = from_pretrained(self.init_from, scene)
         if not isinstance(model, NeRD):
             raise ValueError(
-                f"expected a learned or hybrid model to start from, got the analytic step "
-                f"'{self.init_from}'"
+                f"expected a learned or hybrid model to continue from, got the analytic "
+                f"step '{self.init_from}'"
             )
         return model
 
     def plan(self) -> list[str]:
-        """What would be trained on what, and what is there."""
+        """Which model would be trained on which data, and what exists already."""
         scene, (out, folders) = scene_of(self.scene, self.reference), self.folders
-        model = make_model(scene, self.config)
-        start = self.begin(scene)
-        if start is not None:
-            model = begin_from(start, scene, self.config)
+        initial = self.initial(scene)
+        if initial is None:
+            model = make_model(scene, self.config)
+        else:
+            model = begin_from(initial, scene, self.config)
         weights = sum(weight.numel() for weight in model.network.parameters())
         count = preset_of(self.scene).data.trajectories
         return [
             f"draw {count} trajectories, to {folders[0]}"
-            if _is_drawn(folders)
+            if _is_missing(folders)
             else f"use the data in {', '.join(map(str, folders))}",
-            f"go on with the run in {out}"
+            f"resume the run in {out}"
             if (out / STATE).exists()
             else f"begin a run in {out}",
-            f"train {weights} weights for {self.config.total_steps} updates",
+            f"train the {weights} weights of a {model.kind} model for "
+            f"{self.config.total_steps} updates",
         ]
 
     def run(self) -> dict[str, Any]:
-        """Train and return the card of the checkpoint that the preset takes."""
+        """Train and return the card of the checkpoint that the preset chooses."""
         scene = scene_of(self.scene, self.reference)
         preset, (out, folders) = preset_of(self.scene), self.folders
-        start = self.begin(scene)
+        initial = self.initial(scene)
         writable_folder(out)
         ranks.join(torch.device(self.device))
-        if ranks.rank() == 0 and _is_drawn(folders):
+        if ranks.rank() == 0 and _is_missing(folders):
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         ranks.wait()
         if self.threads:
@@ -124,32 +140,31 @@ class Train(DeviceCommand):
             random_actions=bool(protocol.random_actions),
             quiet=self.quiet,
             logger=self.logger,
-            init_from=start,
+            init_from=initial,
         )
         trainer.run()
-        made = out / preset.exports
-        card = read_json(made / "card.json")
-        is_first = ranks.rank() == 0
+        chosen = out / preset.exports
+        card, is_first = read_json(chosen / "card.json"), ranks.rank() == 0
         ranks.leave()
         if is_first:
             if self.export is not None:
-                save_checkpoint(load_checkpoint(made, scene), self.export, card)
-            print(f"{preset.exports} checkpoint in {made}: {_curve(card)}")
+                save_checkpoint(load_checkpoint(chosen, scene), self.export, card)
+            print(f"{preset.exports} checkpoint in {chosen}: {_errors(card)}")
         return card
 
 
-def _is_drawn(folders: tuple[Path, ...]) -> bool:
-    """Whether the data are yet to be drawn: a single set that is not there."""
+def _is_missing(folders: tuple[Path, ...]) -> bool:
+    """Whether the data must be generated: a single data set that does not exist."""
     return len(folders) == 1 and not (folders[0] / CARD).exists()
 
 
-def _curve(card: dict[str, Any]) -> str:
-    """Validation error of a card in one line."""
+def _errors(card: dict[str, Any]) -> str:
+    """Validation errors of a card in one line."""
     parts = [
-        f"{name} {figures['mean']:.2g} {figures['unit']} at {horizon} steps"
-        if figures["mean"] is not None
+        f"{name} {error['mean']:.2g} {error['unit']} at {horizon} steps"
+        if error["mean"] is not None
         else f"{name} not finite at {horizon} steps"
         for horizon, by_name in card.get("validation_error", {}).items()
-        for name, figures in by_name.items()
+        for name, error in by_name.items()
     ]
     return ", ".join(parts) or "not validated"

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from torchrl_nerd.analytic import PenaltyContactStep, UnconstrainedStep
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -11,9 +12,7 @@ from torchrl_nerd.keys import (
     ROBOT_STATE,
     ROBOT_TORQUE,
 )
-from torchrl_nerd.modules.free_step import expect_none, untold_pushes
-from torchrl_nerd.modules.ground_step import GroundStep
-from torchrl_nerd.modules.scene_tokens import SceneTokens
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import own_contacts
 from torchrl_nerd.scenes.explain import SolverReport
@@ -100,7 +99,7 @@ def explain(scene: Scene) -> SceneReport:
         >>> explain(load_scene("cartpole")).token_width
         7
     """
-    tokens = SceneTokens(scene)
+    tokens = SceneFeatures(scene)
     sizes = {**tokens.robot.sizes, **tokens.contact.sizes}
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
     model = scene.model
@@ -147,7 +146,7 @@ def _terrain(scene: Scene) -> str:
     surfaces = terrain.surfaces
     planes = sum(surface.kind == PLANE for surface in surfaces)
     where = "drawn for each trajectory" if terrain.is_per_row else "fixed"
-    has_normal = any(f == CONTACT_NORMAL for f in SceneTokens(scene).contact.sizes)
+    has_normal = any(f == CONTACT_NORMAL for f in SceneFeatures(scene).contact.sizes)
     normal = "a feature" if has_normal else "no feature: it follows from the state"
     shapes = f"{planes} plane{'s' * (planes != 1)}"
     if planes < len(surfaces):
@@ -158,15 +157,10 @@ def _terrain(scene: Scene) -> str:
 def _analytic_steps(scene: Scene) -> dict[str, str | None]:
     """Why each analytic step cannot step the scene, None where it can."""
     answers: dict[str, str | None] = {}
-    touched = {"a floating base": scene.base.is_floating}
-    touched["a ground"] = scene.terrain is not None
-    steps = {
-        "unconstrained": lambda: expect_none(scene, touched | untold_pushes(scene)),
-        "penalty-contact": lambda: GroundStep(scene),
-    }
-    for name, build in steps.items():
+    steps = {"unconstrained": UnconstrainedStep, "penalty-contact": PenaltyContactStep}
+    for name, step in steps.items():
         try:
-            build()
+            step(scene)
         except ValueError as error:
             answers[name] = str(error)
         else:
