@@ -47,15 +47,16 @@ demo: $(STAMP) ## learn a swing-up in learned dynamics, check it in true physics
 	GOMP_SPINCOUNT=1000 $(PY) examples/ppo.py
 
 test: check ## lint, types and the test suite
-	$(PYTEST) -n $(WORKERS) $(ARGS)
+	$(PYTEST) -n $(WORKERS) --dist worksteal $(ARGS)
 
-check: $(STAMP) ## lint, format and types alone
+check: $(STAMP) ## lint, format, types, imports and docstrings alone
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m basedpyright
+	$(PY) tests/tools/check_source.py
 
-test-slow: $(STAMP) ## the tests that take minutes
-	$(PYTEST) -m "slow and not gpu" $(ARGS)
+test-slow: $(STAMP) ## the tests that take minutes and all products of parameters, on random inputs
+	$(PYTEST) -m "slow and not gpu" --seed random $(ARGS)
 
 test-gpu: $(STAMP) ## the tests that need a CUDA device
 	$(PYTEST) -m gpu $(ARGS)

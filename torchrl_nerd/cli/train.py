@@ -84,7 +84,11 @@ class Train(DeviceCommand):
         return self.out or Path("runs") / run, self.data or (Path("datasets") / name,)
 
     def initial(self, scene: Scene) -> NeRD | None:
-        """The model whose training continues; None: fresh weights."""
+        """The model whose training continues; None: fresh weights.
+
+        Raises:
+            ValueError: no such model, or an analytic step.
+        """
         if self.init_from is None:
             return None
         model = from_pretrained(self.init_from, scene)
