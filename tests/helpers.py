@@ -4,6 +4,7 @@ import copy
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -57,7 +58,7 @@ ARM = """
 """Ball and hinge on a mount, fixed and turned, over a fixed and tilted plane."""
 
 
-def slow_but(quick: Iterable[str], names: Iterable[str]) -> list:
+def slow_but(quick: Iterable[Any], names: Iterable[Any]) -> list:
     """All names for `pytest.mark.parametrize`; those that are not quick, marked slow."""
     quick = set(quick)
     return [

@@ -92,6 +92,7 @@ def test_a_forked_process_has_threads_of_its_own():
     assert os.waitpid(child, 0)[1] == 0
 
 
+@pytest.mark.slow
 def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
     monkeypatch.setattr(torch_step, "MIN_WORK", 2)
     model = from_pretrained("double_pendulum-hybrid")

@@ -175,6 +175,7 @@ def test_bad_choices_are_refused_in_one_sentence(generator):
         NeRDDynamics(model, inference="window", window=0)
 
 
+@pytest.mark.slow
 def test_a_compiled_step_follows_its_weights(generator):
     """Changed in place, put in another's stead, or of another dtype."""
     model = from_pretrained("double_pendulum-mlp")

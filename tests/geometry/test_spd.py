@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from helpers import slow_but
 from torch import Tensor
 
 from torchrl_nerd.geometry.spd import (
@@ -30,7 +31,11 @@ def drawn(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     return matrix.movedim(0, -1), right
 
 
-@pytest.mark.parametrize("size", [1, 2, MAX_SOLVE, MAX_SOLVE + 1, 14])
+SIZES = 1, 2, MAX_SOLVE, MAX_SOLVE + 1, 14
+SHAPES = (6, 4, 2), (1, 3, 4), (7, 2, 8)
+
+
+@pytest.mark.parametrize("size", slow_but((2, 14), SIZES))
 def test_few_unknowns_or_many(size, generator):
     matrix, right = drawn(size, generator)
     inverse = torch.linalg.inv(matrix.movedim(-1, 0))
@@ -52,7 +57,7 @@ def test_few_columns_or_many(columns, generator):
         torch.testing.assert_close(each(matrix, rows), expected, **CLOSE)
 
 
-@pytest.mark.parametrize("shape", [(6, 4, 2), (1, 3, 4), (7, 2, 8)], ids=str)
+@pytest.mark.parametrize("shape", slow_but(SHAPES[:1], SHAPES), ids=str)
 def test_branch_by_branch(shape, generator):
     root, count, size = branches = BranchSparsity(*shape)
     matrix, right = drawn(root + count * size, generator)
