@@ -22,8 +22,10 @@ from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import SCENES, load_scene
 
 ROWS, STEPS = 6, 4
+PER_ENV = [s for s in map(load_scene, SCENES) if s.terrain and s.terrain.is_per_row]
 
 
 def rows_of(rows, state, torques, terrain):
@@ -156,7 +158,7 @@ def test_wrong_shapes_are_refused_in_one_sentence(scene, dynamics, generator):
 
 
 @warp_too
-def test_torque_and_ground_matter(scene, dynamics, generator):
+def test_torque_matters(scene, dynamics, generator):
     make = DynamicsMaker(scene, dynamics, generator)
     if isinstance(make.model, NeRD):
         in_small_steps(make.model)
@@ -164,12 +166,20 @@ def test_torque_and_ground_matter(scene, dynamics, generator):
     pushed = roll(make(), start, torques, terrain)["qvel"]
     passive = roll(make(), start, 0.0 * torques, terrain)["qvel"]
     assert (pushed != passive).any(-1).all() == bool(scene.actuated)
-    if terrain is None:
-        return
+
+
+@warp_too
+@pytest.mark.parametrize("scene", PER_ENV, ids=lambda scene: scene.name)
+def test_terrain_matters(scene, dynamics, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    if isinstance(make.model, NeRD):
+        in_small_steps(make.model)
+    start, torques, terrain = random_drive(scene, ROWS, 1, generator)
     touching = terrain.clone()
     touching[:, 3] += 3.0  # m, nearer
+    apart = roll(make(), start, torques, terrain)["qvel"]
     touched = roll(make(), start, torques, touching)["qvel"]
-    assert (touched != pushed).any()
+    assert (touched != apart).any()
 
 
 @warp_too

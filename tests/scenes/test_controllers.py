@@ -5,7 +5,15 @@ import torch
 from helpers import random_transitions
 
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.scenes.controllers import PDController, TorqueController
+
+DRIVEN = [
+    name
+    for name in SCENES
+    if load_scene(name).actuated
+    and isinstance(load_scene(name).controller, TorqueController)
+]
 
 
 def random_actions(scene, rows, generator, low=-1.0, high=1.0):
@@ -24,8 +32,11 @@ def test_a_scenes_torques_fit_its_actuators(scene, generator):
     assert torque.shape == (50, len(scene.actuated)) and torque.dtype == torch.float64
     largest = torch.tensor(scene.sampling.torque, dtype=torch.float64)
     assert (torque.abs() <= largest).all()
-    if not isinstance(scene.controller, TorqueController) or not torque.shape[1]:
-        return
+
+
+@pytest.mark.parametrize("name", DRIVEN)
+def test_a_unit_action_gives_the_largest_torque(name, generator):
+    scene = load_scene(name)
     unit = torch.eye(scene.controller.num_actions)
     pushed = torques(scene, unit, generator) - torques(scene, 0.0 * unit, generator)
     gain = torch.tensor(scene.controller.gain, dtype=torch.float64)
