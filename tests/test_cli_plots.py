@@ -1,4 +1,4 @@
-"""``nerd plot``: files, figures, refusals."""
+"""``nerd plot``: a figure, its numbers, refusals."""
 
 import json
 
@@ -8,23 +8,26 @@ from torchrl_nerd.cli import main
 
 
 def test_rollouts_are_plotted(tmp_path, seed, capsys):
-    out, figures = tmp_path / "a.png", tmp_path / "a.json"
+    out, results = tmp_path / "a.png", tmp_path / "a.json"
     argv = [
         "plot",
         "double_pendulum",
-        "--rows",
+        "--trajectories",
         "4",
         "--steps",
         "5",
         "--case",
         "ground 1",
     ]
-    argv += ["--seed", str(seed), "--out", str(out), "--json", str(figures)]
+    argv += ["--seed", str(seed), "--out", str(out), "--json", str(results)]
     assert main(argv) == 0
-    assert f"{out}: double_pendulum, ground 1" in capsys.readouterr().out
-    content = json.loads(figures.read_text())
+    assert f"{out}: 4 trajectories of 5 steps, ground 1" in capsys.readouterr().out
+    content = json.loads(results.read_text())
     assert out.exists() and len(content["seconds"]) == 6
-    assert set(content["energies"]) == set(content["gaps"]) == {"learned", "MuJoCo"}
+    assert content["dynamics"] == ["double_pendulum", "MuJoCo"]
+    assert all(
+        len(content[key][i]) == 6 for key in ("energies", "distances") for i in (0, 1)
+    )
 
 
 @pytest.mark.parametrize(
@@ -32,7 +35,7 @@ def test_rollouts_are_plotted(tmp_path, seed, capsys):
     [
         ("plot unicorn", "'unicorn'"),
         ("plot cartpole --case gorge", "unknown case 'gorge', expected one of passive"),
-        ("plot cartpole --rows 1", "rows of at least 2, got 1"),
+        ("plot cartpole --trajectories 1", "trajectories of at least 2, got 1"),
         ("plot cartpole --steps 0", "steps of at least 1, got 0"),
         ("data cube --from a.npz --policy p", "--policy without --from"),
     ],

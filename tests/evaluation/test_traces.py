@@ -1,11 +1,11 @@
-"""Energy and gaps over time, and the figures that show them."""
+"""Energy and distances over time, and the figure that shows them."""
 
 import pytest
 import torch
 from helpers import make_scene
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.trace_plot import plot_traces, plot_training, read_log
+from torchrl_nerd.evaluation.plots import plot_traces
 from torchrl_nerd.evaluation.traces import compare_traces, energy
 from torchrl_nerd.robots import load_scene, protocol_of
 
@@ -24,7 +24,7 @@ def test_energy_of_a_pendulum_is_the_textbooks(generator):
     assert torch.allclose(energy(scene, angle, speed), expected[:, 0])
 
 
-def test_energy_of_what_is_lost_is_nan():
+def test_energy_of_a_state_that_is_not_finite_is_nan():
     scene = make_scene(PENDULUM)
     angle = torch.tensor([[0.0], [torch.nan]], dtype=torch.float64)
     assert energy(scene, angle, torch.zeros_like(angle)).isnan().tolist() == [
@@ -38,42 +38,22 @@ def test_equal_dynamics_have_equal_traces(name, tmp_path, seed):
     scene = load_scene(name)
     source = next(iter(protocol_of(scene).cases.values()))
     truth, same = (MujocoDynamics(scene, num_threads=1) for _ in range(2))
-    traces = compare_traces(source, same, truth, 6, 5, seed)
+    traces = compare_traces(source, (same, truth), 6, 5, seed)
     assert all(float(error.max()) < 1e-7 for error in traces.errors.values())
     assert all(error.shape == (5, 7) for error in traces.errors.values())
-    learned, true = traces.energies.values()
+    learned, true = traces.energies
     assert torch.equal(learned, true) and true.shape == (7,) and true.isfinite().all()
-    assert (traces.gaps is None) == (scene.terrain is None)
+    assert (traces.distances is None) == (scene.terrain is None)
     assert float(traces.seconds[-1]) == pytest.approx(6 * scene.control_step)
-    plot_traces(traces, tmp_path / "traces.png")
+    plot_traces(traces, ("nerd", "MuJoCo"), name, tmp_path / "traces.png")
     assert (tmp_path / "traces.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_free_motion_keeps_its_energy(seed):
+def test_unconstrained_motion_keeps_its_energy(seed):
     """Cartpole without torque and friction, but for what the steps' size costs."""
     scene = load_scene("cartpole")
     assert scene.model.dof_damping.max() == 0.0
     source = next(iter(protocol_of(scene).cases.values()))
     truth = MujocoDynamics(scene, num_threads=1)
-    kept = compare_traces(source, truth, truth, 20, 4, seed).energies["MuJoCo"]
+    kept = compare_traces(source, (truth, truth), 20, 4, seed).energies[1]
     assert float(kept.max() - kept.min()) < 0.02 * float(kept.abs().max() + 25.0)
-
-
-def test_a_run_is_plotted_from_its_log(tmp_path, rng):
-    losses = rng.random(5)
-    lines = [f"{100 * i},{loss},{2 * loss}" for i, loss in enumerate(losses)]
-    (tmp_path / "log.csv").write_text("\n".join(["step,loss,hinge_100", *lines]) + "\n")
-    log = plot_training(tmp_path, tmp_path / "training.png")
-    assert log["loss"] == losses.tolist() and log["step"][-1] == 400.0
-    assert (tmp_path / "training.png").stat().st_size > 1000
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [(None, "with a log.csv"), ("", "with a step"), ("step,loss\n1,a\n", "numbers in")],
-)
-def test_broken_logs_are_refused(text, words, tmp_path):
-    if text is not None:
-        (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(ValueError, match=words):
-        read_log(tmp_path)

@@ -49,7 +49,7 @@ class Bench(DeviceCommand):
     """No progress bars."""
 
     @property
-    def picture(self) -> Path | None:
+    def figure(self) -> Path | None:
         """The drawing, where it was asked for."""
         return self.plot
 

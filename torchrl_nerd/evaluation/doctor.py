@@ -52,7 +52,7 @@ def machine() -> dict[str, str]:
         "CUDA devices": cuda,
         "C++ compiler": compiler,
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
-        "OpenGL": find_gl() or "none: films are drawn without",
+        "OpenGL": find_gl() or "none: nerd play cannot render",
         "display": os.environ.get("DISPLAY", "none"),
     }
 

@@ -1,4 +1,4 @@
-"""Figures of learned against true dynamics, written as PNG.
+"""Figures of learned dynamics against the ground truth, written as PNG.
 
 matplotlib is imported on first use: only `pip install torchrl-nerd[examples]` brings it.
 """
@@ -8,36 +8,30 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-from mujoco import mjtJoint
-from tensordict import TensorDictBase
+from torch import Tensor
 
+from torchrl_nerd.evaluation.rollout_error import unit_of
+from torchrl_nerd.evaluation.traces import Traces
 from torchrl_nerd.files import write_atomically
-from torchrl_nerd.scenes import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours tell apart for every eye: https://jfly.uni-koeln.de/color/
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-PARTS = {  # of a joint's qpos
-    mjtJoint.mjJNT_FREE: ("x (m)", "y (m)", "z (m)", "qw", "qx", "qy", "qz"),
-    mjtJoint.mjJNT_BALL: ("qw", "qx", "qy", "qz"),
-    mjtJoint.mjJNT_SLIDE: ("(m)",),
-    mjtJoint.mjJNT_HINGE: ("(rad)",),
-}
+# The colors of Okabe and Ito are told apart by every eye: https://jfly.uni-koeln.de/color/
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#999999")
 STYLES = ("-", "--", ":", "-.")
-PANEL = (7.0, 2.0)  # inches
+WIDTH, PANEL_HEIGHT = 7.0, 2.2  # inches
+BAND = (0.05, 0.95)  # quantiles
 
 
 def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> None:
-    """Mean return over training, and beside it the numbers as CSV.
+    """Mean return over training as PNG, and the numbers as CSV beside it.
 
     Args:
         curve: points: ``frames`` (env steps) and the mean return by name of the dynamics
             it was measured in.
-        path: of the PNG; the table's name ends in ``.csv`` instead.
+        path: of the PNG; the table has the suffix ``.csv`` instead.
     """
     figure, (axes,) = make_figure(1, height=4.0)
     millions = [point["frames"] / 1e6 for point in curve]
@@ -45,7 +39,10 @@ def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> Non
     for number, name in enumerate(names[1:]):
         returns = [point[name] for point in curve]
         axes.plot(millions, returns, STYLES[number], color=COLORS[number], label=name)
-    axes.set(xlabel="environment steps (millions)", ylabel="mean return")
+    axes.set(
+        xlabel="environment steps (millions)", ylabel="mean return (higher: better)"
+    )
+    axes.set_title("Return of the policy over training", fontsize=10, loc="left")
     axes.legend(frameon=False)
     save_figure(figure, path)
     rows = [names, *([str(point[name]) for name in names] for point in curve)]
@@ -55,67 +52,84 @@ def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> Non
     )
 
 
-def plot_states(
-    episodes: Mapping[str, TensorDictBase], scene: Scene, path: Path
-) -> None:
-    """Positions and reward over time, one panel each, one line per dynamics.
+def plot_traces(traces: Traces, names: Sequence[str], title: str, path: Path) -> None:
+    """Errors of all trajectories over time, and energy and distance of one, as PNG.
 
     Args:
-        episodes: ``qpos`` and ``reward`` after each step, ``[steps]``, by name of the
-            dynamics; lengths may differ.
-        scene: the robot.
+        traces: of `compare_traces`.
+        names: of the two dynamics.
+        title: of the figure.
         path: of the PNG.
     """
-    labels = [*qpos_names(scene), "reward"]
-    figure, panels = make_figure(len(labels), height=PANEL[1] * len(labels))
-    for number, (name, steps) in enumerate(episodes.items()):
-        values = torch.cat((steps["qpos"], steps["reward"]), -1)
-        seconds = scene.control_step * torch.arange(1, len(values) + 1)
-        for axes, line in zip(panels, values.unbind(-1), strict=True):
-            axes.plot(seconds, line, STYLES[number], color=COLORS[number], label=name)
-    for axes, label in zip(panels, labels, strict=True):
-        axes.set_ylabel(label)
-    panels[-1].set_xlabel("time (s)")
-    panels[0].legend(frameon=False, ncols=len(episodes))
+    units = {name: unit_of(traces.scene, name) for name in traces.errors}
+    kinds = list(dict.fromkeys(units.values()))
+    panels = len(kinds) + 1 + (traces.distances is not None)
+    figure, axes = make_figure(panels, PANEL_HEIGHT * panels)
+    figure.suptitle(title, fontsize=11)
+    count = len(next(iter(traces.errors.values())))
+    for panel, unit in zip(axes, kinds, strict=False):
+        quantities = [name for name in units if units[name] == unit]
+        for color, name in zip(COLORS * len(quantities), quantities, strict=False):
+            _plot_band(panel, traces.seconds, traces.errors[name], color, name)
+        panel.set_title(
+            f"Error over {count} trajectories: mean and 5% to 95% (lower is better \u2193)",
+            fontsize=9,
+            loc="left",
+        )
+        panel.set(ylabel=f"error ({unit})", ylim=(0.0, None))
+        panel.legend(
+            frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5)
+        )
+    lines = {"Energy": ("energy (J)", traces.energies)}
+    if traces.distances is not None:
+        lines["Smallest distance to the terrain"] = ("distance (m)", traces.distances)
+    for panel, (what, (label, both)) in zip(
+        axes[len(kinds) :], lines.items(), strict=True
+    ):
+        for i in (1, 0):
+            panel.plot(
+                traces.seconds, both[i], STYLES[1 - i], color=COLORS[i], label=names[i]
+            )
+        panel.set_title(f"{what}, trajectory of median error", fontsize=9, loc="left")
+        panel.set_ylabel(label)
+        panel.legend(
+            frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5)
+        )
+    axes[-1].set_xlabel("time (s)")
     save_figure(figure, path)
 
 
-def qpos_names(scene: Scene) -> list[str]:
-    """Name and unit of every entry of ``qpos``."""
-    model, names = scene.model, []
-    for joint in range(model.njnt):
-        name = model.joint(joint).name
-        names += [f"{name} {part}" for part in PARTS[mjtJoint(model.jnt_type[joint])]]
-    return names
+def _plot_band(
+    axes: "Axes", seconds: Tensor, error: Tensor, color: str, name: str
+) -> None:
+    error = error.nan_to_num(nan=float("inf"))
+    low, high = (error.quantile(q, 0) for q in BAND)
+    axes.fill_between(seconds, low, high, color=color, alpha=0.15, lw=0)
+    axes.plot(seconds, error.mean(0), color=color, label=name.replace("_", " "))
 
 
 def make_figure(
     panels: int, height: float, share_x: bool = True
 ) -> "tuple[Figure, list[Axes]]":
-    """Stacked panels ``height`` inches high together; no display is needed."""
-    need_matplotlib()
+    """Stacked panels ``height`` inches high together; no display is needed.
+
+    Raises:
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        raise ModuleNotFoundError(
+            "figures need matplotlib: pip install 'torchrl-nerd[examples]'"
+        )
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(PANEL[0], height), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(panels, 1, sharex=share_x, squeeze=False)[:, 0]
     for panel in axes:
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.3)
     return figure, list(axes)
-
-
-def need_matplotlib() -> None:
-    """Say in one sentence where matplotlib (and its pillow) is missing.
-
-    Raises:
-        ModuleNotFoundError: it is.
-    """
-    if find_spec("matplotlib") is None:
-        raise ModuleNotFoundError(
-            "figures need matplotlib: pip install 'torchrl-nerd[examples]'"
-        )
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
@@ -144,34 +143,6 @@ def mean_returns(
     """The means alone of `transfer`, by name of the dynamics."""
     summaries = transfer(task, actor, dynamics, episodes, seed=seed)
     return {name: summary.mean for name, summary in summaries.items()}
-
-
-@torch.no_grad()
-def hardest_episode(
-    task: str | Task,
-    actor: Actor,
-    dynamics: Sequence[str | Path],
-    seed: int = 0,
-) -> dict[str, TensorDictBase]:
-    """What the policy does in each dynamics from the start that earns least, of 64.
-
-    Returns:
-        ``qpos``, ``qvel`` and ``reward`` after each step of the episode, ``[steps]``, by
-        name of the dynamics.
-    """
-    episodes, row = {}, 0
-    for name in dict.fromkeys(map(str, dynamics)):
-        env = make_env(task, dynamics=name, num_envs=64, seed=seed)
-        env = stack_frames(env, frame_stack_of(actor))
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            steps = env.rollout(env.task.horizon, actor, break_when_any_done=False)[
-                "next"
-            ]
-        if not episodes:
-            row = int(steps["reward"][:, 0].argmin())
-        length = steps["done"][row].int().argmax() + 1
-        episodes[name] = steps.select("qpos", "qvel", "reward")[row, :length]
-    return episodes
 
 
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:

@@ -1,6 +1,6 @@
-"""What learned and true rollouts keep to: energy, and the gap to the ground."""
+"""Errors, energy and distance to the terrain over time, of rollouts in two dynamics."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -22,35 +22,33 @@ from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 
-NAMES = ("learned", "MuJoCo")
-
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Rollouts from the same starts, and one of them closely.
+    """Rollouts from the same initial states under the same actions.
 
     | field | meaning |
     |---|---|
     | ``scene`` | the robot |
     | ``seconds`` | ``(steps + 1,)`` |
-    | ``errors`` | ``(rows, steps + 1)`` by quantity, see `position_errors` |
-    | ``row`` | the one whose mean error is in the middle |
-    | ``energies`` | J, ``(steps + 1,)`` of that row, by NAMES |
-    | ``gaps`` | m, its smallest distance to the ground; None without one |
+    | ``errors`` | ``(trajectories, steps + 1)`` by quantity, see `position_errors` |
+    | ``energies`` | J, ``(steps + 1,)`` in each dynamics, of the trajectory whose mean
+      error is the median |
+    | ``distances`` | m, smallest distance of that trajectory to the terrain, negative in
+      contact; None without terrain |
     """
 
     scene: Scene
     seconds: Tensor
     errors: Mapping[str, Tensor]
-    row: int
-    energies: Mapping[str, Tensor]
-    gaps: Mapping[str, Tensor] | None
+    energies: Sequence[Tensor]
+    distances: Sequence[Tensor] | None
 
 
 def trace(
     dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive, every: int = 1
 ) -> TensorDict:
-    """States ``[rows, 1 + steps // every]``, the start first: ``qpos`` and ``qvel``."""
+    """``qpos`` and ``qvel`` of a rollout, ``[rows, 1 + steps // every]``, start first."""
     terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL)
     dynamics.reset(state)
@@ -63,7 +61,7 @@ def trace(
 
 
 def energy(scene: Scene, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Kinetic energy and that of gravity and joint springs, J, ``(steps,)``.
+    """Kinetic energy plus that of gravity and joint springs, J, ``(steps,)``.
 
     Args:
         scene: the robot.
@@ -85,37 +83,29 @@ def energy(scene: Scene, qpos: Tensor, qvel: Tensor) -> Tensor:
 
 def compare_traces(
     source: Source,
-    learned: Dynamics,
-    truth: Dynamics,
+    dynamics: Sequence[Dynamics],
     steps: int,
-    rows: int,
+    trajectories: int,
     seed: int,
     random_actions: bool = False,
 ) -> Traces:
-    """Both from the same starts under the same actions; see `passive_errors`."""
-    scene, start = scene_of(source), initial_states(source, rows, seed)
-    drive = action_drive(source, rows, steps, seed, random_actions)
-    paths = [trace(dynamics, start, steps, drive) for dynamics in (learned, truth)]
+    """Roll out two dynamics, the second one the ground truth; see `action_drive`."""
+    scene, start = scene_of(source), initial_states(source, trajectories, seed)
+    drive = action_drive(source, trajectories, steps, seed, random_actions)
+    paths = [trace(one, start, steps, drive) for one in dynamics]
     errors = position_errors(scene, paths[1][QPOS], paths[0][QPOS])
-    score = torch.stack([e / e.nanmean().clamp_min(1e-12) for e in errors.values()])
-    order = score.mean((0, 2)).nan_to_num(nan=torch.inf).argsort()
-    row = int(order[rows // 2])
-    terrain = start.get(TERRAIN, None)
-    ground = None if terrain is None else terrain[row].expand(steps + 1, -1)
-    chosen = {
-        name: cast(TensorDict, path[row])
-        for name, path in zip(NAMES, paths, strict=True)
-    }
-    gaps = None
+    relative = torch.stack([e / e.nanmean().clamp_min(1e-12) for e in errors.values()])
+    order = relative.mean((0, 2)).nan_to_num(nan=torch.inf).argsort()
+    median = int(order[trajectories // 2])
+    shown = [cast(TensorDict, path[median]) for path in paths]
+    distances, terrain = None, start.get(TERRAIN, None)
     if scene.terrain is not None:
-        gaps = {
-            k: scene.clearances(p[QPOS], ground).amin(-1) for k, p in chosen.items()
-        }
+        ground = None if terrain is None else terrain[median].expand(steps + 1, -1)
+        distances = [scene.clearances(p[QPOS], ground).amin(-1) for p in shown]
     return Traces(
         scene=scene,
         seconds=scene.control_step * torch.arange(steps + 1),
         errors=errors,
-        row=row,
-        energies={k: energy(scene, p[QPOS], p[QVEL]) for k, p in chosen.items()},
-        gaps=gaps,
+        energies=[energy(scene, p[QPOS], p[QVEL]) for p in shown],
+        distances=distances,
     )

@@ -1,14 +1,12 @@
-"""What is measured of a policy once it has learned: a table, figures, one episode."""
+"""What is measured of a policy once it has learned: a table and a JSON file."""
 
 from dataclasses import asdict
 from pathlib import Path
 
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.evaluation.plots import plot_states
 from torchrl_nerd.evaluation.policy_transfer import (
     ReturnSummary,
-    hardest_episode,
     transfer,
     transfer_table,
 )
@@ -19,7 +17,7 @@ from torchrl_nerd.robots import make_task
 def report_transfer(
     task: str, actor: Actor, learned_in: str, episodes: int, seed: int, folder: Path
 ) -> dict[str, ReturnSummary]:
-    """Print returns and gaps in every dynamics; write them and one episode.
+    """Print returns and gaps in every dynamics; write them.
 
     Args:
         task: its id.
@@ -28,7 +26,7 @@ def report_transfer(
             model, MuJoCo and dm_control.
         episodes: in each, see `transfer`.
         seed: of the starts.
-        folder: gets ``returns.json`` and ``episode.png``, see `hardest_episode`.
+        folder: gets ``returns.json``.
 
     Returns:
         Summaries by name of the dynamics.
@@ -42,6 +40,4 @@ def report_transfer(
     returns = transfer(task, actor, everywhere, episodes, seed=seed)
     print(transfer_table(returns))
     write_json(folder / "returns.json", {k: asdict(v) for k, v in returns.items()})
-    shown = hardest_episode(task, actor, everywhere[:3], seed=seed)
-    plot_states(shown, scene, folder / "episode.png")
     return returns

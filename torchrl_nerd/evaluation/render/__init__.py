@@ -1,1 +1,1 @@
-"""Learned and true motion side by side, as a film or in MuJoCo's viewer."""
+"""Side-by-side videos of a rollout in two dynamics, drawn by `mujoco.Renderer`."""

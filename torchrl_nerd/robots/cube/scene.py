@@ -65,6 +65,7 @@ def cube_slope() -> Scene:
         size=level.size,
         contype=level.contype,
         conaffinity=level.conaffinity,
+        material=level.material,
         rgba=level.rgba,
     )
     spec.delete(level)
