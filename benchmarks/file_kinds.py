@@ -17,9 +17,14 @@ from torchrl_nerd.checkpoint import (
 )
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data import generate as generation
-from torchrl_nerd.data.cube_tosses import COLUMNS, read_log
 from torchrl_nerd.data.generate import CARD, generate, load_data, simulate
-from torchrl_nerd.data.recorded import load_tosses, read_transitions, write_tosses
+from torchrl_nerd.data.log_files import (
+    FREE_BODY,
+    load_recording,
+    read_log,
+    read_transitions,
+    write_recording,
+)
 from torchrl_nerd.evaluation.policy import Policy, load_policy, save_policy
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.modules.nerd import NeRD
@@ -93,7 +98,7 @@ def _finish_data(folder: Path) -> Found:
 
 
 def _make_recorded(folder: Path) -> None:
-    write_tosses(EXCERPT, load_scene(CUBE), folder)
+    write_recording(EXCERPT, load_scene(CUBE), folder)
 
 
 def _load_recorded(folder: Path) -> Found:
@@ -140,19 +145,18 @@ def _make_npz(folder: Path) -> None:
 
 
 def _make_csv(folder: Path) -> None:
-    log = read_log(EXCERPT)
-    ends = torch.arange(len(log.position))
-    toss = torch.searchsorted(log.offsets, ends, right=True) - 1
-    table = torch.cat((toss[:, None].double(), log.position, log.quaternion), -1)
-    names = ",".join(("toss", *COLUMNS["position"], *COLUMNS["quaternion_wxyz"]))
+    log = read_log(EXCERPT, load_scene(CUBE))
+    toss = log.trajectory_of(torch.arange(len(log.qpos)))
+    table = torch.cat((toss[:, None].double(), log.qpos), -1)
+    names = ",".join(("toss", *FREE_BODY["position"], *FREE_BODY["quaternion_wxyz"]))
     path = folder / "tosses.csv"
     np.savetxt(path, table.numpy(), delimiter=",", header=names, comments="")
 
 
 def _load_log(name: str) -> Callable[[Path], Found]:
     def load(folder: Path) -> Found:
-        tosses, _ = load_tosses(folder / name, load_scene(CUBE))
-        return {"qpos": tosses.qpos, "qvel": tosses.qvel}
+        found, _ = load_recording(folder / name, load_scene(CUBE))
+        return {"qpos": found.qpos, "qvel": found.qvel}
 
     return load
 

@@ -19,7 +19,8 @@ import pytest
 import torch
 from helpers import EXCERPT
 
-from torchrl_nerd.data.cube_tosses import Tosses, TossLog, make_tosses, read_log
+from torchrl_nerd.data.log_files import read_log
+from torchrl_nerd.data.recorded import Recording, complete
 from torchrl_nerd.robots import SCENES, TASKS, load_scene
 from torchrl_nerd.scenes import Scene
 
@@ -109,12 +110,12 @@ def real_cube() -> Scene:
 
 
 @pytest.fixture
-def log() -> TossLog:
+def log(real_cube: Scene) -> Recording:
     """A dozen of its tosses as they were recorded."""
-    return read_log(EXCERPT)
+    return read_log(EXCERPT, real_cube)
 
 
 @pytest.fixture
-def tosses(log: TossLog, real_cube: Scene) -> Tosses:
+def recording(log: Recording, real_cube: Scene) -> Recording:
     """The same as states."""
-    return make_tosses(log, real_cube)
+    return complete(log, real_cube)

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
+from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
@@ -245,3 +246,25 @@ def random_tree(
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><compiler angle="radian"/><worldbody>{tree}</worldbody></mujoco>'
     )
+
+
+def simulated(
+    scene: Scene, generator: Generator, trajectories: int = 6, states: int = 20
+) -> Recording:
+    """A log of true motion under random torques."""
+    state, scale = scene.sample_initial(trajectories, generator)
+    torque = sample_torque(scene.sampling, scale, states - 1, generator)
+    start, dynamics = TensorDict(state, [trajectories]), MujocoDynamics(scene)
+    dynamics.reset(start)
+    path = dynamics.rollout(start, torque, start.get(TERRAIN, None))
+    ground = start.get(TERRAIN, None)
+    if ground is not None:
+        ground = ground.repeat_interleave(states, 0)
+    qpos, qvel = (
+        torch.cat((start[key][:, None], path[key]), 1).flatten(0, 1)
+        for key in (QPOS, QVEL)
+    )
+    held = torch.cat((torque, 0.0 * torque[:, :1]), 1).flatten(0, 1)
+    offsets = states * torch.arange(trajectories + 1)
+    frame = scene.control_step
+    return Recording(qpos, qvel, held, offsets, frame, terrain=ground)

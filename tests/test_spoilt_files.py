@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from file_kinds import CHUNK, KINDS, SCENE
 from fuzz_files import OUTCOMES, outcome, shapes_of
+from torchrl_nerd.data.log_files import LARGEST_LOG, read_log
 
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
 from torchrl_nerd.data import generate as generation
-from torchrl_nerd.data.cube_tosses import LARGEST_LOG, read_log
 from torchrl_nerd.data.generate import load_data
 from torchrl_nerd.data.store import chunk_path, read_chunk, write_chunk
 from torchrl_nerd.evaluation.policy import load_policy
@@ -160,7 +160,7 @@ def test_a_log_that_unpacks_to_gigabytes_is_not_unpacked(tmp_path, monkeypatch):
     path.write_bytes(corruptions.bomb())
     corruptions.bomb.cache_clear()
     with pytest.raises(ValueError, match="bytes when unpacked"):
-        read_log(path)
+        read_log(path, load_scene("cube_real"))
 
 
 @pytest.mark.parametrize("dtype", [str, complex, "M8[s]", [("a", "f8")]], ids=str)
@@ -168,7 +168,7 @@ def test_a_log_of_other_than_numbers(dtype, tmp_path):
     path = tmp_path / "log.npz"
     np.savez(path, position=np.zeros((4, 3), dtype), quaternion_wxyz=np.ones((4, 4)))
     with pytest.raises(ValueError, match="expected an array of numbers in 'position'"):
-        read_log(path)
+        read_log(path, load_scene("cube_real"))
 
 
 @pytest.mark.parametrize(

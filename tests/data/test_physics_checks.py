@@ -4,21 +4,48 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers import simulated
 
+from torchrl_nerd import load_scene
 from torchrl_nerd.data.physics_checks import check_log
-from torchrl_nerd.geometry.rotations import quat_multiply, rotate
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate, rotate_inverse
 
 XYZW = [1, 2, 3, 0]
+NONE = torch.nan  # of velocities that were not recorded
 
 
-def without(log, row: int, count: int, **changes):
+def changed(log, position=None, quat=None, linear=None, angular=None):
+    """The log with some of its columns replaced."""
+    parts = log.qpos[:, :3], log.qpos[:, 3:], log.qvel[:, :3], log.qvel[:, 3:]
+    others = position, quat, linear, angular
+    p, q, v, w = (a if b is None else b for a, b in zip(parts, others, strict=True))
+    v, w = (torch.as_tensor(x).expand(len(p), 3) for x in (v, w))
+    return replace(log, qpos=torch.cat((p, q), 1), qvel=torch.cat((v, w), 1))
+
+
+def position(log):
+    return log.qpos[:, :3]
+
+
+def quat(log):
+    return log.qpos[:, 3:]
+
+
+def linear(log):
+    return log.qvel[:, :3]
+
+
+def angular(log):
+    return log.qvel[:, 3:]
+
+
+def without(log, row: int, count: int):
     """The log with ``count`` frames lost from ``row`` on."""
-    index = torch.arange(len(log.position))
+    index = torch.arange(len(log.qpos))
     keep = (index < row) | (index >= row + count)
     offsets = log.offsets - count * (log.offsets > row).long()
-    names = ("position", "quaternion", "linear", "angular")
-    kept = {name: getattr(log, name)[keep] for name in names}
-    return replace(log, **{**kept, "offsets": offsets, **changes})
+    kept = {name: getattr(log, name)[keep] for name in ("qpos", "qvel", "joint_torque")}
+    return replace(log, **kept, offsets=offsets)
 
 
 def test_real_tosses_pass_with_all_that_was_asked(log, real_cube):
@@ -29,68 +56,66 @@ def test_real_tosses_pass_with_all_that_was_asked(log, real_cube):
 def test_where_they_are_and_face_does_not_matter(log, real_cube, generator):
     angle, shift = torch.randn(2, generator=generator).double()
     turn = torch.stack(((0.5 * angle).cos(), *angle.new_zeros(2), (0.5 * angle).sin()))
-    turn = turn.expand(len(log.position), 4)
+    turn = turn.expand(len(log.qpos), 4)
     move = torch.stack((shift, -2.0 * shift, 0.0 * shift))
-    moved = replace(
+    moved = changed(
         log,
-        position=rotate(turn, log.position) + move,
-        quaternion=quat_multiply(turn, log.quaternion),
-        linear=rotate(turn, log.linear),
+        rotate(turn, position(log)) + move,
+        quat_multiply(turn, quat(log)),
+        rotate(turn, linear(log)),
     )
     assert len(check_log(moved, real_cube)) == 7
 
 
 def test_poses_alone_pass(log, real_cube):
-    check_log(replace(log, linear=None, angular=None), real_cube)
+    check_log(changed(log, linear=NONE, angular=NONE), real_cube)
 
 
 WRONG = {
     "half widths": (
-        lambda g: replace(g, position=g.position / 0.0524, linear=g.linear / 0.0524),
+        lambda g: changed(g, position(g) / 0.0524, linear=linear(g) / 0.0524),
         ("free fall", "-18"),
     ),
     "millimetres": (
-        lambda g: replace(g, position=1e3 * g.position, linear=1e3 * g.linear),
+        lambda g: changed(g, 1e3 * position(g), linear=1e3 * linear(g)),
         ("free fall", "multiplied by about 0.001"),
     ),
     "y up": (
-        lambda g: replace(g, position=g.position[:, [0, 2, 1]]),
+        lambda g: changed(g, position(g)[:, [0, 2, 1]]),
         ("free fall", "y axis falls"),
     ),
     "z down": (
-        lambda g: replace(g, position=-g.position, linear=-g.linear),
+        lambda g: changed(g, -position(g), linear=-linear(g)),
         ("free fall", "z points down"),
     ),
     "xyzw": (
-        lambda g: replace(g, quaternion=g.quaternion[:, XYZW]),
+        lambda g: changed(g, quat=quat(g)[:, XYZW]),
         ("under the ground", "read as xyzw"),
     ),
     "xyzw, poses alone": (
-        lambda g: replace(
-            g, quaternion=g.quaternion[:, XYZW], linear=None, angular=None
-        ),
+        lambda g: changed(g, quat=quat(g)[:, XYZW], linear=NONE, angular=NONE),
         ("under the ground", "read as xyzw"),
     ),
     "angular velocity in world axes": (
-        lambda g: replace(g, angular=rotate(g.quaternion, g.angular)),
+        lambda g: changed(g, angular=rotate(quat(g), angular(g))),
         ("angular velocity in body axes", "world axes"),
     ),
     "degrees": (
-        lambda g: replace(g, angular=torch.rad2deg(g.angular)),
+        lambda g: changed(g, angular=torch.rad2deg(angular(g))),
         ("angular velocity", "degrees"),
     ),
     "linear velocity in body axes": (
-        lambda g: replace(
-            g, linear=rotate(g.quaternion * torch.tensor([1.0, -1, -1, -1]), g.linear)
-        ),
+        lambda g: changed(g, linear=rotate_inverse(quat(g), linear(g))),
         ("linear velocity", "body axes"),
     ),
     "not unit": (
-        lambda g: replace(g, quaternion=1.1 * g.quaternion),
+        lambda g: changed(g, quat=1.1 * quat(g)),
         ("length of quaternions", "0.1"),
     ),
     "another frame rate": (
-        lambda g: replace(g, time=torch.arange(len(g.position)).double() / 100.0),
+        lambda g: replace(
+            g, time=torch.arange(len(g.qpos)).double() / 100.0, frame=0.01
+        ),
         ("frame over the scene's control step", "1.48"),
     ),
 }
@@ -111,20 +136,32 @@ def test_lost_frames_are_found(log, real_cube, generator, count):
     toss = int(torch.randint(len(log.offsets) - 1, (), generator=generator))
     first, end = log.offsets[toss : toss + 2].tolist()
     rows = torch.arange(first + 2, end - count - 1)
-    apart = log.position[rows + count] - log.position[rows - 1]
+    apart = position(log)[rows + count] - position(log)[rows - 1]
     rows = rows[torch.linalg.vector_norm(apart, dim=-1) > 0.01]
     row = int(rows[torch.randint(len(rows), (), generator=generator)])
     spoilt = [without(log, row, count)]
     if count > 1:  # one frame of an impact: poses alone do not tell
-        spoilt.append(without(log, row, count, linear=None, angular=None))
+        spoilt.append(changed(spoilt[0], linear=NONE, angular=NONE))
     for wrong in spoilt:
         with pytest.raises(ValueError, match="lost, before row"):
             check_log(wrong, real_cube)
 
 
 def test_a_gap_between_time_stamps_is_found(log, real_cube):
-    time = torch.arange(len(log.position)).double() / 148.0
+    time = torch.arange(len(log.qpos)).double() / 148.0
     check_log(replace(log, time=time), real_cube)
     time[40:] += 0.05
     with pytest.raises(ValueError, match="gap in time"):
         check_log(replace(log, time=time), real_cube)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "ant"])
+def test_velocities_of_other_robots_are_checked(name, generator):
+    log = simulated(load_scene(name), generator)
+    scene = load_scene(name)
+    (*_, check) = check_log(log, scene)
+    assert check.name == "qvel against differences of qpos" and check.passes
+    for factor in (0.5, 57.3):
+        with pytest.raises(ValueError, match="qvel against differences"):
+            check_log(replace(log, qvel=factor * log.qvel), scene)
+    check_log(replace(log, qvel=torch.full_like(log.qvel, NONE)), scene)

@@ -1,21 +1,28 @@
-"""Fine-tuning on a dozen real tosses: what moves, what stays, and that it helps."""
+"""Fine-tuning on a dozen real recording: what moves, what stays, and that it helps."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from helpers import simulated
 from tensordict import TensorDict
 
+from torchrl_nerd import load_scene
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import open_loop
-from torchrl_nerd.geometry.manifold import integrate_pos
-from torchrl_nerd.modules.pose_encoder import PoseEncoder
+from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training.convergence import converged, score
-from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.pose_loss import pose_error, rollout
-from torchrl_nerd.training.toss_models import from_scratch
+from torchrl_nerd.training.finetune import (
+    FineTuner,
+    converged,
+    rollout_error,
+    score,
+    weighted_error,
+)
+from torchrl_nerd.training.finetune_run import start_model
+from torchrl_nerd.training.sequences import cover, data_stats
 
 QUICK = FinetuneConfig(
     update="all", epochs=0.2, batch_size=64, sequence_length=4, validate_every=100
@@ -24,65 +31,89 @@ NUMBERS = torch.arange(12)
 
 
 @pytest.fixture
-def model(real_cube, tosses):
-    return from_scratch(real_cube, tosses, "residual", seed=0)
+def model(real_cube, recording):
+    return fresh(real_cube, recording)
 
 
-def tuner(model, tosses, **changes) -> FineTuner:
+def fresh(scene, recording) -> NeRD:
+    """Fresh weights, statistics of the recording."""
+    data = recording.transitions()[:, None]
+    learned = NeRD(scene, network_config("mlp-4x64"), data_stats(scene, data))
+    cover(learned, data)
+    return learned
+
+
+def tuner(model, recording, **changes) -> FineTuner:
     config = replace(QUICK, **changes)
-    return FineTuner(model, tosses, NUMBERS[2:], NUMBERS[:2], config, quiet=True)
+    return FineTuner(model, recording, NUMBERS[2:], NUMBERS[:2], config, quiet=True)
 
 
 def weights(model) -> dict[str, torch.Tensor]:
     return {k: v.clone() for k, v in model.state_dict().items()}
 
 
-def test_it_learns_from_real_tosses(model, tosses):
-    run = tuner(model, tosses, epochs=1.0, length=8, physics_lr=0.05)
+def test_it_learns_from_real_tosses(model, recording):
+    run = tuner(model, recording, epochs=1.0, sequence_length=8)
     run.run()
-    first, *_, last = [point for point in run.curve]
-    assert last["orientation_rad"] < first["orientation_rad"]
+    first, *_, last = run.curve
+    assert score(last) < score(first)
 
 
-def test_physics_is_fitted_without_gradients(model, tosses):
-    run = tuner(model, tosses, update="physics", evaluations=2)
-    best = run.run()
+@pytest.mark.parametrize("name", ["cartpole", "double_pendulum"])
+def test_it_learns_from_a_log_of_any_robot(name, generator):
+    """A driven robot; and one over a ground that varies."""
+    scene = load_scene(name)
+    log = simulated(scene, generator, trajectories=12)
+    model = fresh(scene, log)
+    config = replace(QUICK, epochs=20, states=10, validate_every=5)
+    run = FineTuner(model, log, NUMBERS[4:], NUMBERS[:4], config, quiet=True)
+    run.run()
+    best = min(run.curve, key=score)
+    assert score(best) < 0.8 * score(run.curve[0])
+    assert len(best) == 3 + scene.model.nq  # an error of every joint
+
+
+def test_physics_is_fitted_without_gradients(real_cube, recording):
+    step = start_model(real_cube)
+    run = tuner(step, recording, update=None, evaluations=2)
+    run.run()
     epochs = [point["epoch"] for point in run.curve]
+    assert run.update == "physics"
     assert epochs == sorted(set(epochs)) and epochs[-1] < 4.1
     lowest = min(run.curve, key=score)
-    assert run.errors(run.checks)[0].mean() == pytest.approx(lowest["position_m"])
-    network = model.network.state_dict()
-    assert all(torch.equal(network[k], v) for k, v in best.network.state_dict().items())
+    found = run.errors(run.checks)["base_position"].mean()
+    assert found == pytest.approx(lowest["position_m"])
 
 
-def test_only_a_simulator_has_physics_to_fit(real_cube, tosses):
-    with pytest.raises(SettingError, match="simulator"):
-        tuner(
-            from_scratch(real_cube, tosses, "mlp-4x64", seed=0),
-            tosses,
-            update="physics",
-        )
+def test_only_an_analytic_step_has_physics_to_fit(model, recording):
+    with pytest.raises(SettingError, match="analytic step"):
+        tuner(model, recording, update="physics")
 
 
-def test_statistics_are_frozen_and_the_given_model_is_left_alone(model, tosses):
+def test_trajectories_that_are_too_short_are_refused(model, recording):
+    with pytest.raises(ValueError, match="at least 2000 states, got none"):
+        tuner(model, recording, states=2000)
+
+
+def test_statistics_are_frozen_and_the_given_model_is_left_alone(model, recording):
     before = weights(model)
-    after = weights(tuner(model, tosses).run())
+    after = weights(tuner(model, recording).run())
     assert all(torch.equal(before[k], v) for k, v in weights(model).items())
     frozen = [k for k in before if k.startswith("normalize")]
     assert frozen and all(torch.equal(before[k], after[k]) for k in frozen)
 
 
 @pytest.mark.parametrize("update", ["all", "head", "low-rank"])
-def test_only_what_was_asked_for_changes(model, tosses, update, generator):
+def test_only_what_was_asked_for_changes(model, recording, update, generator):
     with torch.no_grad():
         for weight in model.network.parameters():
             weight += 0.01 * torch.randn(weight.shape, generator=generator)
-    run = tuner(model, tosses, update=update, rank=2)
-    run._update(run._batch(run.starts[:64], 4, generator))
+    run = tuner(model, recording, update=update, rank=2)
+    run._step(run.starts[:64], 4)
     run._frozen()  # a copy: training goes on
-    run._update(run._batch(run.starts[:64], 4, generator))
+    run._step(run.starts[:64], 4)
     after = run._frozen()
-    state = TensorDict({"qpos": tosses.qpos[:9], "qvel": tosses.qvel[:9]}, [9])
+    state = TensorDict({"qpos": recording.qpos[:9], "qvel": recording.qvel[:9]}, [9])
     steps = [open_loop(NeRDDynamics(x.eval()), state, 1) for x in (run.model, after)]
     torch.testing.assert_close(*steps)
     for name, old in model.network.named_parameters():
@@ -96,59 +127,42 @@ def test_only_what_was_asked_for_changes(model, tosses, update, generator):
                 assert torch.linalg.matrix_rank(change, atol=1e-7) <= 2
 
 
-def test_it_stops_where_validation_stands_still_at_full_length(model, tosses):
-    still = {"lr": 0.0, "physics_lr": 0.0}
-    run = tuner(model, tosses, epochs=1.0, validate_every=1, patience=2, **still)
+def test_it_stops_where_validation_stands_still_at_full_length(model, recording):
+    run = tuner(model, recording, epochs=1.0, validate_every=1, patience=2, lr=0.0)
     run.run()
     short = run.config.short_history_fraction * run.updates_per_epoch
     done = run.curve[-1]["epoch"] * run.updates_per_epoch
     assert done == pytest.approx(int(short) + 2) and done < run.updates_per_epoch
 
 
-def test_runs_of_one_seed_are_the_same(model, tosses):
-    first, second = (weights(tuner(model, tosses).run()) for _ in range(2))
+def test_runs_of_one_seed_are_the_same(model, recording):
+    first, second = (weights(tuner(model, recording).run()) for _ in range(2))
     assert all(torch.equal(first[k], second[k]) for k in first)
 
 
-def test_poses_at_any_rate_are_enough(model, tosses):
-    poses = replace(tosses, qvel=torch.full_like(tosses.qvel, float("nan")))
-    run = tuner(
-        model, poses, observe="poses", every=3, poses=2, pose_noise=1e-4, length=6
-    )
-    best = run.run()
-    assert all(weight.isfinite().all() for weight in best.parameters())
-    assert run.curve[-1]["position_m"] < 0.2
-
-
-@pytest.mark.parametrize("is_high", [True, False])
-def test_the_encoder_knows_velocities_in_flight_and_slopes_on_ground(
-    real_cube, generator, is_high
-):
-    every = int(torch.randint(1, 4, (), generator=generator))
-    encoder = PoseEncoder(real_cube, poses=5, every=every)
-    linear, angular = torch.randn(2, 8, 3, generator=generator).double()
-    start = real_cube.sample_initial(8, generator)[0]["qpos"]
-    start[:, 2] = 2.0 if is_high else -2.0
-    qvel = torch.cat((linear, angular), 1)
-    time = real_cube.control_step * every * torch.arange(5).double()
-    window = torch.stack(
-        [integrate_pos(real_cube.layout, start, t * qvel) for t in time], 1
-    )
-    gravity = torch.as_tensor(real_cube.model.opt.gravity) * is_high
-    window[..., :3] += 0.5 * time[:, None] ** 2 * gravity
-    qvel[:, :3] += time[-1] * gravity
-    qpos, found = encoder(window)
-    torch.testing.assert_close(qpos, window[:, -1])
-    torch.testing.assert_close(found, qvel, atol=1e-9, rtol=0)
-
-
-def test_the_loss_is_smooth_where_nothing_is_wrong(model, tosses):
-    window = tosses.windows(tosses.starts(5)[:8], 5)
-    start = window["qpos"][:, 0].requires_grad_()
-    path = rollout(model, start, window["qvel"][:, 0], 4)
-    error = pose_error(path, path.detach())
+@pytest.mark.parametrize("name", ["cube_real", "ant", "cartpole"])
+def test_the_loss_has_a_slope_where_nothing_is_wrong(name, generator):
+    scene = load_scene(name)
+    window = simulated(scene, generator, trajectories=3, states=5)
+    qpos = window.qpos.clone().requires_grad_()
+    error = weighted_error(scene, position_errors(scene, window.qpos, qpos))
     error.sum().backward()
-    assert error.max() < 1e-3 and start.grad.isfinite().all()
+    assert error.max() < 1e-6 and qpos.grad.isfinite().all()
+
+
+def test_gradients_are_those_of_the_error(model, recording):
+    """Against differences, along the gradient of the last layer."""
+    window = recording.windows(recording.starts(4)[:8], 4)
+    head = [w for n, w in model.network.named_parameters() if "head" in n][0]
+    slope = torch.autograd.grad(rollout_error(model, window).sum(), head)[0]
+    change, ends = 1e-2 * slope / slope.norm(), []
+    for sign in (1.0, -1.0):
+        with torch.no_grad():
+            head += sign * change
+            ends.append(float(rollout_error(model, window).sum()))
+            head -= sign * change
+    expected = pytest.approx((ends[0] - ends[1]) / 2.0, rel=0.05)
+    assert float((slope * change).sum()) == expected
 
 
 def test_convergence_is_the_first_point_near_the_best():
@@ -163,7 +177,7 @@ def test_convergence_is_the_first_point_near_the_best():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"update": "some"}, {"rows": 0}, {"observe": "sound"}, {"every": 3}],
+    [{"update": "some"}, {"batch_size": 0}, {"states": 1}, {"lr": -1.0}],
 )
 def test_settings_out_of_range_are_refused(changes):
     with pytest.raises(SettingError, match="expected"):

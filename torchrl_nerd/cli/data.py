@@ -13,7 +13,7 @@ from torchrl_nerd.cli.options import (
     Positional,
     Reference,
     SceneName,
-    real_scene,
+    recorded_scene,
     run_name,
     scene_of,
 )
@@ -26,8 +26,8 @@ from torchrl_nerd.data.generate import (
     generate,
     plain_strategy,
 )
+from torchrl_nerd.data.log_files import load_recording, write_recording
 from torchrl_nerd.data.ray_map import ray_map
-from torchrl_nerd.data.recorded import load_tosses, write_tosses
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
@@ -54,7 +54,7 @@ class Data(Command):
     """Folder of the data set; default datasets/SCENE."""
     reference: Reference = None
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """File of recorded cube tosses (npz or CSV), whose units and frames are checked."""
+    """File of recorded trajectories (npz or CSV); units and frames are checked."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
     policy: Path | None = None
     """Folder of a policy (see examples/ppo.py) that acts, from the resets of its task."""
@@ -79,8 +79,8 @@ class Data(Command):
     def plan(self) -> list[str]:
         """How many trajectories would be drawn, their size, and how many exist."""
         if self.recorded is not None:
-            tosses, _ = load_tosses(self.recorded, real_scene(self.scene))
-            return [f"convert {len(tosses)} recorded tosses"]
+            recording, _ = load_recording(self.recorded, recorded_scene(self.scene))
+            return [f"convert {len(recording)} recorded trajectories"]
         scene, out = scene_of(self.scene, self.reference), self.folder
         _, draw = self.strategy(scene) or plain_strategy(scene)
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
@@ -96,16 +96,17 @@ class Data(Command):
         """Write the data set and return its card.
 
         Raises:
-            ValueError: options that exclude each other, or see `generate`, `load_tosses`.
+            ValueError: options that exclude each other; see `generate`, `load_recording`.
         """
         if self.recorded is not None:
             if self.policy is not None:
                 raise ValueError("expected --policy without --from: it draws data")
-            scene = real_scene(self.scene)
+            scene = recorded_scene(self.scene)
             out = self.out or Path("datasets") / f"{scene.name}_recorded"
-            card = write_tosses(self.recorded, scene, out)
+            card = write_recording(self.recorded, scene, out)
             print("\n".join(card["checks"]))
-            print(f"{card['trajectories']} recorded tosses in {out}: they fit physics")
+            count = card["trajectories"]
+            print(f"{count} recorded trajectories in {out}: they pass all checks")
             return card
         scene = scene_of(self.scene, self.reference)
         out = self.folder

@@ -9,14 +9,18 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import DeviceCommand
-from torchrl_nerd.cli.options import Positional, real_scene
-from torchrl_nerd.data.recorded import SHIPPED, load_tosses
+from torchrl_nerd.cli.options import Positional, recorded_scene
+from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.recorded_error import (
+    STATES,
+    compare,
+    errors_as_text,
+    rivals,
+)
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
-from torchrl_nerd.evaluation.toss_error import STATES
-from torchrl_nerd.evaluation.toss_table import compare, mujoco_baselines, toss_table
-from torchrl_nerd.robots import PRESETS, load_scene, protocol_of
+from torchrl_nerd.robots import PRESETS, load_scene, protocol_of, recorded_protocol
 from torchrl_nerd.scenes import Scene
 
 
@@ -50,12 +54,14 @@ class Eval(DeviceCommand):
     unseen_terrain: bool = False
     """Over grounds of kinds that no training data have, in place of the paper's."""
     data: Path | None = None
-    """Recorded cube tosses (npz or CSV) in place of true physics: every sub-trajectory of
-    80 states."""
+    """Recorded trajectories (npz or CSV) in place of MuJoCo: every window of `states`."""
     split: str = "all"
-    """Of recorded tosses: all, train, validation or test, by the recommended seed."""
+    """Of recorded trajectories: all, train, validation or test."""
+    states: int = STATES
+    """Of a window of recorded trajectories, its start among them."""
     baselines: bool = False
-    """Beside it, on recorded tosses: MuJoCo, published and fitted, and no motion."""
+    """Beside it, on recorded trajectories: MuJoCo and the analytic step with the scene's
+    own parameters."""
     quiet: bool = False
     """No progress bar."""
 
@@ -120,30 +126,31 @@ class Eval(DeviceCommand):
     def _load(self, name: Path | str, scene: Scene) -> Model:
         """The model as it was asked for."""
         model = from_pretrained(name, scene).to(self.device)
-        return model.to(torch.bfloat16) if self.bf16 else model
+        return model.to(torch.bfloat16) if self.bf16 and model.kind != "analytic" else model
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
-        """The same for recorded tosses.
+        """The same for recorded trajectories.
 
         Raises:
-            ValueError: no such split, or no toss that is long enough.
+            ValueError: no such split, or no trajectory that is long enough.
         """
-        scene = real_scene(self.scene)
-        model = self._load(self.model or SHIPPED, scene)
-        tosses, split = load_tosses(path, scene)
+        protocol = recorded_protocol(self.scene)
+        scene = recorded_scene(self.scene)
+        model = self._load(self.model or protocol.model, scene)
+        recording, split = load_recording(path, scene)
         if self.split != "all" and self.split not in split:
             expected = ", ".join(("all", *split))
             raise ValueError(f"expected split {expected}, got '{self.split}'")
         chosen = None if self.split == "all" else split[self.split]
-        starts = tosses.starts(STATES, chosen)
+        starts = recording.starts(self.states, chosen)
         if len(starts) == 0:
             raise ValueError(
-                f"expected a toss of at least {STATES} states in {path}, got none"
+                f"expected a trajectory of at least {self.states} states in {path}, got "
+                "none"
             )
-        models = {"model": dynamics_of(model, inference=self.inference)}
-        if self.baselines:
-            models = {**mujoco_baselines(scene), **models}
-        table = compare(models, tosses, starts)
-        print(toss_table(table))
+        models = rivals(scene) if self.baselines else {}
+        models["model"] = dynamics_of(model, inference=self.inference)
+        table = compare(models, scene, recording, starts, self.states)
+        print(errors_as_text(table, protocol.published, self.states))
         shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
         return {**shared, **table["model"], "others": table}

@@ -4,9 +4,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from torchrl_nerd.data.recorded import REAL
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots import load_scene, recorded_protocol
 from torchrl_nerd.scenes import Scene
 
 Positional = tyro.conf.Positional
@@ -38,13 +37,6 @@ def run_name(name: str, reference: str | None) -> str:
     return "-".join((folder_name(name), *((reference,) if reference else ())))
 
 
-def real_scene(name: str) -> Scene:
-    """The scene that recorded tosses are of; ``cube`` is short for it.
-
-    Raises:
-        ValueError: another robot.
-    """
-    if name not in REAL:
-        expected = " or ".join(REAL)
-        raise ValueError(f"expected {expected} for recorded tosses, got '{name}'")
-    return load_scene(REAL[name])
+def recorded_scene(name: str) -> Scene:
+    """The scene that recordings of a robot are of: ``cube_real`` for ``cube``."""
+    return load_scene(recorded_protocol(name).scene)

@@ -1,85 +1,182 @@
-"""Recorded tosses from file to states and, checked, to a data set on disk."""
+"""Recorded trajectories of a robot: completed, split, cut into windows, kept as data."""
 
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_nerd import __version__
-from torchrl_nerd.data.cube_tosses import Tosses, make_tosses, read_log, split_tosses
-from torchrl_nerd.data.generate import CARD
-from torchrl_nerd.data.physics_checks import check_log
-from torchrl_nerd.data.store import (
-    chunk_path,
-    expect_finite,
-    read_chunk,
-    write_chunk,
-)
-from torchrl_nerd.files import writable_folder, write_json
+from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 
-REAL = {"cube": "cube_real", "cube_real": "cube_real"}
-"""Scenes that recorded tosses are of, by the names that commands take."""
+TORQUE = "joint_torque"
+SPLIT_SEED, TRAIN_SHARE, VALIDATION_SHARE = 0, 380 / 510, 65 / 510
+CLEAR = 0.005  # m between the lowest contact point and the ground: free flight
+FLIGHT = 8  # frames at the start of a trajectory in which free fall is measured
 
-SHIPPED = "cube_tosses"
-"""The shipped model that was fine-tuned on them."""
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recorded trajectories, one after the other, float64.
+
+    | field | meaning |
+    |---|---|
+    | ``qpos`` | ``(N, nq)`` |
+    | ``qvel`` | ``(N, nv)``; NaN where not recorded, until `complete` |
+    | ``joint_torque`` | ``(N, num_actuated)``, N m or N, held until the next state |
+    | ``offsets`` | ``(T + 1,)``: trajectory i is rows ``offsets[i]:offsets[i + 1]`` |
+    | ``frame`` | time between two states, s |
+    | ``time`` | time stamps ``(N,)``, s, or None |
+    | ``terrain`` | the ground ``(N, terrain.size)``, where it varies, else None |
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    joint_torque: Tensor
+    offsets: Tensor
+    frame: float
+    time: Tensor | None = None
+    terrain: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """States and torques by their keys, ``(N, *)``."""
+        found = {QPOS: self.qpos, QVEL: self.qvel, TORQUE: self.joint_torque}
+        return found if self.terrain is None else {**found, TERRAIN: self.terrain}
+
+    @property
+    def inside(self) -> Tensor:
+        """Which rows follow one of the same trajectory, bool ``(N,)``."""
+        inside = torch.ones(len(self.qpos), dtype=torch.bool)
+        inside[self.offsets[:-1]] = False
+        return inside
+
+    def select(self, numbers: Tensor) -> "Recording":
+        """Some of the trajectories by their ``numbers (n,)``, in that order."""
+        bounds = [self.offsets[i : i + 2].tolist() for i in numbers]
+        rows = torch.cat([torch.arange(first, end) for first, end in bounds])
+        ends = torch.tensor([0, *(end - first for first, end in bounds)]).cumsum(0)
+        kept = {name: column[rows] for name, column in self.columns.items()}
+        return replace(self, **kept, offsets=ends, time=None)
+
+    def starts(self, states: int, numbers: Tensor | None = None) -> Tensor:
+        """Row of the first of every ``states`` consecutive states, ``(windows,)``.
+
+        Args:
+            states: in a window.
+            numbers: of the trajectories, ``(n,)``; None for all.
+        """
+        found = [torch.zeros(0, dtype=torch.long)]
+        for i in range(len(self)) if numbers is None else numbers.tolist():
+            first, end = self.offsets[i : i + 2].tolist()
+            found.append(torch.arange(first, max(first, end - states + 1)))
+        return torch.cat(found)
+
+    def trajectory_of(self, rows: Tensor) -> Tensor:
+        """Number of the trajectory that each of ``rows (n,)`` belongs to, ``(n,)``."""
+        return torch.searchsorted(self.offsets, rows, right=True) - 1
+
+    def windows(self, starts: Tensor, states: int) -> TensorDict:
+        """Consecutive states and torques ``[windows, states]``."""
+        rows = starts[:, None] + torch.arange(states)
+        return TensorDict({k: v[rows] for k, v in self.columns.items()}, [*rows.shape])
+
+    def transitions(self) -> TensorDict:
+        """The keys of every other data set ``[transitions]``, and trajectory numbers.
+
+        TorchRL's `SliceSampler` cuts trajectories of unequal lengths by
+        ``("collector", "traj_ids")``.
+        """
+        after = self.inside.nonzero()[:, 0]
+        now = {key: column[after - 1] for key, column in self.columns.items()}
+        moved = {QPOS: self.qpos[after], QVEL: self.qvel[after]}
+        moved[TORQUE] = now.pop(TORQUE)
+        size, number = [len(after)], self.trajectory_of(after)
+        other = {"next": TensorDict(moved, size), "collector": {"traj_ids": number}}
+        return TensorDict({**now, **other}, size)
 
 
-def load_tosses(path: Path, scene: Scene) -> tuple[Tosses, dict[str, Tensor]]:
-    """States of a file that fits physics, and the numbers ``(n,)`` of its parts' tosses.
+def is_free_body(scene: Scene) -> bool:
+    """Whether the robot is one free body without motors."""
+    is_single = scene.base.is_floating and scene.model.nv == 6
+    return is_single and not scene.actuated
+
+
+def complete(log: Recording, scene: Scene) -> Recording:
+    """States of a checked log: unit quaternions, and velocities that it lacks.
+
+    Velocities are estimated from positions as `estimate_velocities` does. A velocity that
+    is a mean over the frame before lags its state: of a free body in flight the median lag
+    is measured, and what gravity adds in that time is added.
+    """
+    layout = scene.layout
+    qpos = integrate_pos(layout, log.qpos, torch.zeros_like(log.qvel))
+    log = replace(log, qpos=qpos)
+    is_missing = log.qvel.isnan()
+    qvel = log.qvel.clone()
+    if is_missing.any():
+        qvel = torch.where(is_missing, estimate_velocities(log, scene), qvel)
+    if is_free_body(scene):
+        flies = scene.clearances(qpos).amin(-1) > CLEAR
+        steady = flies & log.inside
+        if steady.any():
+            mean = backward_differences(log, scene)[:, 2]
+            now = mean + 0.5 * log.frame * float(free_fall(log)[2])
+            qvel[flies, 2] += (now - qvel[:, 2])[steady].median()
+    return replace(log, qvel=qvel)
+
+
+def estimate_velocities(log: Recording, scene: Scene) -> Tensor:
+    """``qvel (N, nv)`` from positions: `backward_differences`, a median of three each."""
+    qvel = backward_differences(log, scene)
+    smooth = torch.stack((qvel.roll(1, 0), qvel, qvel.roll(-1, 0))).median(0).values
+    ends = torch.cat((log.offsets[:-1], log.offsets[1:] - 1))
+    smooth[ends] = qvel[ends]
+    return smooth
+
+
+def backward_differences(log: Recording, scene: Scene) -> Tensor:
+    """``qvel (N, nv)`` over the frame before; a trajectory's first is its second's."""
+    step = differentiate_pos(scene.layout, log.qpos[:-1], log.qpos[1:])
+    qvel = torch.cat((step[:1], step)) / log.frame
+    first = log.offsets[:-1]
+    qvel[first] = qvel[first + 1]
+    return qvel
+
+
+def free_fall(log: Recording) -> Tensor:
+    """Median over trajectories of a free body's first acceleration, ``(3,)``, m/s^2.
 
     Raises:
-        ValueError: in one sentence, a file that cannot be read or the check that failed.
+        ValueError: no trajectory of at least 4 frames.
     """
-    log = read_log(path)
-    check_log(log, scene)
-    tosses = make_tosses(log, scene)
-    return tosses, split_tosses(len(tosses))
+    found = []
+    for first, end in zip(log.offsets[:-1], log.offsets[1:], strict=True):
+        count = min(FLIGHT, int(end - first))
+        if count < 4:
+            continue
+        t = log.frame * torch.arange(count, dtype=torch.float64)
+        basis = torch.stack((torch.ones_like(t), t, 0.5 * t * t), -1)
+        path = log.qpos[first : first + count, :3]
+        found.append(torch.linalg.lstsq(basis, path).solution[2])
+    if not found:
+        raise ValueError("expected a trajectory of at least 4 frames, got none")
+    return torch.stack(found).median(0).values
 
 
-def write_tosses(path: Path, scene: Scene, folder: Path) -> dict[str, Any]:
-    """Write a data set ``[transitions]`` with the keys of every other; returns its card.
+def split_trajectories(count: int) -> dict[str, Tensor]:
+    """Numbers ``(n,)`` of the trajectories to train on, to choose by and to test with.
 
-    Beside them: ``("collector", "traj_ids")``, the toss, and ``part``, 0 for training,
-    1 for validation, 2 for test.
-
-    Raises:
-        ValueError: as `load_tosses`; the folder cannot be written or holds other data.
+    Of the 510 published tosses of a cube: 380, 65 and 65, by the recommended seed.
     """
-    log = read_log(path)
-    checks = check_log(log, scene)
-    tosses = make_tosses(log, scene)
-    if (folder / CARD).exists():
-        raise ValueError(f"{folder} already holds data: choose another folder")
-    data = tosses.transitions()
-    part = torch.empty(len(tosses), dtype=torch.int8)
-    split = split_tosses(len(tosses))
-    for number, members in enumerate(split.values()):
-        part[members] = number
-    data["part"] = part[data["collector", "traj_ids"]]
-    write_chunk(data, chunk_path(writable_folder(folder), 0))
-    card = {
-        "scene": scene.name,
-        "scene_hash": scene.hash,
-        "source": path.name,
-        "trajectories": len(tosses),
-        "transitions": len(data),
-        "split": {name: members.tolist() for name, members in split.items()},
-        "checks": [str(check) for check in checks],
-        "torchrl_nerd": __version__,
-    }
-    write_json(folder / CARD, card)
-    return card
-
-
-def read_transitions(folder: Path) -> TensorDict:
-    """The data set that `write_tosses` wrote, memory-mapped, ``[transitions]``.
-
-    Raises:
-        ValueError: in one sentence, what is missing or broken.
-    """
-    data = read_chunk(chunk_path(folder, 0), 1)
-    expect_finite(data, folder)
-    return data
+    order = torch.from_numpy(np.random.default_rng(SPLIT_SEED).permutation(count))
+    train = round(TRAIN_SHARE * count)
+    last = train + round(VALIDATION_SHARE * count)
+    names = ("train", "validation", "test")
+    parts = (order[:train], order[train:last], order[last:])
+    return dict(zip(names, parts, strict=True))

@@ -6,7 +6,13 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot, Source
+from torchrl_nerd.robots.robot import (
+    EvaluationProtocol,
+    Preset,
+    RecordedProtocol,
+    Robot,
+    Source,
+)
 from torchrl_nerd.scenes import Scene, import_scene, is_import
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.tasks.suite import SuiteTask
@@ -85,6 +91,12 @@ def protocol_of(scene: Scene) -> EvaluationProtocol:
     return EvaluationProtocol(cases, (20, 100), random_actions=names[1:])
 
 
+def recorded_protocol(name: str) -> RecordedProtocol:
+    """What goes with recordings of the robot of that name."""
+    known = preset_of(name).recorded
+    return RecordedProtocol(name, name) if known is None else known
+
+
 def source_of(scene: Scene) -> Source:
     """Whose initial states validate models of a scene: its preset's task, or itself."""
     task = preset_of(scene.name).task
@@ -112,11 +124,13 @@ __all__ = [
     "TASKS",
     "EvaluationProtocol",
     "Preset",
+    "RecordedProtocol",
     "Robot",
     "Source",
     "load_scene",
     "make_task",
     "preset_of",
     "protocol_of",
+    "recorded_protocol",
     "source_of",
 ]

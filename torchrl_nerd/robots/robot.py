@@ -34,6 +34,24 @@ class EvaluationProtocol:
 
 
 @dataclass(frozen=True)
+class RecordedProtocol:
+    """What goes with recordings of a robot.
+
+    | field | meaning |
+    |---|---|
+    | ``scene`` | name of the scene that has the recorded robot's mass and frame rate |
+    | ``model`` | shipped model that was fitted to such recordings |
+    | ``parameters`` | published physical parameters, SI units, where a fit begins |
+    | ``published`` | what -> error, such as ``position_error_m`` -> mean, m or rad |
+    """
+
+    scene: str
+    model: str
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Preset:
     """How the models of one scene are made and measured.
 
@@ -48,6 +66,7 @@ class Preset:
       scene's sampling ranges |
     | ``exports`` | which checkpoint of a run is the model: the best one or the last |
     | ``unseen_terrain`` | test rollouts over kinds of ground that no training data have |
+    | ``recorded`` | what goes with recordings of it |
     """
 
     protocol: Callable[[], EvaluationProtocol]
@@ -58,6 +77,7 @@ class Preset:
     strategy: str | None = None
     exports: Literal["best", "last"] = "best"
     unseen_terrain: Callable[[], EvaluationProtocol] | None = None
+    recorded: RecordedProtocol | None = None
 
 
 @dataclass(frozen=True)

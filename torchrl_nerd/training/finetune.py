@@ -1,14 +1,14 @@
-"""Fine-tuning on recorded tosses: rollouts over the impact, few epochs, frozen statistics.
+"""Fine-tuning on recorded trajectories: rollouts from recorded states, few epochs.
 
-One epoch shows every window of the training tosses once, as in the paper's code. The same
-class trains from scratch, for comparison, and on simulated tosses.
+Weights follow the gradient of a rollout's error. The physical parameters of an analytic
+step are fitted without gradients. Normalisation statistics stay as they are. One epoch
+shows every window of the training trajectories once.
 """
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -16,139 +16,134 @@ from tensordict import TensorDict
 from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
+from torchrl_nerd.analytic import FreeBodyPenaltyStep
+from torchrl_nerd.analytic.free_body import PARAMETERS
 from torchrl_nerd.configs import FinetuneConfig
-from torchrl_nerd.data.cube_tosses import Tosses
-from torchrl_nerd.evaluation.parameter_fit import WINDOWS
-from torchrl_nerd.evaluation.toss_error import STATES
-from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.data.recorded import TORQUE, Recording
+from torchrl_nerd.dynamics import Model, dynamics_of
+from torchrl_nerd.evaluation.recorded_error import Errors, error_key, window_errors
+from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
+from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training.convergence import converged, score
 from torchrl_nerd.training.low_rank import add_low_rank, merge_low_rank
-from torchrl_nerd.training.physics_fit import fit_physics
-from torchrl_nerd.training.pose_loss import pose_loss, rollout
-from torchrl_nerd.training.symmetry import Isometry, find_isometries
-from torchrl_nerd.training.toss_view import TossView
+from torchrl_nerd.training.physics_fit import WINDOWS, fit_flight, fit_parameters
 
-VALIDATION_STRIDE = 5  # of the validation tosses' sub-trajectories, which overlap
-IMAGES = 8  # isometries per batch
-WARMUP = 10  # updates over which step sizes rise
+VALIDATION_STRIDE = 5  # of the validation windows, which overlap
+WARMUP = 10  # updates over which the step size rises
+CAN_LEARN = (NeRD, FreeBodyPenaltyStep)
+SCALES = {"m": 0.05, "rad": 1.0}  # errors that weigh alike
 BAR = "epochs {n:.2f}/{total:.2f} |{bar}| {elapsed}<{remaining}{postfix}"
+
+Curve = Sequence[Mapping[str, float]]
+"""Validation errors by ``epoch`` and ``seconds``, such as ``position_m``."""
 
 
 class FineTuner:
-    """Trains a model on windows of tosses; `run` returns the best one on validation.
+    """Trains a model on windows of recorded trajectories; `run` returns the best one.
 
     Args:
-        model: pretrained; left as it is, and trained on its device. Its statistics are
-            frozen.
-        tosses: recorded.
-        train: numbers of the tosses to train on.
-        validation: numbers of the tosses that choose the best model and when to stop.
+        model: learned or hybrid, or an analytic step; left as it is, and trained on its
+            device.
+        recording: trajectories of its scene.
+        train: numbers of the trajectories to train on, ``(n,)``.
+        validation: numbers of the trajectories that choose the best model and when to
+            stop.
         config: how.
         quiet: no progress bar.
         keep: called with every model that is better than all before.
 
     Raises:
-        ValueError: tosses that are too short, or physics to fit without a simulator.
+        SettingError: an update that the model does not have.
+        ValueError: trajectories that are too short.
     """
 
     def __init__(
         self,
-        model: NeRD,
-        tosses: Tosses,
+        model: Model,
+        recording: Recording,
         train: Tensor,
         validation: Tensor,
         config: FinetuneConfig,
         quiet: bool = False,
-        keep: Callable[[NeRD], object] | None = None,
+        keep: Callable[[Model], object] | None = None,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.tosses, self.quiet = config, tosses, quiet
-        self.train = train
-        self.model, self.keep = copy.deepcopy(model), keep
-        self.view = TossView(model.scene, tosses, config, model.device)
-        states = STATES if config.update == "physics" else config.sequence_length + 1
-        self.starts = self.view.starts(states, train)
-        self.checks = self.view.starts(STATES, validation)[::VALIDATION_STRIDE]
-        for name, found in (("training", self.starts), ("validation", self.checks)):
+        is_fit = isinstance(model, FreeBodyPenaltyStep)
+        self.update = config.update or ("physics" if is_fit else "all")
+        if (self.update == "physics") != is_fit or not isinstance(model, CAN_LEARN):
+            raise SettingError(
+                "expected update 'physics' for a free body's analytic step, 'all', "
+                f"'head' or 'low-rank' for a network, got '{self.update}' for "
+                f"{type(model).__name__}"
+            )
+        self.config, self.recording, self.quiet = config, recording, quiet
+        self.model, self.train, self.keep = copy.deepcopy(model), train, keep
+        states = config.states if is_fit else config.sequence_length + 1
+        self.starts = recording.starts(states, train)
+        self.checks = recording.starts(config.states, validation)[::VALIDATION_STRIDE]
+        for name, found, least in (
+            ("training", self.starts, states),
+            ("validation", self.checks, config.states),
+        ):
             if len(found) == 0:
                 raise ValueError(
-                    f"expected {name} tosses that are long enough, got none"
+                    f"expected {name} trajectories of at least {least} states, got none"
                 )
-        if config.update == "physics" and not isinstance(model, HybridNeRD):
-            raise SettingError(
-                "expected a model with a simulator for update 'physics', got another: "
-                "give update 'all', 'head' or 'low-rank'"
-            )
-        network = cast(nn.Module, self.model.network)
-        if config.update == "low-rank":
-            add_low_rank(network, config.rank)
-        for name, weight in network.named_parameters():
-            is_chosen = config.update != "head" or "head" in name
-            if config.update == "low-rank":
-                is_chosen = ".parametrizations." in name and "original" not in name
-            weight.requires_grad_(is_chosen)
-        chosen = [w for w in network.parameters() if w.requires_grad]
-        groups = [{"params": chosen, "lr": config.lr}]
-        if isinstance(model, HybridNeRD):
-            simulator = cast(HybridNeRD, self.model).analytic_step
-            physics = [simulator.raw]
-            groups.append({"params": physics, "lr": config.physics_lr})
-        if self.view.encoder is not None:
-            weights = list(self.view.encoder.parameters())
-            groups.append({"params": weights, "lr": config.lr})
-        self.optimizer = torch.optim.Adam(groups)
-        self.peaks = [group["lr"] for group in groups]
         self.curve: list[dict[str, float]] = []
-
-    @cached_property
-    def isometries(self) -> tuple[Isometry, ...]:
-        """What windows are shown as: a search that the fit of physics does without."""
-        found = find_isometries(self.model.scene)
-        return found if self.config.use_symmetry else found[:1]
+        if isinstance(self.model, NeRD):
+            chosen = choose_weights(self.model.network, self.update, config.rank)
+            self.optimizer = torch.optim.Adam(chosen, lr=config.lr)
 
     @property
     def updates_per_epoch(self) -> int:
         """Updates that show every window once."""
         return -(-len(self.starts) // self.config.batch_size)
 
-    def run(self) -> NeRD:
-        """Train until the epochs are over or validation stands still."""
+    def run(self) -> Model:
+        """Train until the epochs are over or validation no longer improves."""
         self._began = time.monotonic()
         self._consider(0.0)
-        if self.config.update == "physics":
+        if self.update == "physics":
             self._fit()
         else:
             self._descend()
-        self.model, self.view.encoder = self._best
+        self.model = self._best
         return self.model
 
     def _bar(self, count: int, per_epoch: int) -> tqdm:
         scale = 1.0 / per_epoch
         bar = tqdm(total=count, unit_scale=scale, bar_format=BAR, disable=self.quiet)
-        bar.set_postfix(self._last)
+        bar.set_postfix_str(self._last)
         return bar
 
     def _fit(self) -> None:
-        """Physics alone, without gradients; an evaluation counts as its share of one."""
-        model, evaluations = cast(HybridNeRD, self.model), self.config.evaluations
-        epoch = len(self.starts)
+        """Physical parameters, without gradients; a window counts as part of an epoch."""
+        step, scene = cast(FreeBodyPenaltyStep, self.model), self.model.scene
+        epoch, evaluations, seen = len(self.starts), self.config.evaluations, 0
         planned = evaluations * sum(min(windows, epoch) for windows in WINDOWS)
-        seen = 0
 
-        def show(windows: int) -> None:
+        def error_of(values: dict[str, float], rows: Tensor) -> float:
             nonlocal seen
-            seen += windows
-            bar.update(windows)
+            seen += len(rows)
+            bar.update(len(rows))
+            step.set_values(values)
+            return float(weighted_error(scene, self.errors(rows)).mean())
 
+        flight = fit_flight(scene, self.recording.select(self.train))
+        first, seed = step.values() | flight, self.config.seed
+        stages = fit_parameters(
+            error_of, first, PARAMETERS, self.starts, evaluations, seed
+        )
         with self._bar(planned, epoch) as bar:
-            for _ in fit_physics(model, self.view, self.train, evaluations, show):
+            for found in stages:
+                step.set_values(found)
                 self._consider(seen / epoch)
-                bar.set_postfix(self._last)
+                bar.set_postfix_str(self._last)
 
     def _descend(self) -> None:
-        """All that may change, along the gradient of rollouts."""
+        """The chosen weights, along the gradient of rollouts."""
         config, waited = self.config, 0
         total = max(1, round(config.epochs * self.updates_per_epoch))
         generator = Generator().manual_seed(config.seed)
@@ -159,97 +154,130 @@ class FineTuner:
                     order = torch.randperm(len(self.starts), generator=generator)
                 pick, order = order[: config.batch_size], order[config.batch_size :]
                 is_short = update <= config.short_history_fraction * total
-                length = (
-                    max(1, config.sequence_length // 2)
-                    if is_short
-                    else config.sequence_length
-                )
+                length = config.sequence_length // (2 if is_short else 1)
                 rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
-                for group, peak in zip(
-                    self.optimizer.param_groups, self.peaks, strict=True
-                ):
-                    group["lr"] = peak * rate
-                loss = self._update(self._batch(self.starts[pick], length, generator))
+                self.optimizer.param_groups[0]["lr"] = config.lr * rate
+                loss = self._step(self.starts[pick], max(1, length))
                 bar.update()
                 if update % config.validate_every == 0 or update == total:
                     is_better = self._consider(update / self.updates_per_epoch, loss)
-                    bar.set_postfix(self._last)
+                    bar.set_postfix_str(self._last)
                     waited = 0 if is_better or is_short else waited + 1
                     if waited >= config.patience:
                         break
 
-    def _batch(self, starts: Tensor, length: int, generator: Generator) -> TensorDict:
-        """Windows ``[rows, length + 1]``, mirrored and with a little noise."""
-        window = self.view.windows(starts, length + 1)
-        order = torch.randperm(len(self.isometries), generator=generator)[:IMAGES]
-        parts = window.chunk(len(order))
-        images = [
-            self.isometries[i](cast(TensorDict, part))
-            for i, part in zip(order.tolist(), parts, strict=False)
-        ]
-        return cast(TensorDict, TensorDict.cat(images)).to(self.model.device)
-
-    def _update(self, window: TensorDict) -> float:
-        """One step of the optimiser; its loss."""
-        config = self.config
-        self.model.train()
+    def _step(self, starts: Tensor, length: int) -> float:
+        """One step of the optimiser on rollouts of ``length`` steps; its loss."""
+        window = self.recording.windows(starts, length + 1).to(self.model.device)
         with torch.enable_grad():
-            start, qvel, qpos = self.view.observe(window)
-            start = start + config.noise * torch.nn.functional.pad(
-                torch.randn_like(start[:, :3]), (0, 4)
-            )
-            path = rollout(self.model, start, qvel, qpos.shape[1])
-            step = torch.arange(1, qpos.shape[1] + 1)
-            loss = pose_loss(path, qpos, step % config.every == 0)
+            loss = rollout_error(self.model, window).mean()
         self.optimizer.zero_grad()
         loss.backward()
-        for group in self.optimizer.param_groups:
-            norm = nn.utils.clip_grad_norm_(group["params"], config.clip)
-            if not norm.isfinite():
-                return float("nan")
+        weights = self.optimizer.param_groups[0]["params"]
+        norm = nn.utils.clip_grad_norm_(weights, self.config.clip)
+        if not norm.isfinite():
+            return float("nan")
         self.optimizer.step()
         return float(loss.detach())
 
     def _consider(self, epoch: float, loss: float = float("nan")) -> bool:
         """Validate, add to the curve, and keep the model if it is the best so far."""
-        distance, angle = self.errors(self.checks)
-        point = {
-            "epoch": epoch,
-            "seconds": time.monotonic() - self._began,
-            "loss": loss,
-            "position_m": float(distance.mean()),
-            "orientation_rad": float(angle.mean()),
-        }
+        scene = self.model.scene
+        point = {"epoch": epoch, "seconds": time.monotonic() - self._began}
+        point["loss"] = loss
+        for quantity, error in self.errors(self.checks).items():
+            point[error_key(scene, quantity, "_")] = float(error.mean())
         best = min((score(before) for before in self.curve), default=None)
         self.curve.append(point)
         is_better = best is None or score(point) < best
         if is_better:
-            self._best = self._frozen(), copy.deepcopy(self.view.encoder)
+            self._best = self._frozen()
             if self.keep is not None:
-                self.keep(self._best[0])
+                self.keep(self._best)
         return is_better
 
     @property
-    def _last(self) -> dict[str, str]:
-        """The curve's last point, for the progress bar."""
-        last = self.curve[-1]
-        shown = {"m": last["position_m"], "rad": last["orientation_rad"]}
-        return {name: f"{value:.4f}" for name, value in shown.items()}
+    def _last(self) -> str:
+        """The errors of the curve's last point, for the progress bar."""
+        return ", ".join(f"{k} {v:.4f}" for k, v in errors_of(self.curve[-1]).items())
 
-    def errors(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors of sub-trajectories against the recorded poses; see `TossView.errors`.
+    @torch.no_grad()
+    def errors(self, rows: Tensor) -> Errors:
+        """`window_errors` of the model as it is now, from ``rows`` on."""
+        dynamics = NeRDDynamics(self.model)
+        return window_errors(dynamics, self.recording, rows, self.config.states)
 
-        Args:
-            rows: as of `TossView.starts`.
-        """
-        return self.view.errors(self.model, rows, self.tosses)
-
-    def _frozen(self) -> NeRD:
+    def _frozen(self) -> Model:
         """A copy of the model as it is now, low-rank changes added to its weights."""
         model = copy.deepcopy(self.model)
-        merge_low_rank(cast(nn.Module, model.network))
+        if isinstance(model, NeRD):
+            merge_low_rank(model.network)
         return model.requires_grad_(True).eval()
 
     def card(self) -> dict[str, Any]:
-        """Configuration, curve and convergence, for a checkpoint's card."""
-        return {"finetuning": {**asdict(self.config), **converged(self.curve)}}
+        """Configuration and convergence, for a checkpoint's card."""
+        how = asdict(self.config) | {"update": self.update}
+        return {"finetuning": {**how, **converged(self.curve)}}
+
+
+def choose_weights(network: nn.Module, update: str, rank: int) -> list[nn.Parameter]:
+    """Mark what an update changes, in place, and return it.
+
+    Args:
+        network: of the model.
+        update: ``"all"``, ``"head"`` (the last layer) or ``"low-rank"``.
+        rank: of low-rank changes.
+    """
+    if update == "low-rank":
+        add_low_rank(network, rank)
+    for name, weight in network.named_parameters():
+        is_chosen = update != "head" or "head" in name
+        if update == "low-rank":
+            is_chosen = ".parametrizations." in name and "original" not in name
+        weight.requires_grad_(is_chosen)
+    return [weight for weight in network.parameters() if weight.requires_grad]
+
+
+def rollout_error(model: Model, window: TensorDict) -> Tensor:
+    """`weighted_error` of a rollout from a window's first state, with gradients.
+
+    Args:
+        model: learned or hybrid.
+        window: ``[rows, steps + 1]``, see `Recording.windows`.
+    """
+    steps = window.batch_size[1] - 1
+    dynamics = NeRDDynamics(model, differentiable=True)
+    path = open_loop(dynamics, window[:, 0], steps, window[TORQUE])
+    errors = position_errors(model.scene, window[QPOS][:, 1:], path)
+    return weighted_error(model.scene, errors)
+
+
+def weighted_error(scene: Scene, errors: Errors) -> Tensor:
+    """Sum of all errors, each by its scale, ``(rows, steps)``.
+
+    Not squared: after a first impact that was missed all that follows is far off, and must
+    not outweigh the impacts that can be learned.
+    """
+    parts = [error / SCALES[unit_of(scene, name)] for name, error in errors.items()]
+    return torch.stack(parts).sum(0)
+
+
+def errors_of(point: Mapping[str, float]) -> dict[str, float]:
+    """The errors of a curve's point, by quantity and unit."""
+    return {k: v for k, v in point.items() if k not in ("epoch", "seconds", "loss")}
+
+
+def score(point: Mapping[str, float]) -> float:
+    """All errors by the scales of the loss; infinite where one is no number."""
+    found = sum(v / SCALES[k.rsplit("_", 1)[1]] for k, v in errors_of(point).items())
+    return found if found == found else float("inf")
+
+
+def converged(curve: Curve) -> dict[str, float]:
+    """Epochs and seconds until the error was within 5% of the run's lowest, and that."""
+    scores = [score(point) for point in curve]
+    lowest = min(scores)
+    first = next(p for p, x in zip(curve, scores, strict=True) if x <= 1.05 * lowest)
+    best = curve[scores.index(lowest)]
+    found = {f"converged_{key}": first[key] for key in ("epoch", "seconds")}
+    return found | {f"validation_{k}": v for k, v in errors_of(best).items()}

@@ -1,29 +1,39 @@
-"""One run of fine-tuning: from a file of tosses to a checkpoint."""
+"""One run of fine-tuning: from a recorded log to a checkpoint."""
 
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from torchrl_nerd.checkpoint import (
-    CARD,
-    from_pretrained,
-    make_card,
-    save_checkpoint,
-    shipped_models,
-)
+from torchrl_nerd.analytic import FreeBodyPenaltyStep
+from torchrl_nerd.checkpoint import CARD, from_pretrained, make_card, save_checkpoint
 from torchrl_nerd.configs import FinetuneConfig
-from torchrl_nerd.data.recorded import SHIPPED, load_tosses
+from torchrl_nerd.data.log_files import load_recording
+from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import read_json, write_json
-from torchrl_nerd.modules.hybrid import HybridNeRD
-from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import recorded_protocol
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.tensor_files import write_tensors
 from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.toss_models import from_scratch, pretrain
 
-PRETRAINED_NAME = f"{SHIPPED}-pretrained"
-"""The shipped model that has seen simulated tosses alone."""
+ANALYTIC = "analytic"
+
+
+def start_model(scene: Scene, name: str | None = None) -> Model:
+    """The model that fine-tuning starts from.
+
+    Args:
+        scene: of the recording.
+        name: a shipped model, a checkpoint folder, or ``"analytic"``: a step without
+            weights whose physical parameters are the published ones where there are such,
+            else the scene's own. None: analytic where there are published ones, else the
+            scene's shipped model.
+    """
+    published = recorded_protocol(scene.name).parameters
+    if name != ANALYTIC and (name is not None or not published):
+        return from_pretrained(name or scene.name, scene)
+    step = FreeBodyPenaltyStep(scene)
+    step.set_values(dict(published))
+    return step
 
 
 def finetune(
@@ -32,53 +42,40 @@ def finetune(
     out: Path,
     config: FinetuneConfig,
     start: str | None = None,
-    scratch: str | None = None,
     quiet: bool = False,
     device: torch.device | str = "cpu",
 ) -> dict[str, Any]:
-    """Train on the training tosses of a file; writes checkpoint and ``curve.json``.
+    """Train on a log's training trajectories; writes checkpoint and ``curve.json``.
 
     Args:
-        scene: of the cube.
-        path: of the recorded tosses.
+        scene: of the recorded robot.
+        path: of the log, npz or CSV.
         out: folder of the checkpoint.
         config: how.
-        start: a shipped model's name or a checkpoint folder; ``"new"`` pretrains one;
-            the shipped pretrained model where None.
-        scratch: fresh weights instead; see `from_scratch`.
+        start: see `start_model`.
         quiet: no progress bar.
-        device: of the model; the tosses stay on the processor.
+        device: of the model; the recording stays on the processor.
 
     Returns:
-        The card of the best model on the validation tosses.
+        The card of the best model on the validation trajectories.
     """
-    tosses, split = load_tosses(path, scene)
-    if scratch is not None:
-        model = from_scratch(scene, tosses.select(split["train"]), scratch, config.seed)
-    elif start == "new" or (start is None and PRETRAINED_NAME not in shipped_models()):
-        model, tuner = pretrain(scene, quiet=quiet, device=device)
-        card = make_card(model, {"pretraining": tuner.card()["finetuning"]})
-        save_checkpoint(model, out / "pretrained", card)
-    else:
-        model = from_pretrained(start or PRETRAINED_NAME, scene)
+    recording, split = load_recording(path, scene)
+    model = start_model(scene, start).to(device)
     made = {
-        "start": "fresh weights" if scratch else start or PRETRAINED_NAME,
+        "start": start or (ANALYTIC if model.kind == ANALYTIC else scene.name),
         "device": str(device),
         "threads": torch.get_num_threads(),
-        "tosses": {name: len(members) for name, members in split.items()},
+        "trajectories": {name: len(members) for name, members in split.items()},
     }
 
-    def keep(best: NeRD) -> None:
-        figures = {**made, **tuner.card()["finetuning"]}
-        if isinstance(best, HybridNeRD):
-            figures["simulator"] = best.analytic_step.values()
-        card = make_card(best, {"finetuning": figures})
-        save_checkpoint(best, out, card)
+    def keep(best: Model) -> None:
+        results = {**made, **tuner.card()["finetuning"]}
+        if isinstance(best, FreeBodyPenaltyStep):
+            results["parameters"] = best.values()
+        save_checkpoint(best, out, make_card(best, {"finetuning": results}))
         write_json(out / "curve.json", {"curve": tuner.curve})
 
     parts = split["train"], split["validation"]
-    tuner = FineTuner(model.to(device), tosses, *parts, config, quiet, keep)
+    tuner = FineTuner(model, recording, *parts, config, quiet, keep)
     keep(tuner.run())
-    if tuner.view.encoder is not None:
-        write_tensors(out / "encoder.safetensors", tuner.view.encoder.state_dict())
     return read_json(out / CARD)

@@ -1,45 +1,110 @@
-"""Physics of recorded tosses: a simulator's numbers with the least error, no gradients."""
+"""Physical parameters with the least error along recorded trajectories, without gradients.
 
-from collections.abc import Callable, Iterator
+Over an impact the slope of a rollout says little of its neighbours, so the error is
+modelled from its values alone: COBYQA (T. M. Ragonneau, PhD thesis, 2022), scipy's
+trust-region method with quadratic models. Gravity and the centre of mass follow from
+flight alone, by least squares.
+"""
 
-from torch import Tensor
+from collections.abc import Callable, Iterator, Sequence
 
-from torchrl_nerd.analytic.free_body import PARAMETERS
-from torchrl_nerd.evaluation.parameter_fit import fit_flight, fit_parameters
-from torchrl_nerd.evaluation.toss_error import STATES
-from torchrl_nerd.modules.hybrid import HybridNeRD
-from torchrl_nerd.training.toss_view import TossView
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Generator, Tensor
+
+from torchrl_nerd.analytic.free_body import SCALED, SHIFTED
+from torchrl_nerd.data.recorded import CLEAR, Recording
+from torchrl_nerd.geometry.rotations import rotate_inverse
+from torchrl_nerd.scenes import Scene
+
+WINDOWS = (150, 400)  # of the two stages: first coarsely, then finely
+RADII = (0.2, 0.1)  # of the first steps, in units of `SCALED` and `SHIFTED`
+CLOSE = 0.004  # the same of the last
+LOST = 1e3  # error of parameters with which a rollout is not finite
+SHORTEST = 0.05  # s of a flight that counts
+CENTRE = ("centre_x", "centre_y", "centre_z")
 
 
-def fit_physics(
-    model: HybridNeRD,
-    view: TossView,
-    train: Tensor,
+def fit_parameters(
+    error_of: Callable[[dict[str, float], Tensor], float],
+    first: dict[str, float],
+    names: Sequence[str],
+    starts: Tensor,
     evaluations: int,
-    show: Callable[[int], object],
+    seed: int = 0,
 ) -> Iterator[dict[str, float]]:
-    """Give the model the best parameters found, after each stage of `fit_parameters`.
+    """Parameters with the least error after each stage: few windows, then more.
 
     Args:
-        model: changed in place, its simulator alone.
-        view: of the tosses.
-        train: numbers of the tosses to fit to.
+        error_of: parameters and rows of first states -> error, near 1.
+        first: parameters to begin with.
+        names: which of them to change.
+        starts: rows of the first states of training windows, to draw from.
         evaluations: of each stage.
-        show: called with the number of windows of every evaluation.
-
-    Yields:
-        The parameters, which the model then has.
+        seed: of the draw.
     """
+    generator = Generator().manual_seed(seed)
+    order = torch.randperm(len(starts), generator=generator)
+    for windows, radius in zip(WINDOWS, RADII, strict=True):
+        origin, rows = first, starts[order[:windows]]
 
-    def errors_of(values: dict[str, float], rows: Tensor) -> tuple[Tensor, Tensor]:
-        model.analytic_step.set_values(values)
-        show(len(rows))
-        seen = slice(view.every - 1, None, view.every)
-        distance, angle = view.errors(model, rows)
-        return distance[:, seen], angle[:, seen]
+        def score(x: np.ndarray, origin: dict = origin, rows: Tensor = rows) -> float:
+            error = error_of(moved(origin, names, x), rows)
+            return error if np.isfinite(error) else LOST
 
-    flight = fit_flight(model.scene, view.seen.select(train), view.every)
-    first, starts = model.analytic_step.values() | flight, view.starts(STATES, train)
-    for found in fit_parameters(errors_of, first, PARAMETERS, starts, evaluations):
-        model.analytic_step.set_values(found)
-        yield found
+        options = {
+            "maxfev": evaluations,
+            "initial_tr_radius": radius,
+            "final_tr_radius": CLOSE,
+        }
+        found = minimize(score, np.zeros(len(names)), method="COBYQA", options=options)
+        first = moved(origin, names, found.x)
+        yield first
+
+
+def moved(
+    values: dict[str, float], names: Sequence[str], x: np.ndarray
+) -> dict[str, float]:
+    """Parameters with those named changed by ``x``, in units of `SCALED`, `SHIFTED`."""
+    after = dict(values)
+    for name, by in zip(names, x.tolist(), strict=True):
+        if name in SCALED:
+            after[name] = values[name] * float(np.exp(SCALED[name] * by))
+        else:
+            after[name] = values[name] + SHIFTED[name] * by
+    return after
+
+
+def fit_flight(scene: Scene, recording: Recording) -> dict[str, float]:
+    """Gravity (m/s^2) and centre of mass (m, body axes) from first flights.
+
+    The centre of mass ``p + R c`` of a body at ``p``, turned by ``R``, draws a parabola:
+    ``p + R c = p0 + v0 t - g t^2 / 2``, linear in all unknowns. Empty where no trajectory
+    flies long enough.
+
+    Args:
+        scene: a single free body.
+        recording: trajectories.
+    """
+    flies = scene.clearances(recording.qpos).amin(-1) > CLEAR
+    rows, values = [], []
+    for first, end in zip(recording.offsets[:-1], recording.offsets[1:], strict=True):
+        down = (~flies[first:end]).nonzero()
+        count = int(down[0]) if len(down) else int(end - first)
+        if count < 3 or count * recording.frame < SHORTEST:
+            continue
+        qpos = recording.qpos[first : first + count]
+        time = recording.frame * torch.arange(count).to(qpos)
+        line = torch.stack((torch.ones_like(time), time), 1)
+        apart = torch.eye(count).to(qpos) - line @ torch.linalg.pinv(line)
+        axes = torch.eye(3).to(qpos)
+        for axis in range(3):
+            arm = rotate_inverse(qpos[:, 3:7], axes[axis].expand(count, 3))
+            drop = 0.5 * time.square() * (axis == 2)
+            rows.append(apart @ torch.cat((-arm, -drop[:, None]), 1))
+            values.append(apart @ qpos[:, axis])
+    if not rows:
+        return {}
+    found = torch.linalg.lstsq(torch.cat(rows), torch.cat(values)[:, None]).solution
+    return dict(zip((*CENTRE, "gravity"), found[:, 0].tolist(), strict=True))

@@ -4,14 +4,10 @@ import pytest
 import torch
 
 from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
-from torchrl_nerd.data.cube_tosses import Tosses
-from torchrl_nerd.evaluation.parameter_fit import (
-    CENTRE,
-    fit_flight,
-    fit_parameters,
-    moved,
-)
-from torchrl_nerd.evaluation.toss_error import path_errors
+from torchrl_nerd.data.recorded import Recording
+from torchrl_nerd.evaluation.rollout_error import position_errors
+from torchrl_nerd.training.finetune import weighted_error
+from torchrl_nerd.training.physics_fit import CENTRE, fit_flight, fit_parameters, moved
 
 TOSSES, STATES = 12, 16
 
@@ -25,7 +21,8 @@ def made(scene, step, generator, height):
         for _ in range(STATES - 1):
             path.append(step(*path[-1])[:2])
     qpos, qvel = (torch.stack(x, 1).flatten(0, 1) for x in zip(*path, strict=True))
-    return Tosses(qpos, qvel, STATES * torch.arange(TOSSES + 1))
+    offsets = STATES * torch.arange(TOSSES + 1)
+    return Recording(qpos, qvel, qpos[:, :0], offsets, scene.control_step)
 
 
 def test_flight_tells_gravity_and_the_centre_of_mass(real_cube, generator):
@@ -34,9 +31,7 @@ def test_flight_tells_gravity_and_the_centre_of_mass(real_cube, generator):
     truth = {"gravity": 9.7, **dict(zip(CENTRE, drawn.tolist(), strict=True))}
     step.set_values(truth)
     tosses = made(real_cube, step, generator, height=1.0)
-    for every in (1, 3):
-        found = fit_flight(real_cube, tosses, every)
-        assert found == pytest.approx(truth, abs=1e-5, rel=1e-4)
+    assert fit_flight(real_cube, tosses) == pytest.approx(truth, abs=1e-5, rel=1e-4)
 
 
 def test_tosses_without_flight_tell_nothing(real_cube, generator):
@@ -45,11 +40,11 @@ def test_tosses_without_flight_tell_nothing(real_cube, generator):
 
 
 def test_a_fit_lowers_the_error(real_cube, generator):
-    step = FreeBodyPenaltyStep(real_cube, substeps=2)
+    step = FreeBodyPenaltyStep(real_cube, num_substeps=2)
     tosses = made(real_cube, step, generator, height=0.0)
     truth, rows = step.values(), tosses.starts(STATES)
 
-    def errors_of(values, rows):
+    def error_of(values, rows):
         step.set_values(values)
         window = tosses.windows(rows, STATES)
         qpos, qvel, path = window["qpos"][:, 0], window["qvel"][:, 0], []
@@ -57,12 +52,13 @@ def test_a_fit_lowers_the_error(real_cube, generator):
             for _ in range(STATES - 1):
                 qpos, qvel, _ = step(qpos, qvel)
                 path.append(qpos)
-        return path_errors(torch.stack(path, 1), window["qpos"][:, 1:])
+        errors = position_errors(real_cube, window["qpos"][:, 1:], torch.stack(path, 1))
+        return float(weighted_error(real_cube, errors).mean())
 
     names = ("friction", "gravity")
     wrong = {**truth, "gravity": 1.02 * truth["gravity"], "friction": 0.2}
-    *_, found = fit_parameters(errors_of, wrong, names, rows, evaluations=25)
-    before, after = (errors_of(x, rows)[0].mean() for x in (wrong, found))
+    *_, found = fit_parameters(error_of, wrong, names, rows, evaluations=25)
+    before, after = (error_of(x, rows) for x in (wrong, found))
     assert after < 0.2 * before
     assert {k: found[k] for k in PARAMETERS if k not in names} == {
         k: truth[k] for k in PARAMETERS if k not in names

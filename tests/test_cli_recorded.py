@@ -1,11 +1,12 @@
-"""``nerd`` on recorded tosses: data, finetune, eval, and refusals in one sentence."""
+"""``nerd`` on recorded logs: data, finetune, eval, and refusals in one sentence."""
 
 import json
 
 import numpy as np
 import pytest
-from helpers import EXCERPT
+from helpers import EXCERPT, simulated
 
+from torchrl_nerd import load_scene
 from torchrl_nerd.cli import main
 
 TINY = [
@@ -39,7 +40,7 @@ def half_widths(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["cube", "cube_real"])
-def test_recorded_tosses_become_a_data_set(name, tmp_path, capsys):
+def test_recorded_logs_become_a_data_set(name, tmp_path, capsys):
     out, figures = tmp_path / "set", tmp_path / "figures.json"
     argv = ["data", name, "--from", str(EXCERPT), "--out", str(out)]
     assert main([*argv, "--json", str(figures)]) == 0
@@ -48,23 +49,51 @@ def test_recorded_tosses_become_a_data_set(name, tmp_path, capsys):
     assert (out / "data.json").exists()
 
 
-def test_what_was_fine_tuned_is_measured(tmp_path, capsys):
+@pytest.mark.parametrize("update", ["physics", "all"])
+def test_what_was_fine_tuned_is_measured(update, tmp_path, capsys):
     out, figures = tmp_path / "run", tmp_path / "figures.json"
-    argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", str(out), *TINY]
-    assert main([*argv, "--scratch", "residual"]) == 0
-    assert "epochs 0.02/0.02" in capsys.readouterr().err
+    argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", str(out)]
+    how = ["--evaluations", "1"]
+    if update == "all":
+        how = ["--model", "cube_real", *TINY]
+    assert main([*argv, *how]) == 0
+    assert update == "physics" or "epochs 0.02/0.02" in capsys.readouterr().err
     assert {p.name for p in out.iterdir()} == {
         "model.safetensors",
         "card.json",
         "curve.json",
     }
+    results = json.loads((out / "card.json").read_text())["finetuning"]
+    assert {"converged_epoch", "converged_seconds", "start", "device"} <= set(results)
+    assert results["update"] == update and results["validation_position_m"] > 0
+    assert ("parameters" in results) == (update == "physics")
     argv = ["eval", "cube", "--data", str(EXCERPT), "--model", str(out)]
-    assert main([*argv, "--json", str(figures)]) == 0
+    assert main([*argv, "--json", str(figures), "--baselines"]) == 0
     content = json.loads(figures.read_text())
+    assert {"scene", "split", "windows", "against", "others"} <= set(content)
+    assert {"no motion", "MuJoCo", "model"} <= set(content["others"])
     for key in ("position_error_m", "orientation_error_rad"):
-        assert {"mean", "final", "p95", "interval"} <= set(content[key])
+        names = {"mean", "final", "median", "p95", "interval", "first"}
+        assert names == set(content[key])
         assert 0 < content[key]["mean"] < content[key]["p95"] < 3
     assert "ContactNets" in capsys.readouterr().out
+
+
+def test_any_robots_log_goes_through_all_commands(generator, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log = simulated(load_scene("cartpole"), generator, trajectories=12, states=12)
+    names = ("qpos", "qvel", "joint_torque")
+    arrays = {name: getattr(log, name).numpy() for name in names}
+    np.savez("log.npz", trajectory_offsets=log.offsets, **arrays)
+    assert main("data cartpole --from log.npz --out set".split()) == 0
+    argv = "finetune cartpole --from log.npz --out run --states 10".split()
+    assert main([*argv, *TINY]) == 0
+    argv = "eval cartpole --data log.npz --states 10 --model run --json f.json"
+    assert main(argv.split()) == 0
+    content = json.loads(open("f.json").read())
+    assert content["scene"] == "cartpole" and content["windows"] == 12 * 3
+    errors = {key for key in content if "_error_" in key}
+    assert len(errors) == 2 and errors == set(content["others"]["model"])
 
 
 def test_wrong_units_are_refused_with_check_and_figure(half_widths, tmp_path, capsys):
@@ -81,7 +110,10 @@ def test_wrong_units_are_refused_with_check_and_figure(half_widths, tmp_path, ca
 def test_other_robots_and_splits_are_refused(tmp_path, capsys):
     out = str(tmp_path / "set")
     text = refusal(capsys, "data", "ant", "--from", str(EXCERPT), "--out", out)
-    assert "'ant'" in text and "cube" in text
+    assert "expected 'qpos'" in text and "position" in text
     assert "nowhere" in refusal(capsys, "eval", "cube", "--data", "nowhere.npz")
     argv = ["eval", "cube", "--data", str(EXCERPT), "--split", "best"]
     assert "'best'" in refusal(capsys, *argv)
+    argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", out]
+    argv += ["--model", "cube_real", "--update", "physics"]
+    assert "analytic" in refusal(capsys, *argv)

@@ -1,0 +1,199 @@
+"""Recorded logs become the states, transitions and windows they were."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import EXCERPT, simulated
+
+from torchrl_nerd import load_scene
+from torchrl_nerd.data.log_files import (
+    load_recording,
+    read_log,
+    read_transitions,
+    write_recording,
+)
+from torchrl_nerd.data.recorded import (
+    complete,
+    estimate_velocities,
+    free_fall,
+    split_trajectories,
+)
+from torchrl_nerd.geometry.manifold import integrate_pos
+
+
+def write_csv(path, header, *columns):
+    table = np.concatenate([np.asarray(c) for c in columns], 1)
+    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.17g")
+
+
+def numbers(log):
+    """The trajectory of every row, as a column."""
+    return log.trajectory_of(torch.arange(len(log.qpos)))[:, None]
+
+
+def same(a, b):
+    return all(
+        torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y
+        for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
+    )
+
+
+def test_csv_and_npz_give_the_same_tosses(log, real_cube, tmp_path):
+    header = "toss,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz"
+    write_csv(tmp_path / "log.csv", header, numbers(log), log.qpos, log.qvel)
+    assert same(read_log(tmp_path / "log.csv", real_cube), log)
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv"])
+def test_a_log_of_any_robot_comes_back(kind, generator, tmp_path):
+    scene = load_scene("cartpole")
+    log, path = simulated(scene, generator), tmp_path / f"log.{kind}"
+    time = log.frame * torch.arange(len(log.qpos))
+    if kind == "csv":
+        header = "trajectory,qpos_0,qpos_1,qvel_0,qvel_1,joint_torque_0,time"
+        columns = log.qpos, log.qvel, log.joint_torque, time[:, None]
+        write_csv(path, header, numbers(log), *columns)
+    else:
+        names = ("qpos", "qvel", "joint_torque")
+        arrays = {name: getattr(log, name).numpy() for name in names}
+        np.savez(path, trajectory=numbers(log)[:, 0], time=time, **arrays)
+    found, split = load_recording(path, scene)
+    assert found.frame == pytest.approx(log.frame)
+    assert same(replace(found, frame=log.frame, time=None), log)
+    assert sum(len(members) for members in split.values()) == len(log)
+    window = found.windows(found.starts(5)[:1], 5)
+    assert torch.equal(window["joint_torque"][0], log.joint_torque[:5])
+
+
+def test_positions_alone_are_enough_for_any_robot(generator):
+    scene = load_scene("cartpole")
+    log = simulated(scene, generator)
+    found = complete(replace(log, qvel=torch.full_like(log.qvel, torch.nan)), scene)
+    apart, speed = (found.qvel - log.qvel).norm(dim=1), log.qvel.norm(dim=1)
+    assert apart.median() < 0.2 * speed.median()
+
+
+def test_transitions_never_cross_from_toss_to_toss(recording):
+    data = recording.transitions()
+    ids = data["collector", "traj_ids"]
+    assert len(data) == len(recording.qpos) - len(recording)
+    moved = torch.linalg.vector_norm(
+        (data["next", "qpos"] - data["qpos"])[:, :3], dim=1
+    )
+    assert moved.max() < 2.0 * recording.frame * 2.0  # at most 2 m/s
+    follows = ids[1:] == ids[:-1]
+    assert torch.equal(data["next", "qpos"][:-1][follows], data["qpos"][1:][follows])
+
+
+def test_windows_are_consecutive_states_of_one_toss(recording):
+    starts = recording.starts(80)
+    assert torch.equal(
+        recording.trajectory_of(starts), recording.trajectory_of(starts + 79)
+    )
+    expected = (recording.offsets.diff() - 79).clamp_min(0).sum()
+    assert len(starts) == expected
+    window = recording.windows(starts[:5], 80)
+    assert torch.equal(window["qpos"][1, :-1], window["qpos"][0, 1:])
+
+
+def test_selected_tosses_are_those_asked_for(recording, generator):
+    numbers = torch.randperm(len(recording), generator=generator)[:4]
+    chosen = recording.select(numbers)
+    for i, number in enumerate(numbers.tolist()):
+        mine = chosen.qpos[chosen.offsets[i] : chosen.offsets[i + 1]]
+        own = recording.qpos[recording.offsets[number] : recording.offsets[number + 1]]
+        assert torch.equal(mine, own)
+
+
+def test_flight_goes_on_as_gravity_says(recording, real_cube):
+    """Half a frame of gravity makes a recorded velocity that of its pose's time."""
+    data = recording.transitions()
+    flies = (real_cube.clearances(data["qpos"]).amin(-1) > 0.02) & (
+        real_cube.clearances(data["next", "qpos"]).amin(-1) > 0.02
+    )
+    frame = recording.frame
+    fall = 0.5 * frame**2 * free_fall(recording)
+    ahead = data["qpos"][:, :3] + frame * data["qvel"][:, :3] + fall
+    apart = (ahead - data["next", "qpos"][:, :3])[flies]
+    assert flies.sum() > 50
+    assert apart.abs().median() < 5e-5  # m; without it 2e-4 along z
+
+
+def test_velocities_of_their_poses_own_time_are_kept(real_cube, generator):
+    log = simulated(real_cube, generator)
+    apart = complete(log, real_cube).qvel - log.qvel
+    assert apart.abs().max() < 0.1 * 9.81 * 0.5 * log.frame
+
+
+def test_velocities_from_poses_are_those_recorded(log, real_cube):
+    apart = estimate_velocities(log, real_cube) - log.qvel
+    assert apart[:, :3].norm(dim=-1).median() < 0.005  # m/s
+    assert apart[:, 3:].norm(dim=-1).median() < 0.02  # rad/s
+
+
+def test_velocities_of_steady_motion_are_exact(log, real_cube, generator):
+    qvel = torch.randn(6, generator=generator).double().expand(len(log.qpos), 6)
+    time = log.frame * torch.arange(len(log.qpos), dtype=torch.float64)[:, None]
+    start = log.qpos[:1].expand_as(log.qpos)
+    qpos = integrate_pos(real_cube.layout, start, time * qvel)
+    found = estimate_velocities(replace(log, qpos=qpos), real_cube)
+    torch.testing.assert_close(found, qvel, atol=1e-8, rtol=0)
+
+
+def test_poses_alone_are_enough(log, recording, real_cube):
+    poses = replace(log, qvel=torch.full_like(log.qvel, torch.nan))
+    found = complete(poses, real_cube).qvel
+    assert (found - recording.qvel).norm(dim=-1).median() < 0.02
+
+
+def test_the_split_is_the_published_one():
+    split = split_trajectories(510)
+    assert [len(x) for x in split.values()] == [380, 65, 65]
+    assert torch.equal(torch.cat(list(split.values())).sort().values, torch.arange(510))
+    order = np.random.default_rng(0).permutation(510)
+    assert split["test"].tolist() == order[445:].tolist()
+
+
+def test_a_data_set_holds_what_was_recorded(real_cube, recording, tmp_path):
+    card = write_recording(EXCERPT, real_cube, tmp_path / "set")
+    data = read_transitions(tmp_path / "set")
+    assert card["trajectories"] == len(recording) and len(card["checks"]) >= 5
+    assert torch.equal(data["qpos"], recording.transitions()["qpos"])
+    with pytest.raises(ValueError, match="already holds data"):
+        write_recording(EXCERPT, real_cube, tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (lambda a: a.pop("position"), "'position'"),
+        (lambda a: a.update(quaternion_wxyz=a["quaternion_wxyz"][:-1]), "of shape"),
+        (lambda a: a.update(trajectory_offsets=np.array([0, 7])), "trajectory_offsets"),
+        (lambda a: a["position"].__setitem__((3, 1), np.nan), "finite"),
+        (lambda a: a.update(qpos=a["position"]), "'qpos' of shape"),
+    ],
+)
+def test_a_broken_file_is_refused_in_one_sentence(spoil, said, real_cube, tmp_path):
+    with np.load(EXCERPT) as file:
+        arrays = {name: file[name].copy() for name in file.files}
+    spoil(arrays)
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(ValueError, match=said):
+        read_log(tmp_path / "log.npz", real_cube)
+
+
+def test_pickled_arrays_are_refused(real_cube, tmp_path):
+    np.savez(tmp_path / "log.npz", position=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match="expected an npz file"):
+        read_log(tmp_path / "log.npz", real_cube)
+
+
+def test_a_log_of_another_robot_is_refused(generator, tmp_path):
+    log = simulated(load_scene("cartpole"), generator)
+    np.savez(tmp_path / "log.npz", qpos=log.qpos, qvel=log.qvel)
+    with pytest.raises(ValueError, match="'qpos' of shape .* got"):
+        read_log(tmp_path / "log.npz", load_scene("ant"))
+    with pytest.raises(ValueError, match="expected 'qpos'"):
+        read_log(EXCERPT, load_scene("ant"))

@@ -1,0 +1,203 @@
+"""Error over recorded trajectories: rollouts from recorded states, never corrected.
+
+NeRD appendix C.4, for tosses of a cube: every 80 consecutive states of the test tosses;
+from the first of them the model rolls out the other 79; mean error along the path. Windows
+of one trajectory overlap, so intervals are found by drawing trajectories again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from torchrl_nerd.analytic import make_step
+from torchrl_nerd.data.recorded import TORQUE, Recording
+from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
+from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
+from torchrl_nerd.keys import QPOS
+from torchrl_nerd.scenes import Scene
+
+STATES = 80  # of a window, the start among them
+DRAWS = 2000  # of the trajectories, for intervals
+PART = 2048  # windows rolled out at a time
+BASE = {"base_position": "m", "base_orientation": "rad"}
+
+Errors = dict[str, Tensor]
+"""Quantity of `position_errors` -> ``(windows, states - 1)``, m or rad."""
+
+
+@dataclass(frozen=True)
+class WindowError:
+    """Error of one quantity over all windows, m or rad.
+
+    | field | meaning |
+    |---|---|
+    | ``mean`` | along the path, over windows |
+    | ``final`` | mean at the last state |
+    | ``median`` | over windows of their mean along the path |
+    | ``p95`` | 95th percentile of the same |
+    | ``interval`` | half width of the 95% interval of the mean, over trajectories |
+    | ``first`` | the mean over windows that start their trajectory; NaN if none |
+    """
+
+    mean: float
+    final: float
+    median: float
+    p95: float
+    interval: float
+    first: float
+
+
+def window_errors(
+    dynamics: Dynamics, recording: Recording, starts: Tensor, states: int = STATES
+) -> Errors:
+    """Errors after each step of rollouts from recorded states.
+
+    Args:
+        dynamics: of any kind.
+        recording: trajectories of its scene.
+        starts: rows of the first states, ``(windows,)``.
+        states: of a window.
+    """
+    found = []
+    for part in starts.split(PART):
+        window = recording.windows(part, states)
+        path = open_loop(dynamics, window[:, 0], states - 1, window[TORQUE])
+        measured = window[QPOS][:, 1:]
+        found.append(position_errors(dynamics.scene, measured, path))
+    return {name: torch.cat([part[name] for part in found]) for name in found[0]}
+
+
+def no_motion(
+    scene: Scene, recording: Recording, starts: Tensor, states: int = STATES
+) -> Errors:
+    """`window_errors` of a robot that stays where it is."""
+    measured = recording.windows(starts, states)[QPOS]
+    start = measured[:, :1].expand_as(measured[:, 1:])
+    return position_errors(scene, measured[:, 1:], start)
+
+
+def error_key(scene: Scene, quantity: str, joint: str = "_error_") -> str:
+    """A quantity and its unit as one word: ``position_error_m``, ``elbow_error_rad``."""
+    return quantity.removeprefix("base_") + joint + unit_of(scene, quantity)
+
+
+def resampled_means(values: Tensor, group: Tensor, draws: int = DRAWS) -> Tensor:
+    """Means over windows of trajectories drawn with replacement, ``(draws,)``.
+
+    Args:
+        values: of each window, ``(windows,)``.
+        group: number of each window's trajectory, ``(windows,)``.
+        draws: how many.
+    """
+    found, number = group.unique(return_inverse=True)
+    sums = torch.zeros(len(found)).to(values).index_add(0, number, values)
+    counts = torch.bincount(number, minlength=len(found)).to(values)
+    generator = Generator().manual_seed(0)
+    pick = torch.randint(len(found), (draws, len(found)), generator=generator)
+    return sums[pick].sum(1) / counts[pick].sum(1)
+
+
+def paired_interval(a: Tensor, b: Tensor, group: Tensor) -> tuple[float, float]:
+    """95% interval of mean(a) - mean(b), over trajectories, of the same windows.
+
+    Args:
+        a: errors ``(windows, steps)``.
+        b: others, likewise.
+        group: number of each window's trajectory, ``(windows,)``.
+    """
+    means = resampled_means((a - b).mean(1), group)
+    low, high = means.quantile(means.new_tensor((0.025, 0.975))).tolist()
+    return low, high
+
+
+def summarize_windows(
+    scene: Scene, errors: Errors, recording: Recording, starts: Tensor
+) -> dict[str, WindowError]:
+    """Summary of each quantity, by `error_key`; ``starts`` as of `window_errors`."""
+    group = recording.trajectory_of(starts)
+    is_first = starts == recording.offsets[group]
+    found = {}
+    for quantity, error in errors.items():
+        mean = error.mean(1)
+        low, high = paired_interval(error, torch.zeros_like(error), group)
+        found[error_key(scene, quantity)] = WindowError(
+            mean=float(mean.mean()),
+            final=float(error[:, -1].mean()),
+            median=float(mean.median()),
+            p95=float(mean.quantile(0.95)),
+            interval=0.5 * (high - low),
+            first=float(mean[is_first].mean()),
+        )
+    return found
+
+
+def compare(
+    models: Mapping[str, Dynamics],
+    scene: Scene,
+    recording: Recording,
+    starts: Tensor,
+    states: int = STATES,
+) -> dict[str, dict[str, Any]]:
+    """Errors of no motion and of every model, and differences between the models.
+
+    ``against`` holds, for every other model, 95% intervals over trajectories of the errors
+    less the other's: below 0 the model is ahead. Its keys are ``m`` and ``rad`` for the
+    base, names for joints.
+
+    Args:
+        models: by name.
+        scene: of the recording.
+        recording: trajectories.
+        starts: rows of the first states.
+        states: of a window.
+    """
+    errors = {"no motion": no_motion(scene, recording, starts, states)}
+    for name, dynamics in models.items():
+        errors[name] = window_errors(dynamics, recording, starts, states)
+    group, table = recording.trajectory_of(starts), {}
+    for name, mine in errors.items():
+        summary = summarize_windows(scene, mine, recording, starts)
+        row: dict[str, Any] = {key: asdict(value) for key, value in summary.items()}
+        against = {
+            other: {
+                BASE.get(key, key): paired_interval(mine[key], its[key], group)
+                for key in mine
+            }
+            for other, its in errors.items()
+            if other not in (name, "no motion")
+        }
+        table[name] = {**row, "against": against} if len(models) > 1 else row
+    return table
+
+
+def rivals(scene: Scene) -> dict[str, Dynamics]:
+    """Dynamics with the scene's own parameters: MuJoCo, and an analytic step if any."""
+    found: dict[str, Dynamics] = {"MuJoCo": MujocoDynamics(scene)}
+    try:
+        found["analytic"] = AnalyticDynamics(make_step(scene))
+    except ValueError:  # a scene whose contact law it does not know
+        pass
+    return found
+
+
+def errors_as_text(
+    table: Mapping[str, Mapping[str, Any]],
+    published: Mapping[str, Mapping[str, float]],
+    states: int = STATES,
+) -> str:
+    """The rows of `compare` as text, published mean errors last."""
+    columns = ("mean", "interval", "median", "final", "p95", "first")
+    head = f"{f'{states} states':<34}{'quantity':<19}"
+    lines = [head + "".join(f"{'+-' if c == 'interval' else c:>9}" for c in columns)]
+    for name, row in table.items():
+        for key, error in row.items():
+            if key != "against":
+                numbers = "".join(f"{error[c]:>9.4f}" for c in columns)
+                lines.append(f"{name:<34}{key.replace('_error_', ' '):<19}{numbers}")
+    for name, row in published.items():
+        for key, mean in row.items():
+            lines.append(f"{name:<34}{key.replace('_error_', ' '):<19}{mean:>9.4f}")
+    return "\n".join(lines)
