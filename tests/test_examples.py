@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from dm_control import suite as dm_suite
+from helpers import EXCERPT
 
 from torchrl_nerd.evaluation.policy import load_policy
 from torchrl_nerd.robots import make_task
@@ -80,3 +81,14 @@ def test_ppo_learns_in_one_dynamics_and_is_measured_in_all(
 
 def test_ppo_is_short():
     assert len((EXAMPLES / "ppo.py").read_text().splitlines()) < 150
+
+
+def test_a_log_is_learned_from_and_measured(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import finetune_cube
+
+    argv = ["finetune_cube.py", "--log", str(EXCERPT), "--evaluations", "2"]
+    monkeypatch.setattr("sys.argv", argv)
+    finetune_cube.main()
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("no motion", "before", "after"))

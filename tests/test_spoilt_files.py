@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from file_kinds import CHUNK, KINDS, SCENE
 from fuzz_files import OUTCOMES, outcome, shapes_of
-from torchrl_nerd.data.log_files import LARGEST_LOG, read_log
 
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.generate import load_data
+from torchrl_nerd.data.log_files import LARGEST_LOG, read_log
 from torchrl_nerd.data.store import chunk_path, read_chunk, write_chunk
 from torchrl_nerd.evaluation.policy import load_policy
 from torchrl_nerd.files import read_json, write_json

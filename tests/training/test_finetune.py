@@ -8,7 +8,7 @@ from helpers import simulated
 from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
-from torchrl_nerd.configs import FinetuneConfig
+from torchrl_nerd.configs import NO_PREDICTIONS, FinetuneConfig
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
 from torchrl_nerd.modules.nerd import NeRD
@@ -38,7 +38,9 @@ def model(real_cube, recording):
 def fresh(scene, recording) -> NeRD:
     """Fresh weights, statistics of the recording."""
     data = recording.transitions()[:, None]
-    learned = NeRD(scene, network_config("mlp-4x64"), data_stats(scene, data))
+    learned = NeRD(
+        scene, NO_PREDICTIONS, network_config("mlp-4x64"), data_stats(scene, data)
+    )
     cover(learned, data)
     return learned
 
@@ -52,25 +54,21 @@ def weights(model) -> dict[str, torch.Tensor]:
     return {k: v.clone() for k, v in model.state_dict().items()}
 
 
-def test_it_learns_from_real_tosses(model, recording):
-    run = tuner(model, recording, epochs=1.0, sequence_length=8)
-    run.run()
-    first, *_, last = run.curve
-    assert score(last) < score(first)
-
-
-@pytest.mark.parametrize("name", ["cartpole", "double_pendulum"])
-def test_it_learns_from_a_log_of_any_robot(name, generator):
-    """A driven robot; and one over a ground that varies."""
+@pytest.mark.parametrize("name", ["cube_real", "cartpole", "double_pendulum"])
+def test_it_learns_from_a_log_of_any_robot(name, recording, generator):
+    """Real tosses; a driven robot; one over a ground that varies."""
     scene = load_scene(name)
-    log = simulated(scene, generator, trajectories=12)
-    model = fresh(scene, log)
-    config = replace(QUICK, epochs=20, states=10, validate_every=5)
-    run = FineTuner(model, log, NUMBERS[4:], NUMBERS[:4], config, quiet=True)
+    log = recording
+    if name != "cube_real":
+        log = simulated(scene, generator, trajectories=12)
+    config = replace(QUICK, epochs=6, batch_size=32, sequence_length=6, states=7)
+    some = NUMBERS[:4]
+    run = FineTuner(fresh(scene, log), log, some, some, config, quiet=True)
     run.run()
     best = min(run.curve, key=score)
     assert score(best) < 0.8 * score(run.curve[0])
-    assert len(best) == 3 + scene.model.nq  # an error of every joint
+    errors = 2 if name == "cube_real" else scene.model.nq
+    assert len(best) == 3 + errors  # beside epoch, seconds and loss
 
 
 def test_physics_is_fitted_without_gradients(real_cube, recording):

@@ -126,7 +126,11 @@ class Eval(DeviceCommand):
     def _load(self, name: Path | str, scene: Scene) -> Model:
         """The model as it was asked for."""
         model = from_pretrained(name, scene).to(self.device)
-        return model.to(torch.bfloat16) if self.bf16 and model.kind != "analytic" else model
+        return (
+            model.to(torch.bfloat16)
+            if self.bf16 and model.kind != "analytic"
+            else model
+        )
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
         """The same for recorded trajectories.

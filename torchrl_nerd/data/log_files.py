@@ -82,17 +82,17 @@ def read_log(path: Path, scene: Scene) -> Recording:
                 f"of shape {array.shape}"
             )
     is_pose = is_free_body(scene) and QPOS not in arrays
-    has_terrain = scene.terrain is not None and scene.terrain.is_per_row
+    terrain = scene.terrain if scene.terrain and scene.terrain.is_per_row else None
     needed = ("position", "quaternion_wxyz") if is_pose else (QPOS,)
-    for name in (*needed, *((TERRAIN,) if has_terrain else ())):
+    for name in (*needed, *((TERRAIN,) if terrain else ())):
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"
             raise ValueError(f"expected '{name}' in {path}, found {found}")
     count = len(arrays["position" if is_pose else QPOS])
     sizes = {QPOS: scene.model.nq, QVEL: scene.model.nv}
     sizes |= {TORQUE: len(scene.actuated)}
-    if has_terrain:
-        sizes[TERRAIN] = scene.terrain.size
+    if terrain:
+        sizes[TERRAIN] = terrain.size
     sizes |= {name: len(columns) for name, columns in FREE_BODY.items()}
     shapes: dict[str, tuple[int, ...]] = {k: (count, v) for k, v in sizes.items()}
     shapes |= {"time": (count,), "trajectory": (count,)}

@@ -204,7 +204,7 @@ class FineTuner:
     @torch.no_grad()
     def errors(self, rows: Tensor) -> Errors:
         """`window_errors` of the model as it is now, from ``rows`` on."""
-        dynamics = NeRDDynamics(self.model)
+        dynamics = dynamics_of(self.model)
         return window_errors(dynamics, self.recording, rows, self.config.states)
 
     def _frozen(self) -> Model:
@@ -246,7 +246,7 @@ def rollout_error(model: Model, window: TensorDict) -> Tensor:
         window: ``[rows, steps + 1]``, see `Recording.windows`.
     """
     steps = window.batch_size[1] - 1
-    dynamics = NeRDDynamics(model, differentiable=True)
+    dynamics = dynamics_of(model, differentiable=True)
     path = open_loop(dynamics, window[:, 0], steps, window[TORQUE])
     errors = position_errors(model.scene, window[QPOS][:, 1:], path)
     return weighted_error(model.scene, errors)

@@ -1,6 +1,6 @@
-"""Validation curves of docs/real_data.md in one picture: fine-tuned and from scratch.
+"""Validation curves in one picture: fine-tuned and from scratch.
 
-    python benchmarks/finetune_curves.py --out docs/figures/finetune_curves.png
+    python experiments/measured_cube/curves.py
 
 Reads the curves that `nerd finetune` writes, and prints when each came to its best.
 """
@@ -10,12 +10,12 @@ from pathlib import Path
 
 from torchrl_nerd.evaluation.plots import COLORS, STYLES, make_figure, save_figure
 from torchrl_nerd.files import read_json
-from torchrl_nerd.training.convergence import Curve, converged
+from torchrl_nerd.training.finetune import Curve, converged
 
-FIGURES = Path("docs/figures")
+RESULTS = Path(__file__).parent / "results"
 CURVES = {
-    "fine-tuned": FIGURES / "finetune_cube_curve.json",
-    "from scratch": FIGURES / "scratch_cube_curve.json",
+    "fine-tuned": RESULTS / "finetune_cube_curve.json",
+    "from scratch": RESULTS / "scratch_cube_curve.json",
 }
 ERRORS = {"position_m": "error (m)", "orientation_rad": "error (rad)"}
 
@@ -38,7 +38,7 @@ def plot_curves(curves: dict[str, Curve], path: Path) -> None:
 def main() -> None:
     """Draw and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=FIGURES / "finetune_curves.png")
+    parser.add_argument("--out", type=Path, default=RESULTS / "finetune_curves.png")
     args = parser.parse_args()
     curves = {name: read_json(path)["curve"] for name, path in CURVES.items()}
     for name, curve in curves.items():
