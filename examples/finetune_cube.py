@@ -3,7 +3,7 @@
     python examples/finetune_cube.py --log cube_tosses.npz
 
 Without ``--model`` twelve physical parameters of an analytic step are fitted. With it
-(``--model cube_real``) a network's weights follow the gradient of its rollouts. ``--scene``
+(a name or folder) a network's weights follow the gradient of its rollouts. ``--scene``
 is any robot; docs/howto/logs.md says what a log holds.
 """
 

@@ -7,7 +7,11 @@ import pytest
 from helpers import EXCERPT, simulated
 
 from torchrl_nerd import load_scene
+from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.cli import main
+from torchrl_nerd.configs import NO_PREDICTIONS
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 
 TINY = [
     "--update",
@@ -49,13 +53,20 @@ def test_recorded_logs_become_a_data_set(name, tmp_path, capsys):
     assert (out / "data.json").exists()
 
 
+@pytest.fixture
+def network(real_cube, tmp_path):
+    """Folder of a network with fresh weights."""
+    model = NeRD(real_cube, NO_PREDICTIONS, network_config("mlp-4x64"))
+    return str(save_checkpoint(model, tmp_path / "network", make_card(model)))
+
+
 @pytest.mark.parametrize("update", ["physics", "all"])
-def test_what_was_fine_tuned_is_measured(update, tmp_path, capsys):
+def test_what_was_fine_tuned_is_measured(update, network, tmp_path, capsys):
     out, figures = tmp_path / "run", tmp_path / "figures.json"
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", str(out)]
     how = ["--evaluations", "1"]
     if update == "all":
-        how = ["--model", "cube_real", *TINY]
+        how = ["--model", network, *TINY]
     assert main([*argv, *how]) == 0
     assert update == "physics" or "epochs 0.02/0.02" in capsys.readouterr().err
     assert {p.name for p in out.iterdir()} == {
@@ -75,7 +86,7 @@ def test_what_was_fine_tuned_is_measured(update, tmp_path, capsys):
     for key in ("position_error_m", "orientation_error_rad"):
         names = {"mean", "final", "median", "p95", "interval", "first"}
         assert names == set(content[key])
-        assert 0 < content[key]["mean"] < content[key]["p95"] < 3
+        assert 0 < content[key]["mean"] < content[key]["p95"]
     assert "ContactNets" in capsys.readouterr().out
 
 
@@ -107,7 +118,7 @@ def test_wrong_units_are_refused_with_check_and_figure(half_widths, tmp_path, ca
     assert not (tmp_path / "set" / "data.json").exists()
 
 
-def test_other_robots_and_splits_are_refused(tmp_path, capsys):
+def test_other_robots_and_splits_are_refused(network, tmp_path, capsys):
     out = str(tmp_path / "set")
     text = refusal(capsys, "data", "ant", "--from", str(EXCERPT), "--out", out)
     assert "expected 'qpos'" in text and "position" in text
@@ -115,5 +126,5 @@ def test_other_robots_and_splits_are_refused(tmp_path, capsys):
     argv = ["eval", "cube", "--data", str(EXCERPT), "--split", "best"]
     assert "'best'" in refusal(capsys, *argv)
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", out]
-    argv += ["--model", "cube_real", "--update", "physics"]
+    argv += ["--model", network, "--update", "physics"]
     assert "analytic" in refusal(capsys, *argv)

@@ -20,7 +20,7 @@ class Finetune(DeviceCommand):
 
     Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
 
-    Example: nerd finetune cube --from cube_tosses.npz --model cube_real --update all
+    Example: nerd finetune cube --from cube_tosses.npz --model runs/cube/best
     """
 
     scene: Positional[str]
