@@ -5,7 +5,7 @@
 The first model is the one that is judged, all of them are the ensemble: networks of other
 kinds and seeds, trained on the same motion. Its spread is the deviation of their next
 velocities from their mean, in the first one's units, and its price a step of each. Inputs
-and errors are those of `nerd stability SCENE --cases trust`.
+and errors are those of `nerd stability SCENE --cases out_of_distribution`.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.stability.cases.trust import auc, inputs, scores
+from torchrl_nerd.evaluation.stability.cases.ood import auc, inputs, scores
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.robots import load_scene

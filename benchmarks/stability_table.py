@@ -2,8 +2,7 @@
 
     python benchmarks/stability_table.py
 
-A figure of the learned dynamics, MuJoCo's in brackets where it shows another number, bold
-where its line is not met.
+One metric per row: the model's, MuJoCo's in brackets where it differs, bold where it fails.
 """
 
 import json
@@ -24,66 +23,69 @@ SCENES = {
     "franka_gravity": "`franka_gravity`",
     "cartpole": "Cartpole",
 }
-WITHOUT_LINE = {
-    "adversary": ["worst that the search found"],
-    "chaos": ["Lyapunov times", "chaos floor of a nudge of 1e-6"],
-    "drop": ["height at the end, dropped 10 m, against MuJoCo, m"],
+INFORMATION = {
+    "adversary": ["largest error found by the search, m or rad"],
+    "sensitivity": [
+        "time until the error exceeds 0.3, Lyapunov times",
+        "sensitivity of MuJoCo to starts 1e-6 apart, m or rad",
+    ],
+    "drop": ["final height error, dropped from 10 m, m"],
     "gradients": ["largest gradient after 100 steps"],
     "horizon": ["largest speed, m/s or rad/s"],
-    "joint_limits": ["MuJoCo goes beyond by"],
+    "joint_limits": ["limit exceeded in MuJoCo, rad or m"],
     "precision": [
         "float32 against float64 after 100 steps",
-        "bfloat16 after 100 steps",
+        "bfloat16 against float64 after 100 steps",
     ],
-    "sliding": ["stops beside MuJoCo, m, mean"],
+    "sliding": ["mean error of the stopping point, m"],
     "stiff_contact": [
         "mean error against the stiffer ground, m or rad",
-        "what the stiffness changes in MuJoCo",
+        "mean difference between the two in MuJoCo, m or rad",
     ],
     "torques": ["largest speed, alternating"],
 }
 
-Figures = dict[str, dict]
+Results = dict[str, dict]
 """What was measured of every scene, by its name, as the command wrote it."""
 
 
 @dataclass
 class Options:
-    """Where the figures are."""
+    """Where the results are."""
 
     folder: Path = FIGURES
 
 
-def read(folder: Path) -> Figures:
-    """The figures of every scene that has some."""
+def read(folder: Path) -> Results:
+    """The results of every scene that has some."""
     paths = {name: folder / f"stability_{name}.json" for name in SCENES}
     return {name: json.loads(p.read_text()) for name, p in paths.items() if p.exists()}
 
 
-def with_lines(found: Figures) -> str:
-    """Every figure that has a line, a row each."""
+def graded(found: Results) -> str:
+    """Every metric with a tolerance, a row each."""
     names = sorted(
         {case for one in found.values() for case in one if _is_case(one, case)}
     )
     rows = []
     for case in names:
         of_case = {name: one[case] for name, one in found.items() if case in one}
-        lines: dict[str, float] = {}
+        limits: dict[str, float] = {}
         for one in of_case.values():
-            lines |= one["lines"]
+            limits |= one["tolerances"]
         rows += [
-            (case, figure, _cells(found, of_case, figure), number(line))
-            for figure, line in lines.items()
+            (case, metric, _cells(found, of_case, metric), number(limit))
+            for metric, limit in limits.items()
         ]
     return _table(found, rows)
 
 
-def without_lines(found: Figures) -> str:
-    """Some figures for information."""
+def informative(found: Results) -> str:
+    """Some metrics without a tolerance."""
     rows = []
-    for case, figures in WITHOUT_LINE.items():
+    for case, metrics in INFORMATION.items():
         of_case = {name: one[case] for name, one in found.items() if case in one}
-        rows += [(case, f, _cells(found, of_case, f), None) for f in figures]
+        rows += [(case, m, _cells(found, of_case, m), None) for m in metrics]
     return _table(found, rows)
 
 
@@ -99,32 +101,32 @@ def number(value: float | None) -> str:
 
 
 def _is_case(one: dict, name: str) -> bool:
-    return isinstance(one[name], dict) and bool(one[name]["lines"])
+    return isinstance(one[name], dict) and bool(one[name]["tolerances"])
 
 
-def _cells(found: Figures, of_case: Figures, figure: str) -> list[str]:
-    return [_cell(of_case.get(name), figure) for name in found]
+def _cells(found: Results, of_case: Results, metric: str) -> list[str]:
+    return [_cell(of_case.get(name), metric) for name in found]
 
 
-def _cell(result: dict | None, figure: str) -> str:
-    if result is None or figure not in result["learned"]:
+def _cell(result: dict | None, metric: str) -> str:
+    if result is None or metric not in result["tested"]:
         return ""
-    value, true = (result[key].get(figure) for key in ("learned", "true"))
-    shown, line = number(value), result["lines"].get(figure)
-    if line is not None and (value is None or not value <= line):
+    value, exact = (result[key].get(metric) for key in ("tested", "ground_truth"))
+    shown, limit = number(value), result["tolerances"].get(metric)
+    if limit is not None and (value is None or not value <= limit):
         shown = f"**{shown}**"
-    is_same = true is None or number(true) == number(value)
-    return shown if is_same else f"{shown} ({number(true)})"
+    is_same = exact is None or number(exact) == number(value)
+    return shown if is_same else f"{shown} ({number(exact)})"
 
 
-def _table(found: Figures, rows: list) -> str:
-    has_lines = any(line is not None for *_, line in rows)
-    head = ["case", "figure", *(SCENES[name] for name in found)]
-    head += ["line"] * has_lines
+def _table(found: Results, rows: list) -> str:
+    is_graded = any(limit is not None for *_, limit in rows)
+    head = ["case", "metric", *(SCENES[name] for name in found)]
+    head += ["tolerance"] * is_graded
     table, last = [head, ["---"] * len(head)], None
-    for case, figure, cells, line in rows:
+    for case, metric, cells, limit in rows:
         name = "" if case == last else f"`{case}`"
-        table.append([name, figure, *cells, *([line] if has_lines else [])])
+        table.append([name, metric, *cells, *([limit] if is_graded else [])])
         last = case
     lines = [f"| {' | '.join(row)} |" for row in table]
     lines[1] = lines[1].replace(" ", "")
@@ -134,7 +136,7 @@ def _table(found: Figures, rows: list) -> str:
 def main(options: Options) -> None:
     """Print both tables."""
     found = read(options.folder)
-    print(with_lines(found), without_lines(found), sep="\n\n")
+    print(graded(found), informative(found), sep="\n\n")
 
 
 if __name__ == "__main__":

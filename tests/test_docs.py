@@ -236,8 +236,8 @@ def test_examples_in_docstrings_run(path):
 def test_the_tables_of_hard_cases_are_what_was_measured():
     found = stability_table.read(ROOT / "docs" / "figures")
     page = (ROOT / "docs" / "stability.md").read_text()
-    assert stability_table.with_lines(found) in page
-    assert stability_table.without_lines(found) in page
+    assert stability_table.graded(found) in page
+    assert stability_table.informative(found) in page
 
 
 def test_the_table_of_equal_error_is_what_was_measured():

@@ -3,9 +3,9 @@
 import mujoco
 import pytest
 from helpers import every_scene, make_scene
-from torchrl_nerd.modules.scene_tokens import SceneTokens
 
 from torchrl_nerd.evaluation.explain import explain
+from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.robots import load_scene
 
 CROSSED = """
@@ -19,7 +19,7 @@ CROSSED = """
 @every_scene
 def test_the_report_adds_up_and_its_text_names_all(scene):
     report, text = explain(scene), str(explain(scene))
-    assert report.token_width == SceneTokens(scene).size
+    assert report.token_width == SceneFeatures(scene).size
     assert text.startswith(f"{scene.name}: {report.token_width} features a step")
     assert all(feature.key in text for feature in report.features)
     assert all(body in text for body in report.contact_bodies)
@@ -29,19 +29,19 @@ def test_the_report_adds_up_and_its_text_names_all(scene):
 
 
 @pytest.mark.parametrize(
-    ("name", "can"),
+    ("name", "step"),
     [
-        ("cartpole", {"unconstrained": True, "penalty-contact": False}),
-        ("ant", {"unconstrained": False, "penalty-contact": True}),
-        ("dm_control/cheetah-run", {"unconstrained": False, "penalty-contact": False}),
+        ("cartpole", "UnconstrainedStep"),
+        ("ant", "PenaltyContactStep"),
+        ("dm_control/cheetah-run", None),
     ],
 )
-def test_analytic_steps_are_supported_or_say_why_not(name, can):
+def test_an_analytic_step_is_named_or_why_there_is_none(name, step):
     report = explain(load_scene(name))
-    found = report.analytic_steps
-    assert {step: reason is None for step, reason in found.items()} == can
-    for reason in found.values():
-        assert reason is None or (name in reason and reason in str(report))
+    assert report.analytic_step == step
+    assert f"analytic step: {step or 'none'}" in str(report)
+    reason = report.why_no_step
+    assert reason is None if step else reason and name in reason
 
 
 def test_self_contacts_are_those_that_mujoco_finds():

@@ -107,3 +107,13 @@ def test_layout_covers_every_joint_once(scene, rng):
     got = integrate_pos(layout, qpos, scene.control_step * qvel)
     want = mujoco_integrates(model, qpos, scene.control_step * qvel)
     torch.testing.assert_close(got, want, rtol=0.0, atol=1e-14)
+
+
+def test_a_quaternion_keeps_its_norm_over_many_integrations(rng):
+    model = random_tree(rng, is_floating=True)
+    layout, (qpos, qvel) = JointLayout.from_model(model), random_states(model, 4, rng)
+    for _ in range(3000):
+        qpos = integrate_pos(layout, qpos, 0.01 * qvel)
+    for q, _ in layout.rotations:
+        norm = torch.linalg.vector_norm(qpos[:, q : q + 4], dim=-1)
+        assert (norm - 1.0).abs().max() < 1e-12

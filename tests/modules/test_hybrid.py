@@ -19,7 +19,7 @@ from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import AnalyticDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.stability.states import turned
+from torchrl_nerd.evaluation.stability.states import rotated
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.hybrid import HybridNeRD
@@ -155,8 +155,8 @@ def test_it_is_invariant_under_yaw(scene, step, generator):
     quat.copy_(quat / quat.norm(dim=-1, keepdim=True))
     angle = torch.pi * torch.rand(1, generator=generator).double()
     turn = torch.cat((angle.cos(), torch.zeros(2), angle.sin()))
-    there = advance(model, turned(scene, rows, turn))
-    expected = turned(scene, advance(model, rows), turn)
+    there = advance(model, rotated(scene, rows, turn))
+    expected = rotated(scene, advance(model, rows), turn)
     for key in (QPOS, QVEL):
         close = (there[key] - expected[key]).abs() <= 1e-3 * (1.0 + expected[key].abs())
         assert close.all(-1).double().mean() > 0.9  # float32 may decide on touching

@@ -4,7 +4,11 @@ import torch
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.stability.states import ground_turned, starts, turned
+from torchrl_nerd.evaluation.stability.states import (
+    rotated,
+    sample_states,
+    with_rotated_ground,
+)
 from torchrl_nerd.robots.cube.scene import STEEPEST
 
 ROWS = 64
@@ -12,7 +16,7 @@ SCENE, LEVEL = load_scene("cube_slope"), load_scene("cube")
 
 
 def test_slopes_are_as_far_below_as_level_ground_would_be(generator):
-    start = starts(SCENE, ROWS, generator)
+    start = sample_states(SCENE, ROWS, generator)
     plane, qpos = start["terrain"], start["qpos"]
     length = torch.linalg.vector_norm(plane[:, :3], dim=-1)
     torch.testing.assert_close(length, torch.ones_like(length), rtol=0.0, atol=1e-14)
@@ -23,7 +27,7 @@ def test_slopes_are_as_far_below_as_level_ground_would_be(generator):
 
 
 def test_setting_down_leaves_the_gap_asked_for(generator):
-    start = starts(SCENE, ROWS, generator)
+    start = sample_states(SCENE, ROWS, generator)
     gap = 0.1 * torch.rand(ROWS, dtype=torch.float64, generator=generator)
     state = {key: start[key] for key in ("qpos", "terrain")}
     SCENE.place_on_terrain(state, gap)
@@ -32,15 +36,15 @@ def test_setting_down_leaves_the_gap_asked_for(generator):
 
 
 def test_a_slope_of_the_row_is_a_slope_of_the_file(generator):
-    start = starts(SCENE, 1, generator)
+    start = sample_states(SCENE, 1, generator)
     start["qpos"][:, 2] = 0.08
     start["terrain"][:] = torch.tensor([0.0, 0.0, 1.0, 0.0])
     turn = torch.tensor([1.0, 0.0, 0.0, 0.0]).double()
     turn[1:3] = 0.1 * torch.randn(2, dtype=torch.float64, generator=generator)
     turn = turn / torch.linalg.vector_norm(turn)
-    start = turned(SCENE, start, turn)
+    start = rotated(SCENE, start, turn)
     torque = torch.zeros(1, 40, 0, dtype=torch.float64)
     here = MujocoDynamics(SCENE).rollout(start, torque, start["terrain"])
-    there = MujocoDynamics(ground_turned(LEVEL, turn)).rollout(start, torque)
+    there = MujocoDynamics(with_rotated_ground(LEVEL, turn)).rollout(start, torque)
     torch.testing.assert_close(here["qpos"], there["qpos"], rtol=0.0, atol=1e-9)
     assert here["qvel"][:, -1].abs().max() > 0.0

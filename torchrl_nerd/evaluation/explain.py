@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from torchrl_nerd.analytic import PenaltyContactStep, UnconstrainedStep
+from torchrl_nerd.analytic import make_step
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -51,7 +52,8 @@ class SceneReport:
     | ``self_contacts`` | pairs of bodies of the robot that can touch each other |
     | ``terrain`` | the ground, in words |
     | ``controller`` | what turns an action into joint torque, in words |
-    | ``analytic_steps`` | by name: None where it supports the scene, else the reason |
+    | ``analytic_step`` | name of the step that supports the scene; None where none does |
+    | ``why_no_step`` | the reason in a sentence where none does |
     """
 
     scene: str
@@ -61,7 +63,8 @@ class SceneReport:
     self_contacts: tuple[tuple[str, str], ...]
     terrain: str
     controller: str
-    analytic_steps: dict[str, str | None]
+    analytic_step: str | None
+    why_no_step: str | None
 
     @property
     def token_width(self) -> int:
@@ -83,24 +86,25 @@ class SceneReport:
         lines.append(f"self-contacts: {found if pairs else 'none'}")
         lines.append(f"terrain: {self.terrain}")
         lines.append(f"controller: {self.controller}")
-        for name, reason in self.analytic_steps.items():
-            answer = "yes" if reason is None else f"no: {reason}"
-            lines.append(f"{name} step: {answer}")
+        lines.append(
+            f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}"
+        )
         return "\n".join(lines)
 
 
-def explain(scene: Scene) -> SceneReport:
+def explain(scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> SceneReport:
     """Report what of a scene is kept, dropped and why.
 
     Args:
         scene: the robot.
+        config: which predictions of the contact law are among the features.
 
     Examples:
         >>> explain(load_scene("cartpole")).token_width
         7
     """
-    tokens = SceneFeatures(scene)
-    sizes = {**tokens.robot.sizes, **tokens.contact.sizes}
+    features = SceneFeatures(scene, config)
+    sizes = {**features.robot.sizes, **features.contact.sizes}
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
     model = scene.model
 
@@ -108,6 +112,7 @@ def explain(scene: Scene) -> SceneReport:
         return _body_name(scene, int(model.geom_bodyid[geom]))
 
     pairs = {tuple(sorted((body_of(a), body_of(b)))) for a, b in own_contacts(model)}
+    step, reason = _analytic_step(scene)
     return SceneReport(
         scene=scene.name,
         features=tuple(
@@ -116,10 +121,11 @@ def explain(scene: Scene) -> SceneReport:
         solver=scene.explain(),
         contact_bodies=tuple(_body_name(scene, body) for body in scene.contacts.bodies),
         self_contacts=tuple((low, high) for low, high in sorted(pairs)),
-        terrain=_terrain(scene),
+        terrain=_terrain(scene, CONTACT_NORMAL in sizes),
         controller=f"{type(scene.controller).__name__}, "
         f"{scene.controller.num_actions} actions",
-        analytic_steps=_analytic_steps(scene),
+        analytic_step=step,
+        why_no_step=reason,
     )
 
 
@@ -139,14 +145,13 @@ def _state_meaning(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-def _terrain(scene: Scene) -> str:
+def _terrain(scene: Scene, has_normal: bool) -> str:
     terrain = scene.terrain
     if terrain is None:
         return "none that the robot can touch"
     surfaces = terrain.surfaces
     planes = sum(surface.kind == PLANE for surface in surfaces)
     where = "drawn for each trajectory" if terrain.is_per_row else "fixed"
-    has_normal = any(f == CONTACT_NORMAL for f in SceneFeatures(scene).contact.sizes)
     normal = "a feature" if has_normal else "no feature: it follows from the state"
     shapes = f"{planes} plane{'s' * (planes != 1)}"
     if planes < len(surfaces):
@@ -154,15 +159,9 @@ def _terrain(scene: Scene) -> str:
     return f"{shapes}, {where}; the normal is {normal}"
 
 
-def _analytic_steps(scene: Scene) -> dict[str, str | None]:
-    """Why each analytic step cannot step the scene, None where it can."""
-    answers: dict[str, str | None] = {}
-    steps = {"unconstrained": UnconstrainedStep, "penalty-contact": PenaltyContactStep}
-    for name, step in steps.items():
-        try:
-            step(scene)
-        except ValueError as error:
-            answers[name] = str(error)
-        else:
-            answers[name] = None
-    return answers
+def _analytic_step(scene: Scene) -> tuple[str | None, str | None]:
+    """Name of the analytic step that steps the scene, or the reason why none does."""
+    try:
+        return type(make_step(scene)).__name__, None
+    except ValueError as error:
+        return None, str(error)

@@ -1,1 +1,1 @@
-"""Numerical stability on hard cases, in true and in learned dynamics."""
+"""Numerical stability on hard cases, in MuJoCo and in any other dynamics."""

@@ -5,35 +5,34 @@ from pathlib import Path
 from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
 from torchrl_nerd.evaluation.stability.run import Result
 
-LEAST, MOST = 1e-6, 1e6  # shares of the line that are drawn as they are
+LEAST, MOST = 1e-6, 1e6  # ratios beyond are clipped
 BAR = 0.24  # inches
-KEPT, BROKEN = COLORS[2], COLORS[1]
+PASS, FAIL = COLORS[2], COLORS[1]
 
 
 def plot_results(results: list[Result], path: Path, title: str) -> None:
-    """Every figure that has a line, as a share of it; right of one it is not kept.
+    """Every metric that has a tolerance, relative to it; above one it fails.
 
     Args:
         results: from `run_cases`.
         path: a PNG.
         title: above it.
     """
-    names, shares = [], []
+    names, ratios = [], []
     for result in results:
-        for figure, line in result.lines.items():
-            names.append(f"{result.case}: {figure}")
-            value = result.learned[figure]
-            share = value / line if line else (LEAST if value == 0 else MOST)
-            shares.append(min(max(share, LEAST), MOST))
+        for metric, limit in result.tolerances.items():
+            names.append(f"{result.case}: {metric}")
+            value = result.tested[metric]
+            ratio = value / limit if limit else (LEAST if value == 0 else MOST)
+            ratios.append(min(max(ratio, LEAST), MOST))
     figure, (axes,) = make_figure(1, height=BAR * len(names) + 1.2)
-    colors = [KEPT if share <= 1.0 else BROKEN for share in shares]
-    places = range(len(names))
-    axes.barh(places, [s - LEAST for s in shares], left=LEAST, color=colors)
-    axes.set_yticks(places, names, fontsize=7)
+    colors = [PASS if ratio <= 1.0 else FAIL for ratio in ratios]
+    axes.barh(range(len(names)), [r - LEAST for r in ratios], left=LEAST, color=colors)
+    axes.set_yticks(range(len(names)), names, fontsize=7)
     axes.invert_yaxis()
     axes.set_xscale("log")
     axes.axvline(1.0, color="black", linewidth=1)
-    axes.set_xlim(LEAST, 10.0 * max(1.0, *shares))
-    axes.set_xlabel("learned figure as a share of its line (green: kept)")
+    axes.set_xlim(LEAST, 10.0 * max(1.0, *ratios))
+    axes.set_xlabel("metric relative to its tolerance (green: pass; smaller is better)")
     axes.set_title(title)
     save_figure(figure, path)

@@ -1,4 +1,4 @@
-"""All cases of a robot in true and in learned dynamics, as one table."""
+"""All cases of a robot in MuJoCo and in the dynamics under test, as one table."""
 
 import time
 from collections.abc import Iterator
@@ -7,9 +7,9 @@ from zlib import crc32
 
 from torch import Generator
 
-from torchrl_nerd.evaluation.stability.case import Case, Figures
+from torchrl_nerd.evaluation.stability.case import Case, Metrics, Trial
 from torchrl_nerd.evaluation.stability.cases import CASES
-from torchrl_nerd.evaluation.stability.world import World
+from torchrl_nerd.evaluation.stability.stepper import Stepper
 
 
 @dataclass(frozen=True)
@@ -19,19 +19,19 @@ class Result:
     | field | meaning |
     |---|---|
     | ``case``, ``physics`` | what was tried |
-    | ``true``, ``learned`` | figures |
-    | ``true_passes``, ``passes`` | whether they keep their lines |
-    | ``lines`` | those of the learned dynamics |
+    | ``ground_truth``, ``tested`` | metrics; none of MuJoCo where a model is needed |
+    | ``ground_truth_passes``, ``passes`` | whether they are within their tolerances |
+    | ``tolerances`` | those of the dynamics under test |
     | ``seconds`` | for both |
     """
 
     case: str
     physics: str
-    true: Figures
-    learned: Figures
-    true_passes: bool
+    ground_truth: Metrics
+    tested: Metrics
+    ground_truth_passes: bool
     passes: bool
-    lines: Figures
+    tolerances: Metrics
     seconds: float
 
 
@@ -49,35 +49,39 @@ def choose_cases(names: list[str] | None) -> list[Case]:
 
 
 def run_cases(
-    truth: World, learned: World, cases: list[Case], seed: int = 0, scale: float = 1.0
+    ground_truth: Stepper,
+    tested: Stepper,
+    cases: list[Case],
+    seed: int = 0,
+    scale: float = 1.0,
 ) -> Iterator[Result]:
-    """Every case that applies to the robot, one after the other.
+    """Every case that applies, one after the other.
 
     Args:
-        truth: MuJoCo.
-        learned: the same robot's model, or any env of it; cases that need more than its
-            states are left out then.
+        ground_truth: MuJoCo.
+        tested: other dynamics of the same robot, or any env of it; cases that need more
+            than it offers are left out.
         cases: which.
         seed: of starts and torques; each case has a stream of its own, the same in both.
-        scale: share of the long rollouts' steps and of large batches' rows, in (0, 1].
+        scale: fraction of long rollouts and large batches, in (0, 1].
     """
     for case in cases:
-        is_blind = case.needs_dynamics and learned.dynamics is None
-        if is_blind or not case.applies(learned.scene):
+        if not case.supports(tested):
             continue
-        began, figures = time.monotonic(), []
-        for world in (truth, learned):
+        began, found = time.monotonic(), []
+        for stepper in (ground_truth, tested):
             stream = Generator().manual_seed(crc32(case.name.encode(), seed))
-            figures.append(case.run(world, stream, scale))
-        true, mine = figures
+            trial = Trial(stepper, stream, scale)
+            found.append(case.run(trial) if case.supports(stepper) else {})
+        exact, mine = found
         yield Result(
             case.name,
             case.physics,
-            true,
+            exact,
             mine,
-            case.passes(true, is_true=True),
-            case.passes(mine, is_true=False),
-            case.lines,
+            case.passes(exact, is_ground_truth=True),
+            case.passes(mine, is_ground_truth=False),
+            case.tolerances,
             round(time.monotonic() - began, 1),
         )
 
@@ -87,24 +91,30 @@ def as_json(results: list[Result]) -> dict:
     return {result.case: asdict(result) for result in results}
 
 
-def as_table(results: list[Result]) -> str:
-    """Markdown: a row for every figure."""
+def as_table(results: list[Result], kind: str = "tested") -> str:
+    """Markdown: one line per metric.
+
+    Args:
+        results: from `run_cases`.
+        kind: header of the column of the dynamics under test.
+    """
     lines = [
-        "| case | figure | MuJoCo | learned | line | |",
+        f"| case | metric | MuJoCo | {kind} | tolerance | |",
         "|---|---|---|---|---|---|",
     ]
     for result in results:
         name = result.case
-        for figure in result.learned | result.true:
-            line, value = result.lines.get(figure), result.learned.get(figure)
-            kept = ""
-            if line is not None and value is not None:
-                kept = "met" if value <= line else "**not met**"
-            cells = [_shown(x) for x in (result.true.get(figure), value, line)]
-            lines.append(f"| {name} | {figure} | {' | '.join(cells)} | {kept} |")
+        for metric in result.tested | result.ground_truth:
+            limit, value = result.tolerances.get(metric), result.tested.get(metric)
+            verdict = ""
+            if limit is not None and value is not None:
+                verdict = "pass" if value <= limit else "**fail**"
+            exact = result.ground_truth.get(metric)
+            cells = [_two_digits(x) for x in (exact, value, limit)]
+            lines.append(f"| {name} | {metric} | {' | '.join(cells)} | {verdict} |")
             name = ""
     return "\n".join(lines) + "\n"
 
 
-def _shown(value: float | None) -> str:
+def _two_digits(value: float | None) -> str:
     return "" if value is None else f"{value:.2g}"

@@ -1,4 +1,4 @@
-"""Where cases begin: the training ranges, at rest, or up in the air."""
+"""Where cases start: the training range, at rest, in the air, rotated."""
 
 import copy
 from dataclasses import replace
@@ -17,75 +17,70 @@ from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.sampling import sample_torque
 from torchrl_nerd.scenes.terrain import POSE_PARAMETERS
 
-SETTLE, STILL = 5.0, 1e-3  # s; m/s and rad/s
+SETTLE, AT_REST = 5.0, 1e-3  # s; m/s and rad/s
 TRIES = 8
 HIGH = 100.0  # m
 
 
-def idle(scene: Scene, rows: int) -> Tensor:
-    """No torque, ``(rows, num_actuated)``."""
-    return torch.zeros(rows, len(scene.actuated), dtype=torch.float64)
+def zero_torque(scene: Scene, count: int) -> Tensor:
+    """``(count, num_actuated)``."""
+    return torch.zeros(count, len(scene.actuated), dtype=torch.float64)
 
 
-def starts(scene: Scene, rows: int, generator: Generator) -> TensorDict:
-    """States ``[rows]`` from the scene's training ranges."""
-    return TensorDict(scene.sample_initial(rows, generator)[0], [rows])
+def sample_states(scene: Scene, count: int, generator: Generator) -> TensorDict:
+    """States ``[count]`` from the scene's training range."""
+    return TensorDict(scene.sample_initial(count, generator)[0], [count])
 
 
-def nudged(start: TensorDict, size: float, generator: Generator) -> TensorDict:
-    """The same states with every velocity off by normal noise of that size."""
+def perturbed(start: TensorDict, size: float, generator: Generator) -> TensorDict:
+    """The same states with normal noise of standard deviation ``size`` on ``qvel``."""
     qvel = start[QVEL]
     noise = torch.randn(qvel.shape, generator=generator, dtype=qvel.dtype)
     return start.clone().update({QVEL: qvel + size * noise})
 
 
 @cache
-def settled(scene: Scene, rows: int) -> TensorDict:
-    """Where the robot comes to lie in true dynamics, dropped from its training ranges.
+def settled_states(scene: Scene, count: int) -> TensorDict:
+    """Where the robot comes to rest in MuJoCo, dropped from its training range.
 
     Where the ground varies, on that of the file.
 
     Returns:
-        Up to ``rows`` states at rest, at least one; fewer where it seldom comes to rest.
+        Up to ``count`` states at rest, at least one.
 
     Raises:
-        ValueError: it never did.
+        ValueError: it never came to rest.
     """
     generator, found = Generator().manual_seed(0), []
     for _ in range(TRIES):
-        found.append(_at_rest(scene, 2 * rows, generator))
-        if sum(map(len, found)) >= rows:
+        found.append(_drop(scene, 2 * count, generator))
+        if sum(map(len, found)) >= count:
             break
-    at_rest = cast(TensorDict, TensorDict.cat(found))[:rows]
+    at_rest = cast(TensorDict, TensorDict.cat(found))[:count]
     if not len(at_rest):
         raise ValueError(
             f"expected a robot that comes to rest within {SETTLE} s of its drop, "
-            f"'{scene.name}' did in none of {2 * rows * TRIES}"
+            f"'{scene.name}' did in none of {2 * count * TRIES}"
         )
     return at_rest
 
 
-def _at_rest(scene: Scene, drops: int, generator: Generator) -> TensorDict:
-    """Those of so many drops that end at rest."""
-    start = starts(scene, drops, generator)
+def _drop(scene: Scene, count: int, generator: Generator) -> TensorDict:
+    """The final states of those drops that end at rest."""
+    start = sample_states(scene, count, generator)
     start[QVEL] = 0.0 * start[QVEL]
     if scene.terrain is not None and scene.terrain.is_per_row:
-        start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(drops, -1)
+        start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(count, -1)
     steps = round(SETTLE / scene.control_step)
-    torque = idle(scene, drops)[:, None].expand(-1, steps, -1)
+    torque = zero_torque(scene, count)[:, None].expand(-1, steps, -1)
     path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None))
     for key in (QPOS, QVEL):
         start[key] = path[key][:, -1].clone()
-    return rows_of(start, torch.amax(start[QVEL].abs(), -1) < STILL)
-
-
-def rows_of(states: TensorDict, rows: Tensor) -> TensorDict:
-    """Some of the states ``[n]``, by index or mask ``(n,)``; a copy."""
-    return cast(TensorDict, states[rows])
+    return cast(TensorDict, start[torch.amax(start[QVEL].abs(), -1) < AT_REST])
 
 
 def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
-    """The same states where nothing can be touched: lifted, or the ground lowered."""
+    """The same states out of reach of the ground: lifted, or the ground lowered."""
     start = start.clone()
     if scene.base.is_floating:
         start[QPOS][:, scene.base.qpos_address + 2] += HIGH
@@ -94,16 +89,18 @@ def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
     return start
 
 
-def uniform_torque(scene: Scene, rows: int, steps: int, generator: Generator) -> Tensor:
-    """Torques in the training range, ``(rows, steps, num_actuated)``."""
-    scale = torch.ones(rows, 1, dtype=torch.float64)
+def uniform_torque(
+    scene: Scene, count: int, steps: int, generator: Generator
+) -> Tensor:
+    """Torques in the training range, ``(count, steps, num_actuated)``."""
+    scale = torch.ones(count, 1, dtype=torch.float64)
     return sample_torque(scene.sampling, scale, steps, generator)
 
 
-def extreme_torques(scene: Scene, rows: int, steps: int) -> dict[str, Tensor]:
-    """None, all there is and more, by name ``(rows, steps, num_actuated)``."""
+def extreme_torques(scene: Scene, count: int, steps: int) -> dict[str, Tensor]:
+    """Zero, largest and larger torques, by name ``(count, steps, num_actuated)``."""
     high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
-    full = high.expand(rows, steps, -1)
+    full = high.expand(count, steps, -1)
     sign = 1.0 - 2.0 * (torch.arange(steps, dtype=torch.float64) % 2.0)
     return {
         "zero": torch.zeros_like(full),
@@ -113,39 +110,39 @@ def extreme_torques(scene: Scene, rows: int, steps: int) -> dict[str, Tensor]:
     }
 
 
-def turned(scene: Scene, states: TensorDict, turn: Tensor) -> TensorDict:
-    """States of a floating robot, turned about the world's origin, its ground with it.
+def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
+    """States of a floating robot, rotated about the world's origin with their ground.
 
-    Ground that all rows share stays; see `ground_turned`.
+    Ground that all trajectories share stays; see `with_rotated_ground`.
 
     Args:
         scene: the robot.
         states: ``[*batch]``.
-        turn: ``(*batch, 4)``.
+        quat: ``(*batch, 4)``.
     """
     q, v = scene.base.qpos_address, scene.base.dof_address
     states = states.clone()
     qpos, qvel = states[QPOS], states[QVEL]
-    qpos[..., q : q + 3] = rotate(turn, qpos[..., q : q + 3])
-    qpos[..., q + 3 : q + 7] = quat_multiply(turn, qpos[..., q + 3 : q + 7])
-    qvel[..., v : v + 3] = rotate(turn, qvel[..., v : v + 3])
+    qpos[..., q : q + 3] = rotate(quat, qpos[..., q : q + 3])
+    qpos[..., q + 3 : q + 7] = quat_multiply(quat, qpos[..., q + 3 : q + 7])
+    qvel[..., v : v + 3] = rotate(quat, qvel[..., v : v + 3])
     if scene.terrain is not None and TERRAIN in states.keys():
         ground = states[TERRAIN]
         for part in scene.terrain.parameters.values():  # normals, or poses
             given = ground[..., part]
-            given[..., :3] = rotate(turn, given[..., :3])
+            given[..., :3] = rotate(quat, given[..., :3])
             if given.shape[-1] == POSE_PARAMETERS:
-                given[..., 3:] = quat_multiply(turn, given[..., 3:])
+                given[..., 3:] = quat_multiply(quat, given[..., 3:])
     return states
 
 
-def ground_turned(scene: Scene, turn: Tensor) -> Scene:
-    """The robot over its ground, turned by a quaternion ``(4,)`` about the origin."""
+def with_rotated_ground(scene: Scene, quat: Tensor) -> Scene:
+    """The scene with its ground rotated by a quaternion ``(4,)`` about the origin."""
     model = copy.copy(scene.model)
     for geom in ground_geoms(model):
         position = torch.from_numpy(scene.model.geom_pos[geom].copy())
-        quat = torch.from_numpy(scene.model.geom_quat[geom].copy())
-        model.geom_pos[geom] = rotate(turn, position).numpy()
-        model.geom_quat[geom] = quat_multiply(turn, quat).numpy()
+        pose = torch.from_numpy(scene.model.geom_quat[geom].copy())
+        model.geom_pos[geom] = rotate(quat, position).numpy()
+        model.geom_quat[geom] = quat_multiply(quat, pose).numpy()
         model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's frame for it
     return replace(scene, model=model)

@@ -1,11 +1,16 @@
-"""Every hard case, by name; a new one is a file with a ``CASE``, found here."""
+"""Every hard case, by name; a new one is a function with ``@hard_case`` in a file here."""
 
-from importlib import import_module
-from pkgutil import iter_modules
+from torchrl_nerd.evaluation.stability import case
+from torchrl_nerd.evaluation.stability.cases import (  # noqa: F401
+    contact,
+    energy,
+    gradients,
+    invariance,
+    isolation,
+    limits,
+    numerics,
+    ood,
+    prediction,
+)
 
-from torchrl_nerd.evaluation.stability.case import Case
-
-CASES: dict[str, Case] = {
-    module.name: import_module(f"{__name__}.{module.name}").CASE
-    for module in iter_modules(__path__)
-}
+CASES = dict(sorted(case.CASES.items()))

@@ -1,89 +1,75 @@
-"""Gradients through 1, 32 and 100 steps, in contact where there is one."""
+"""Gradients through 1, 32 and 100 steps, in contact where there is a ground."""
 
 import torch
 from tensordict import TensorDict
-from torch import Generator, Tensor
+from torch import Tensor
 
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.stability.case import Case, Figures, has_floating_base
-from torchrl_nerd.evaluation.stability.states import (
-    settled,
-    starts,
-    uniform_torque,
+from torchrl_nerd.evaluation.stability.case import (
+    Metrics,
+    Trial,
+    hard_case,
+    has_floating_base,
 )
-from torchrl_nerd.evaluation.stability.world import World
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.scenes import Scene
 
-ROWS = 8
 SLOW = 0.1  # of the training speeds
-BROKEN = "gradients that are no numbers"
-OFF = "one step against finite differences, share"
+NON_FINITE = "non-finite gradients"
+ERROR = "one step against finite differences, relative"
 
 
-def _run(world: World, generator: Generator, scale: float) -> Figures:
-    learned = world.dynamics
-    if not isinstance(learned, NeRDDynamics):
-        return {BROKEN: 0.0, OFF: 0.0}  # MuJoCo has none
-    model = learned.model
-    was = model.dtype
+@hard_case(tolerances={NON_FINITE: 0.0, ERROR: 1e-4}, needs="model")
+def gradients(trial: Trial) -> Metrics:
+    """Gradients equal finite differences and stay finite over 100 steps."""
+    model, dtype = trial.model, trial.model.dtype
     model.network.double()  # finite differences of float32 are noise
     try:
         dynamics = NeRDDynamics(model, differentiable=True)
-        return _figures(dynamics, _begin(world.scene, generator), generator)
+        return _measure(dynamics, _start(trial), trial)
     finally:
-        model.network.to(was)
+        model.network.to(dtype)
 
 
-def _begin(scene: Scene, generator: Generator) -> TensorDict:
-    """On the ground where a robot can lie there, and moving a little."""
-    start = starts(scene, ROWS, generator)
-    if not has_floating_base(scene):
+def _start(trial: Trial) -> TensorDict:
+    """On the ground where the robot can lie there, moving slowly."""
+    start = trial.starts(8)
+    if not has_floating_base(trial.scene):
         return start
-    rest = settled(scene, ROWS).clone()
-    rest[QVEL] += SLOW * start[QVEL][: len(rest)]
-    return rest
+    lying = trial.settled(8)
+    lying[QVEL] += SLOW * start[QVEL][: len(lying)]
+    return lying
 
 
-def _figures(
-    dynamics: NeRDDynamics, start: TensorDict, generator: Generator
-) -> Figures:
-    torque = uniform_torque(dynamics.scene, len(start), 100, generator)
-    given = start[QVEL], torque[:, 0]
-    broken, figures = 0, {}
+def _measure(dynamics: NeRDDynamics, start: TensorDict, trial: Trial) -> Metrics:
+    torque = trial.torques(len(start), 100)
+    inputs = start[QVEL], torque[:, 0]
+    metrics: Metrics = {NON_FINITE: 0.0}
     for steps in (1, 32, 100):
-        slopes = _slopes(dynamics, start, given, torque, steps)
-        broken += sum(int((~slope.isfinite()).sum()) for slope in slopes)
-        highest = max(float(slope.abs().amax()) for slope in slopes if slope.numel())
-        figures[f"largest gradient after {steps} steps"] = highest
-    slopes = _slopes(dynamics, start, given, torque, 1)
-    ways = [
-        1e-6
-        * (1.0 + x.abs().amax(0))
-        * torch.randn(x.shape, generator=generator, dtype=torch.float64)
-        for x in given
-    ]
+        found = _gradients(dynamics, start, inputs, torque[:, 1:steps])
+        metrics[NON_FINITE] += sum(float((~g.isfinite()).sum()) for g in found)
+        sizes = [float(g.abs().amax()) for g in found if g.numel()]
+        metrics[f"largest gradient after {steps} steps"] = max(sizes)
+    step = [1e-6 * (1.0 + x.abs().amax(0)) * trial.normal(*x.shape) for x in inputs]
     ahead, behind = (
-        _end(dynamics, start, [x + s * w for x, w in zip(given, ways, strict=True)])
+        _end(dynamics, start, [x + s * d for x, d in zip(inputs, step, strict=True)])
         for s in (1.0, -1.0)
     )
-    found = 0.5 * (ahead - behind).sum().detach()
-    pairs = zip(slopes, ways, strict=True)
-    expected = torch.stack([(slope * way).sum() for slope, way in pairs]).sum()
-    figures[OFF] = float((found - expected).abs() / (expected.abs() + 1e-15))
-    return {BROKEN: float(broken), **figures}
+    central = 0.5 * (ahead - behind).sum().detach()
+    pairs = zip(_gradients(dynamics, start, inputs, torque[:, :0]), step, strict=True)
+    expected = torch.stack([(g * d).sum() for g, d in pairs]).sum()
+    error = (central - expected).abs() / (expected.abs() + 1e-15)
+    return metrics | {ERROR: float(error)}
 
 
-def _slopes(
+def _gradients(
     dynamics: NeRDDynamics,
     start: TensorDict,
-    given: tuple[Tensor, Tensor],
-    torque: Tensor,
-    steps: int,
+    inputs: tuple[Tensor, Tensor],
+    later: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Of the summed velocities at the end, by the first velocities and torques."""
-    first = [x.clone().requires_grad_() for x in given]
-    end = _end(dynamics, start, first, torque[:, 1:steps]).sum()
+    """Of the summed final velocities by ``inputs``."""
+    first = [x.clone().requires_grad_() for x in inputs]
+    end = _end(dynamics, start, first, later).sum()
     return torch.autograd.grad(end, first, allow_unused=True, materialize_grads=True)
 
 
@@ -93,20 +79,10 @@ def _end(
     first: list[Tensor],
     later: Tensor | None = None,
 ) -> Tensor:
-    """Velocities after a step from given velocities and torques, and some later ones."""
-    qvel, push = first
+    """Final velocities from first velocities and torques, and the later torques."""
+    qvel, torque = first
     state = start.select(QPOS).set(QVEL, qvel)
     dynamics.reset(state)
-    pushes = [push] if later is None else [push, *later.unbind(1)]
-    for now in pushes:
+    for now in (torque, *(() if later is None else later.unbind(1))):
         state = dynamics.step(state, now, start.get(TERRAIN, None))
     return state[QVEL]
-
-
-CASE = Case(
-    "gradients",
-    "a differentiable step has the slope that it shows, and a long way stays finite",
-    _run,
-    lines={BROKEN: 0.0, OFF: 1e-4},
-    needs_dynamics=True,
-)
