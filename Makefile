@@ -21,13 +21,16 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup demo test check test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z_-]+:.*## / { printf "  %-26s %s\n", $$1, $$2 }' Makefile
 
 setup: $(STAMP) ## make .venv, the only step before any `.venv/bin/nerd ...`
+
+dev: $(STAMP) ## and what some tests alone need: Ray, W&B, skrl; and pre-commit
+	$(PIP) -c $(CONSTRAINTS) -e ".[dev]"
 
 # PyTorch goes first, so that nothing else chooses its build. dm_control goes last and
 # alone: from Python 3.13 on one package that it names, but the suite does not use, has
@@ -37,7 +40,7 @@ $(STAMP):
 	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	@echo "Installing into $(VENV): minutes the first time, nothing the second"
 	$(PIP) "$(TORCH)" $(if $(TORCH_INDEX),--extra-index-url "$(TORCH_INDEX)")
-	$(PIP) -c $(CONSTRAINTS) -e ".[dev]"
+	$(PIP) -c $(CONSTRAINTS) -e ".[lint,test]"
 	$(PIP) --no-deps "$(DM_CONTROL)"
 	@rm -f $(VENV)/.installed-* && touch $@
 
@@ -157,7 +160,7 @@ build: $(STAMP) ## wheel and source archive in dist/
 
 lock: ## write the newest versions that pyproject.toml allows to constraints.txt
 	rm -rf $(VENV)
-	$(MAKE) setup docs CONSTRAINTS=/dev/null
+	$(MAKE) dev docs CONSTRAINTS=/dev/null
 	echo "# The versions that make installs; written by make lock." > constraints.txt
 	$(PY) -m pip freeze -qq --exclude-editable | sed 's/+.*//' >> constraints.txt
 

@@ -47,6 +47,7 @@ def test_a_suite_task_from_its_name_to_a_report(monkeypatch, tmp_path, seed, cap
 
 def test_a_library_that_knows_gymnasium_alone_learns_in_it(monkeypatch, seed, capsys):
     monkeypatch.syspath_prepend(str(EXAMPLES))
+    pytest.importorskip("skrl")
     import gymnasium_skrl as example
 
     cfg = example.Config(num_envs=4, rollout=8, steps=16, episode=5, seed=seed % 1000)

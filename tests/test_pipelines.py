@@ -173,8 +173,7 @@ def test_collectors_mix_both_dynamics(example, way):
 @pytest.mark.parametrize("moment", ["collecting", "learning"])
 def test_ppo_outlives_a_worker_of_ray(example, moment, monkeypatch, capsys):
     """Killed while it collects, or while the policy learns; the next batch is whole."""
-    import ray
-
+    ray = pytest.importorskip("ray")
     paths = [str(EXAMPLES), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))  # workers import it, too
     monkeypatch.setenv("RAY_worker_niceness", "0")

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import ray
 import torch
 
 from torchrl_nerd.cli import main
@@ -20,6 +19,7 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.robots import load_scene
 
+ray = pytest.importorskip("ray")
 SCENE = load_scene("double_pendulum")
 CONFIG = DataConfig(trajectories=22, steps=4)
 

@@ -102,7 +102,7 @@ def test_torchrl_rolls_it_out(guard, seed):
     """With automatic resets, whatever looks at its steps."""
     task = make_task(TASK)
     task.horizon = 3
-    envs = [NeRDEnv(task, None, ROWS, seed=1, guard=guard) for _ in range(2)]
+    envs = [NeRDEnv(task, num_envs=ROWS, seed=1, guard=guard) for _ in range(2)]
     envs[1].compile()
     paths = []
     for env in envs:
