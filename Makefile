@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -57,6 +57,12 @@ check: $(STAMP) ## lint, format, types, imports and docstrings alone
 	$(PY) -m ruff format --check .
 	$(PY) -m basedpyright
 	$(PY) tests/tools/check_source.py
+
+size: $(STAMP) ## lines and comments of the package, and files that are too long
+	$(PY) tests/tools/size.py
+
+words: $(STAMP) ## words that the glossary replaced, by word and by file
+	$(PY) tests/tools/check_words.py $(ARGS)
 
 test-slow: $(STAMP) ## the tests that take minutes and all products of parameters, on random inputs
 	$(PYTEST) -m "slow and not gpu" --seed random $(ARGS)
