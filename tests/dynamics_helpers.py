@@ -98,7 +98,9 @@ each_analytic = pytest.mark.parametrize(
 MOTORS = [name for name in SCENES if load_scene(name).actuated]
 ACTIONS = [name for name in TASKS if make_task(name).controller.num_actions]
 
-each_with_motors = pytest.mark.parametrize("scene", map(load_scene, MOTORS), ids=MOTORS)
+each_with_motors = pytest.mark.parametrize(
+    "scene", [*map(load_scene, MOTORS)], ids=MOTORS
+)
 each_with_actions = pytest.mark.parametrize("task_id", ACTIONS)
 """Robots and tasks that can be driven; a cube cannot."""
 

@@ -17,7 +17,7 @@ from torchrl_nerd.robots import PRESETS, SCENES, load_scene
 
 NOTHING_RANDOM = ("doctor", "replay", "explain")
 SOON_DONE = ("plot", "explain", "replay")
-QUICK = ("cartpole", "double_pendulum", "cube")  # the others take minutes in all
+QUICK = ("cartpole",)  # the others take minutes in all
 TINY = [
     "--network",
     "mlp-4x64",
@@ -303,6 +303,7 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
     assert read(half)["errors"] != content["errors"]  # of other rounding
 
 
+@pytest.mark.slow
 def test_a_third_party_robot_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
     """Default folders, whose names hold no slash; the preset and protocol of any robot."""
     monkeypatch.chdir(tmp_path)
@@ -367,7 +368,7 @@ def test_names_of_robots_are_names_of_folders(name, expected):
 
 
 def test_progress_is_shown_apart_from_the_table(tmp_path, monkeypatch, capsys):
-    model = ["--model", "cartpole-micro", "--rows", "2"]
+    model = ["--model", "cartpole-mlp", "--rows", "2"]
     assert main(["eval", "cartpole", *model]) == 0
     shown = capsys.readouterr()
     assert "cartpole:" in shown.err and "it/s" in shown.err

@@ -3,12 +3,14 @@
 import doctest
 import importlib
 import inspect
+import io
 import os
 import pkgutil
 import re
 import shlex
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +25,7 @@ from tensordict import TensorDict
 
 import torchrl_nerd
 from torchrl_nerd import load_scene
-from torchrl_nerd.cli import main
+from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.evaluation.policy import Policy, save_policy
 from torchrl_nerd.robots import TASKS, make_task
 
@@ -56,7 +58,11 @@ BUDGETS = {
 }
 """What commands of the pages get instead of, or beside, their own options."""
 
-each_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+
+def slow_page(page: Path):
+    """A page for `pytest.mark.parametrize`, slow where its code takes long."""
+    marks = [pytest.mark.slow] * (page.stem in ("pipelines", "drop_ins"))
+    return pytest.param(page, marks=marks, id=page.stem)
 
 
 def prose(page: Path) -> str:
@@ -75,17 +81,25 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[\s-]+", "-", title).strip("-") for title in plain}
 
 
-@each_page
-def test_every_relative_link_leads_somewhere(page):
-    for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
-        if "://" in link:
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        assert target.is_file(), f"{page.name}: {link}"
-        assert target.is_relative_to(ROOT)
-        if anchor:
-            assert anchor in anchors(target), f"{page.name}: {link}"
+def leads_somewhere(page: Path, link: str) -> bool:
+    """Whether a relative link is to a file, and to a heading if it names one."""
+    path, _, anchor = link.partition("#")
+    target = (page.parent / path).resolve() if path else page
+    if not target.is_file() or not target.is_relative_to(ROOT):
+        return False
+    return not anchor or anchor in anchors(target)
+
+
+def test_every_relative_link_leads_somewhere():
+    links = [
+        (page, link)
+        for page in PAGES
+        for link in re.findall(r"\]\(([^)\s]+)\)", prose(page))
+        if "://" not in link
+    ]
+    assert len(links) > 50
+    dead = [f"{p.name}: {link}" for p, link in links if not leads_somewhere(p, link)]
+    assert not dead
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -94,7 +108,15 @@ def commands(page: Path) -> list[list[str]]:
     return [shlex.split(line, comments=True) for line in lines]
 
 
-@each_page
+def gives_commands(page: Path) -> bool:
+    """Whether a page shows a command of the package."""
+    return any(words[:1] == ["nerd"] for words in commands(page))
+
+
+WITH_COMMANDS = [page for page in PAGES if gives_commands(page)]
+
+
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda p: p.name)
 def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
     """Dry: of what it reads, the recorded tosses and policies alone must be there."""
     monkeypatch.chdir(tmp_path)
@@ -114,14 +136,8 @@ def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
         assert main([*words[1:], "--dry-run"]) == 0, capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        "docs/start.md",
-        pytest.param("docs/howto/robot.md", marks=pytest.mark.slow),
-        pytest.param("README.md", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["docs/start.md", "docs/howto/robot.md", "README.md"])
 def test_a_new_users_commands_work_one_after_the_other(
     page, tmp_path, monkeypatch, capsys
 ):
@@ -158,30 +174,43 @@ def within_budget(words: list[str]) -> list[str]:
     return command
 
 
-@each_page
-def test_every_option_that_is_named_exists(page, capsys):
+def help_of(command: str) -> str:
+    """What a command says of its options."""
+    said = io.StringIO()
+    with pytest.raises(SystemExit), redirect_stdout(said):
+        main([command, "--help"])
+    return said.getvalue()
+
+
+def test_every_option_that_is_named_exists():
     """In `code` amid the text, where commands are cut short."""
-    found = re.findall(r"`nerd ([a-z]+)([^`]*)`", page.read_text())
-    for name, options in found:
-        with pytest.raises(SystemExit):
-            main([name, "--help"])
-        known = capsys.readouterr().out
-        for option in re.findall(r"--[a-z0-9-]+", options):
-            assert re.search(rf"{option}(?![\w-])", known), f"nerd {name}{options}"
+    unknown, known = [], {name: help_of(name) for name in COMMANDS}
+    for page in PAGES:
+        for name, options in re.findall(r"`nerd ([a-z]+)([^`]*)`", page.read_text()):
+            unknown += [
+                f"{page.name}: nerd {name} {option}"
+                for option in re.findall(r"--[a-z0-9-]+", options)
+                if not re.search(rf"{option}(?![\w-])", known.get(name, ""))
+            ]
+    assert not unknown
 
 
-@each_page
-def test_every_file_that_is_named_is_there(page):
-    """Files of the repository in `code`, from its root or from the package."""
+def is_there(page: Path, name: str) -> bool:
+    """Whether a page names a file of the repository, from its root or the package."""
+    if "NAME" in name or "SCENE" in name or name.startswith(("runs/", "results/")):
+        return True
+    places = (ROOT / name, ROOT / "torchrl_nerd" / name, page.parent / name)
+    return any(place.exists() for place in places)
+
+
+def test_every_file_that_is_named_is_there():
     pattern = r"`((?:[\w.-]+/)+[\w-]+\.(?:py|md|json|png))`"
-    for name in re.findall(pattern, page.read_text()):
-        if "NAME" in name or "SCENE" in name or name.startswith(("runs/", "results/")):
-            continue
-        places = (ROOT / name, ROOT / "torchrl_nerd" / name, page.parent / name)
-        assert any(place.exists() for place in places), f"{page.name}: {name}"
+    named = [(p, name) for p in PAGES for name in re.findall(pattern, p.read_text())]
+    assert named
+    assert not [f"{p.name}: {name}" for p, name in named if not is_there(p, name)]
 
 
-@pytest.mark.parametrize("page", RUN, ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", [slow_page(page) for page in RUN])
 def test_code_of_the_pages_runs(page, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}  # a page's blocks follow on each other
@@ -190,10 +219,10 @@ def test_code_of_the_pages_runs(page, monkeypatch, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
-def test_code_of_every_page_can_be_read(page):
-    for code in blocks(page, "python"):
-        compile(code, page.name, "exec")
+def test_code_of_every_page_can_be_read():
+    for page in PAGES:
+        for code in blocks(page, "python"):
+            compile(code, page.name, "exec")
 
 
 def test_every_public_name_says_what_it_is():

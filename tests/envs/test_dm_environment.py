@@ -36,10 +36,12 @@ class Contract(test_utils.EnvironmentTestMixin):
         return DmEnvironment(task, self.dynamics)
 
 
-for _task in TASKS:
+for _number, _task in enumerate(TASKS):
     for _dynamics in ("mujoco", "learned"):
         _name = f"Test_{_task.replace('/', '_')}_{_dynamics}"
-        _fields = {"task_id": _task, "dynamics": _dynamics}
+        _is_quick = (_dynamics == "learned") == bool(_number % 2)  # each task once
+        _marks = [] if _is_quick else [pytest.mark.slow]
+        _fields = {"task_id": _task, "dynamics": _dynamics, "pytestmark": _marks}
         globals()[_name] = type(_name, (Contract, absltest.TestCase), _fields)
 
 
