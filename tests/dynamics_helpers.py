@@ -35,7 +35,7 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import SCENES, TASKS, load_scene, make_task
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.sequences import cover, data_stats
+from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.transforms import Stats
 
 HAS_COMPILER = any(map(which, ("g++", "clang++")))  # what inductor looks for

@@ -23,7 +23,7 @@ from torchrl_nerd.keys import (
 )
 from torchrl_nerd.modules.nerd import TARGET, TOKEN
 from torchrl_nerd.robots import load_scene, source_of
-from torchrl_nerd.training.sequences import raw_tokens
+from torchrl_nerd.training.samples import raw_tokens
 
 every_variant = pytest.mark.parametrize(
     ("name", "variant"),

@@ -24,7 +24,7 @@ def parts_of(rows: int, least: int) -> int:
 
 
 class RowThreads(Generic[Result]):
-    """A function of tensors of rows, in parts on threads; its result is one or a tuple of them.
+    """A function of tensors of rows, computed in parts on threads.
 
     The parts record no gradients.
 

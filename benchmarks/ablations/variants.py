@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from typing import cast
 
 from tensordict import TensorDict
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 
 from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.gru import GRUConfig
+from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, Config, NeRD, unit_stats
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.sequences import stats_of
+from torchrl_nerd.training.samples import stats_of
 from torchrl_nerd.transforms import StateDelta
 
 from . import features, targets

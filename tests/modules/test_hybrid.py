@@ -26,7 +26,7 @@ from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.training_range import magnitudes
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.training.sequences import cover
+from torchrl_nerd.training.samples import cover
 
 ROWS = 32
 

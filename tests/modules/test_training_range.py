@@ -6,7 +6,7 @@ from dynamics_helpers import LEARNED, little_data, random_drive, random_model
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.training_range import TrainingRange, magnitudes
-from torchrl_nerd.training.sequences import cover, normalised
+from torchrl_nerd.training.samples import cover, normalised
 
 ROWS = 16
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 from helpers import every_scene, random_transitions, true_step
 from torch import Tensor, nn
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 
 from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.modules.gru import GRUConfig
+from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.robots import SCENES, load_scene
@@ -17,7 +18,7 @@ from torchrl_nerd.training.losses import (
     relative_error,
     rollout_loss,
 )
-from torchrl_nerd.training.sequences import data_stats, raw_tokens
+from torchrl_nerd.training.samples import data_stats, raw_tokens
 
 ROWS = 12
 

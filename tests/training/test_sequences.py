@@ -5,11 +5,12 @@ import torch
 from helpers import true_step
 from tensordict import TensorDict
 from torch import Generator
-from torchrl_nerd.modules.baselines import MLPConfig
 
 from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
-from torchrl_nerd.training.sequences import PART, Sequences, data_stats, raw_tokens
+from torchrl_nerd.training.samples import PART, data_stats, raw_tokens
+from torchrl_nerd.training.sequences import Sequences
 
 STEPS = 6
 

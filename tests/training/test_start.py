@@ -22,7 +22,8 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.training import validation
-from torchrl_nerd.training.sequences import Symmetry, cover, data_stats
+from torchrl_nerd.training.augmentation import Symmetry
+from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
 from torchrl_nerd.training.trainer import Trainer
 

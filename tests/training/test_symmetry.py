@@ -3,7 +3,6 @@
 import pytest
 import torch
 from torch import Generator
-from torchrl_nerd.modules.baselines import MLPConfig
 
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
@@ -11,13 +10,15 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.images import Images
+from torchrl_nerd.training.augmentation import SignedPermutations, Symmetry
 from torchrl_nerd.training.losses import rollout_loss
-from torchrl_nerd.training.sequences import Sequences, Symmetry, data_stats, raw_tokens
+from torchrl_nerd.training.samples import data_stats, raw_tokens
+from torchrl_nerd.training.sequences import Sequences
 from torchrl_nerd.training.symmetry import find_isometries
 from torchrl_nerd.training.trainer import Trainer
 from torchrl_nerd.transforms import StateDelta
@@ -84,7 +85,7 @@ def test_tokens_and_targets_are_renumbered(scene, data):
         there = raw_tokens(*encode, isometry(flat))
         choice = torch.full((len(flat),), number)
         for key, x, expected in zip((TOKEN, TARGET), here, there, strict=True):
-            image = symmetry.images[key](x[:, None], choice)[:, 0]
+            image = symmetry.permutations[key](x[:, None], choice)[:, 0]
             torch.testing.assert_close(image, expected, rtol=1e-6, atol=1e-6)
 
 
@@ -103,7 +104,9 @@ def test_statistics_are_those_of_all_images(scene, data):
             found[key].std, expected[key].std, rtol=1e-5, atol=1e-6
         )
         for source, sign in zip(
-            symmetry.images[key].sources, symmetry.images[key].signs, strict=True
+            symmetry.permutations[key].sources,
+            symmetry.permutations[key].signs,
+            strict=True,
         ):
             mean, std = found[key].mean, found[key].std
             torch.testing.assert_close(mean, sign * mean[source], atol=1e-9, rtol=1e-9)
@@ -133,9 +136,9 @@ def test_batches_show_images_of_the_data(scene, data, generator):
 def test_what_is_no_symmetry_is_refused():
     x = torch.randn(20, 3).double()
     with pytest.raises(ValueError, match="entry 1 of the image"):
-        Images(x, [x * torch.tensor([1.0, 2.0, 1.0])])
+        SignedPermutations(x, [x * torch.tensor([1.0, 2.0, 1.0])])
     swapped = torch.stack((x[:, 1], -x[:, 0], x[:, 2]), -1)
-    images = Images(x, [x, swapped])
+    images = SignedPermutations(x, [x, swapped])
     assert images.sources.tolist() == [[0, 1, 2], [1, 0, 2]]
     assert images.signs.tolist() == [[1, 1, 1], [1, -1, 1]]
 

@@ -12,7 +12,8 @@ from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.sequences import Symmetry, data_stats
+from torchrl_nerd.training.augmentation import Symmetry
+from torchrl_nerd.training.samples import data_stats
 from torchrl_nerd.transforms import Stats
 
 

@@ -20,6 +20,7 @@ from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.training import ranks
+from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.loggers import LoggerName, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
@@ -32,7 +33,8 @@ from torchrl_nerd.training.optimizers import (
 )
 from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.run_state import RunState
-from torchrl_nerd.training.sequences import Sequences, Symmetry, cover
+from torchrl_nerd.training.samples import cover
+from torchrl_nerd.training.sequences import Sequences
 from torchrl_nerd.training.start import begin_from, fingerprint, fresh_model
 from torchrl_nerd.training.validation import Errors, Validation, for_card, metrics
 

@@ -4,10 +4,11 @@ import pytest
 import torch
 from dynamics_helpers import random_model
 from tensordict import TensorDict
-from torchrl_nerd.modules.baselines import GRUConfig, MLPConfig
 
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.cost import step_cost
+from torchrl_nerd.modules.gru import GRUConfig
+from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.modules.transformer import HEAD_WIDTH

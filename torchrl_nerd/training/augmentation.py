@@ -1,0 +1,162 @@
+"""Data augmentation by a robot's symmetries: each sample as a random one of its images.
+
+The image of a token or target under an isometry is a signed permutation of its entries.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from tensordict import TensorDict
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.nerd import TARGET, TOKEN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training.samples import PART, raw_tokens
+from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_contact
+from torchrl_nerd.transforms import Normalize, StateDelta, Stats
+
+RTOL = 1e-7  # of equal entries, relative to the largest of a column
+STATS_TOL = (
+    1e-3  # standard deviations: more than rounding, less than matters to a network
+)
+SEARCH_PARTS = 8  # of `PART` trajectories that are searched for hard examples
+# states with every contact point in the ground, which small data sets may not have
+LOW_STATES, MAX_DEPTH = 256, 1.0  # -, m
+
+
+class SignedPermutations:
+    """Images of a kind of vector under isometries: ``image[j] = sign[j] x[source[j]]``.
+
+    Sources and signs are found from samples and their images.
+
+    Args:
+        original: ``(N, F)``, samples in which every entry that ever differs from zero
+            does so somewhere.
+        images: the same samples under each isometry, ``(N, F)``.
+
+    Raises:
+        ValueError: an entry of an image that is none of the original's.
+    """
+
+    def __init__(self, original: Tensor, images: Sequence[Tensor]) -> None:
+        pairs = [_match(original, image) for image in images]
+        self.sources, self.signs = (torch.stack(x) for x in zip(*pairs, strict=True))
+
+    def __call__(self, x: Tensor, choice: Tensor) -> Tensor:
+        """Images of ``x (rows, length, F)``, each row by isometry ``choice (rows,)``."""
+        sources = self.sources[choice][:, None].expand(x.shape)
+        return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
+
+    def complete(self, stats: Stats) -> Stats:
+        """Statistics of all images of the samples that ``stats`` is of.
+
+        With these, normalised vectors are renumbered as raw ones are.
+        """
+        merged, *others = (
+            Stats(stats.count, sign * stats.mean[source], stats.m2[source])
+            for source, sign in zip(self.sources, self.signs, strict=True)
+        )
+        for other in others:
+            merged = merged.merge(other)
+        return merged
+
+    def keep(self, mean: Tensor, std: Tensor) -> bool:
+        """Whether images of samples of these statistics ``(F,)`` have the same ones."""
+        means, stds = self.signs * mean[self.sources], std[self.sources]
+        apart = torch.maximum((means - mean).abs(), (stds - std).abs())
+        return bool((apart < STATS_TOL * std).all())
+
+    def to(self, device: torch.device) -> "SignedPermutations":
+        """On another device, in place."""
+        self.sources, self.signs = self.sources.to(device), self.signs.to(device)
+        return self
+
+
+def hard_examples(x: Tensor, per_column: int = 8) -> Tensor:
+    """Indices of the samples in ``x (N, F)`` with the largest entries of each column."""
+    count = min(per_column, len(x))
+    return x.abs().topk(count, 0).indices.flatten().unique()
+
+
+def _match(original: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    scale = RTOL * (original.abs().amax(0) + 1e-3)
+    sources, signs = [], []
+    for j, column in enumerate(image.T):
+        for sign in (1.0, -1.0):
+            apart = (column[:, None] - sign * original).abs().amax(0)
+            fits = (apart <= scale).nonzero()[:, 0].tolist()
+            if fits:  # of several alike, such as constants, its own
+                sources.append(j if j in fits else fits[0])
+                signs.append(sign)
+                break
+        else:
+            raise ValueError(f"entry {j} of the image is no entry of the original")
+    return torch.tensor(sources), torch.tensor(signs, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Isometries of a robot and their effect on its tokens and targets.
+
+    | field | meaning |
+    |---|---|
+    | ``isometries`` | the identity first |
+    | ``permutations`` | of `TOKEN` and `TARGET` |
+    """
+
+    isometries: tuple[Isometry, ...]
+    permutations: dict[str, SignedPermutations]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
+    ) -> "Symmetry":
+        """The symmetry of a robot; permutations are found from samples of ``data``."""
+        isometries = find_isometries(scene)
+        tokens, targets = SceneFeatures(scene, config), StateDelta(scene)
+        low = states_in_contact(scene, LOW_STATES, MAX_DEPTH)
+
+        def hardest(flat: TensorDict) -> TensorDict:
+            rows = [hard_examples(x) for x in raw_tokens(tokens, targets, flat)]
+            return cast(TensorDict, flat[torch.cat(rows).unique()])
+
+        # the largest of all are among the largest of the parts, one at a time in memory
+        parts = data[: SEARCH_PARTS * PART].split(PART)
+        found = [hardest(cast(TensorDict, part.flatten(0, 1))) for part in parts]
+        some = hardest(cast(TensorDict, TensorDict.cat(found)))
+        token_images, target_images = [], []
+        for isometry in isometries:
+            token, target = raw_tokens(tokens, targets, isometry(some))
+            image = isometry(low)
+            keys = (QPOS, QVEL, JOINT_TORQUE)
+            other = tokens(*(image[k] for k in keys), image.get(TERRAIN, None))
+            token_images.append(torch.cat((token, other)))
+            target_images.append(target)
+        pairs = ((TOKEN, token_images), (TARGET, target_images))
+        found = {key: SignedPermutations(x[0], x) for key, x in pairs}
+        return cls(isometries, found)
+
+    def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
+        """Statistics of tokens and targets with all their images."""
+        return {
+            key: self.permutations[str(key)].complete(x) for key, x in stats.items()
+        }
+
+    def keeps(self, normalize: Normalize) -> bool:
+        """Whether images of normalised tokens and targets are those of raw ones."""
+        return all(
+            permutation.keep(normalize.mean(key), normalize.std(key))
+            for key, permutation in self.permutations.items()
+        )
+
+    def to(self, device: torch.device) -> "Symmetry":
+        """The same on another device."""
+        isometries = tuple(isometry.to(device) for isometry in self.isometries)
+        moved = {key: x.to(device) for key, x in self.permutations.items()}
+        return Symmetry(isometries, moved)

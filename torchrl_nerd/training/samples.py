@@ -1,0 +1,80 @@
+"""Tokens, targets and their statistics from a data set."""
+
+import torch
+from tensordict import TensorDict
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training import ranks
+from torchrl_nerd.transforms import StateDelta, Stats
+
+PART = 1024  # trajectories turned into tokens at a time
+
+
+def raw_tokens(
+    tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
+) -> tuple[Tensor, Tensor]:
+    """Unnormalised tokens ``(*batch, F)`` and targets ``(*batch, D)``, float64."""
+    terrain = data.get(TERRAIN, None)
+    token = tokens(data[QPOS], data[QVEL], data[JOINT_TORQUE], terrain)
+    target = state_delta.delta(data[QPOS], data[QVEL], data[NEXT_QPOS], data[NEXT_QVEL])
+    return token, target
+
+
+def data_stats(
+    scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
+) -> dict[NestedKey, Stats]:
+    """Exact statistics of a scene's features and targets over a data set."""
+    return stats_of(SceneFeatures(scene, config), StateDelta(scene), data)
+
+
+def stats_of(
+    tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
+) -> dict[NestedKey, Stats]:
+    """Exact statistics of tokens and targets over a data set, each rank's part of it."""
+    size = min(PART, -(-len(data) // ranks.world()))
+    mine = data.split(size)[ranks.rank() :: ranks.world()]
+    parts = [raw_tokens(tokens, state_delta, part) for part in mine]
+    stats: dict[NestedKey, Stats] = {}
+    for index, key in enumerate((TOKEN, TARGET)):
+        merged, *rest = (Stats.of(part[index]) for part in parts)
+        for other in rest:
+            merged = merged.merge(other)
+        stats[key] = ranks.merge_stats(merged)
+    return stats
+
+
+def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
+    """Features and targets of transitions, normalised, float32 ``(*batch, D)``."""
+    tokens, targets = (
+        torch.empty(*data.batch_size, size, device=data[QPOS].device)
+        for size in (model.scene_features.size, model.state_delta.size)
+    )
+    for part, *places in zip(
+        data.split(PART), tokens.split(PART), targets.split(PART), strict=True
+    ):
+        raw = raw_tokens(model.scene_features, model.state_delta, part)
+        for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
+            place.copy_(model.normalize.normalize(key, value))
+    return tokens, targets
+
+
+def cover(
+    model: NeRD, data: TensorDict, samples: tuple[Tensor, Tensor] | None = None
+) -> None:
+    """Fit a model's training range and out-of-distribution score to its data.
+
+    Args:
+        model: changed in place.
+        data: transitions, ``[trajectories, steps]``.
+        samples: their normalised features and targets, where they are there already.
+    """
+    features, targets = (x.flatten(0, -2) for x in samples or normalised(model, data))
+    seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
+    model.training_range.fit(features, targets, *seen)
+    model.ood.fit(features)
