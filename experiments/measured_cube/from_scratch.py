@@ -28,7 +28,7 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.sequences import cover, data_stats
+from torchrl_nerd.training.samples import cover, data_stats
 
 SCRATCH = FinetuneConfig(update="all", epochs=40, patience=16)
 CUBES, TOSSES, STATES, CHECKED = 50, 20, 100, 50

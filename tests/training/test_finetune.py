@@ -22,7 +22,7 @@ from torchrl_nerd.training.finetune import (
     weighted_error,
 )
 from torchrl_nerd.training.finetune_run import start_model
-from torchrl_nerd.training.sequences import cover, data_stats
+from torchrl_nerd.training.samples import cover, data_stats
 
 QUICK = FinetuneConfig(
     update="all", epochs=0.2, batch_size=64, sequence_length=4, validate_every=100

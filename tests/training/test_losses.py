@@ -6,7 +6,8 @@ import torch
 from helpers import every_scene, random_transitions, true_step
 from torch import Tensor, nn
 
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.configs import NO_PREDICTIONS
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.modules.gru import GRUConfig
 from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, NeRD
@@ -66,7 +67,7 @@ def batch_of(data) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
 
 
 def model_of(scene: Scene, data, config) -> NeRD:
-    model = NeRD(scene, config, data_stats(scene, data))
+    model = NeRD(scene, NO_PREDICTIONS, config, data_stats(scene, data))
     model.network.double()
     return model.train()
 
@@ -95,7 +96,7 @@ def test_the_truth_has_no_loss(scene, generator):
     draw = true_data if scene.name in SCENES else handmade_data
     data = draw(scene, 5, generator)
     model = model_of(scene, data, MLPConfig(1, 4))
-    _, target = raw_tokens(model.tokens, model.state_delta, data)
+    _, target = raw_tokens(model.scene_features, model.state_delta, data)
     outputs = model.normalize.normalize(TARGET, target)
     model.network = Recorded(outputs)
     assert rollout_loss(model, *batch_of(data), 0.1) < 2e-4
@@ -108,9 +109,9 @@ def test_one_step_of_the_cartpole_by_hand(generator):
     data = true_data(scene, 1, generator)
     model = model_of(scene, data, MLPConfig(1, 8))
     qpos, qvel, torque, _ = batch_of(data)
-    token = model.encode(qpos[:, 0], qvel[:, 0], torque[:, 0], None)
+    token = model.encode(qpos[:, 0], qvel[:, 0], torque[:, 0], None).token
     output = model.network(token).detach().numpy()
-    _, target = raw_tokens(model.tokens, model.state_delta, data)
+    _, target = raw_tokens(model.scene_features, model.state_delta, data)
     target = target.numpy().reshape(ROWS, 4)
     mean, std = target.mean(0), target.std(0)
     delta, step, scale = mean + std * output, 1.0 / 60.0, std[:2]

@@ -6,12 +6,13 @@ from dynamics_helpers import random_model, roll
 from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import SCENES
-from torchrl_nerd.training.rest import LARGEST, ROWS, STILL, find_rest, resting
+from torchrl_nerd.training.rest import MAX_SPEED, REST_SPEED, ROWS, find_rest, resting
 
 GROUNDED = [name for name in SCENES if load_scene(name).terrain is not None]
 each_grounded = pytest.mark.parametrize("name", GROUNDED)
@@ -28,7 +29,7 @@ def states_at_rest(scene, generator, rows=32):
 
 def sluggish_model(scene, generator, size):
     """Keeps every velocity but for noise of a size, in m/s and rad/s."""
-    model = NeRD(scene, network_config("mlp-1x32")).eval()
+    model = NeRD(scene, NO_PREDICTIONS, network_config("mlp-1x32")).eval()
     with torch.no_grad():
         for weight in model.network.head.parameters():
             weight.copy_(size * torch.randn(weight.shape, generator=generator))
@@ -45,9 +46,9 @@ def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
     model, states = sluggish_and_at_rest(load_scene(name), generator)
     assert not torch.equal(after(model, states, 50)[QPOS], states[QPOS])
     find_rest(model, states)
-    found = model.coverage.still.clone()
+    found = model.sleep.sleep_speed.clone()
     find_rest(model, states)
-    assert (found > 0.0).all() and torch.equal(model.coverage.still, found)
+    assert (found > 0.0).all() and torch.equal(model.sleep.sleep_speed, found)
     end = after(model, states, 50)
     assert torch.equal(end[QPOS], states[QPOS]) and not end[QVEL].any()
 
@@ -56,7 +57,7 @@ def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
 def test_what_moves_is_left_alone(name, generator):
     scene = load_scene(name)
     model, states = sluggish_and_at_rest(scene, generator)
-    states[QVEL] += 2 * LARGEST
+    states[QVEL] += 2 * MAX_SPEED
     before = after(model, states, 3)
     find_rest(model, states_at_rest(scene, generator))
     assert torch.equal(after(model, states, 3)[QPOS], before[QPOS])
@@ -66,17 +67,17 @@ def test_what_moves_is_left_alone(name, generator):
 def test_what_gains_more_speed_than_at_rest_is_awake(name, generator):
     model, states = sluggish_and_at_rest(load_scene(name), generator)
     find_rest(model, states)
-    cover, qpos, asleep = model.coverage, states[QPOS], states[QVEL]
-    assert (cover.gain < cover.still).all()  # one step of it, not twenty
+    sleep, qpos, asleep = model.sleep, states[QPOS], states[QVEL]
+    assert (sleep.sleep_gain < sleep.sleep_speed).all()  # one step of it, not twenty
     for share in (0.5, 2.0):
         push = torch.zeros_like(asleep)
-        push[:, 0] = share * cover.gain[0]
-        assert (push < cover.still).all()
+        push[:, 0] = share * sleep.sleep_gain[0]
+        assert (push < sleep.sleep_speed).all()
         is_awake = share > 1.0
-        moved, speed = cover.stay((qpos, asleep), (qpos + 1.0, push))
+        moved, speed = sleep.apply_sleep((qpos, asleep), (qpos + 1.0, push))
         assert torch.equal(speed, push if is_awake else asleep)
         assert torch.equal(moved, qpos + 1.0 if is_awake else qpos)
-        moved, speed = cover.stay((qpos, push), (qpos + 1.0, 0.5 * push))
+        moved, speed = sleep.apply_sleep((qpos, push), (qpos + 1.0, 0.5 * push))
         assert torch.equal(moved, qpos) and not speed.any()  # it was slowing down
 
 
@@ -85,22 +86,22 @@ def test_a_model_that_does_not_rest_stays_as_it_is(name, generator):
     scene = load_scene(name)
     model = random_model(scene, generator)
     find_rest(model, states_at_rest(scene, generator))
-    assert not model.coverage.still.any()
+    assert not model.sleep.sleep_speed.any()
     few = sluggish_model(scene, generator, 1e-5)
     find_rest(few, states_at_rest(scene, generator, 3))
-    assert not few.coverage.still.any()
+    assert not few.sleep.sleep_speed.any()
 
 
 def test_states_at_rest_are_found(generator):
     rows, steps = 30, 40
-    speed = torch.rand(rows, steps, 1, generator=generator).double() * 10.0 * STILL
+    speed = torch.rand(rows, steps, 1, generator=generator).double() * 10.0 * REST_SPEED
     data = TensorDict(
         {QVEL: speed, ("next", QVEL): speed.roll(-1, 1)}, batch_size=[rows, steps]
     )
     found = resting(data)
     assert 0 < len(found) <= ROWS
     for key in (QVEL, ("next", QVEL)):
-        assert (found[key] < STILL).all()
+        assert (found[key] < REST_SPEED).all()
     assert len(resting(data[:, :0])) == 0
 
 

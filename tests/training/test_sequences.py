@@ -6,7 +6,8 @@ from helpers import true_step
 from tensordict import TensorDict
 from torch import Generator
 
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.configs import NO_PREDICTIONS
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.training.samples import PART, data_stats, raw_tokens
@@ -23,7 +24,7 @@ def data(scene, generator) -> TensorDict:
 
 @pytest.fixture
 def model(scene, data) -> NeRD:
-    return NeRD(scene, MLPConfig(1, 4), data_stats(scene, data))
+    return NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 4), data_stats(scene, data))
 
 
 @pytest.fixture
@@ -64,13 +65,13 @@ def test_windows_move_as_the_truth_does(scene, sequences, generator):
 
 
 def test_tokens_and_targets_are_those_of_the_windows(model, sequences, seed):
-    tokens, targets = sequences.one_step(50, 4, Generator().manual_seed(seed))
+    inputs, targets = sequences.one_step(50, 4, Generator().manual_seed(seed))
     qpos, qvel, torque, terrain = sequences.rollout(
         50, 4, Generator().manual_seed(seed)
     )
     ground = None if terrain is None else terrain[:, None].expand(-1, 4, -1)
-    encoded = model.encode(qpos[:, :-1], qvel[:, :-1], torque, ground)
-    torch.testing.assert_close(tokens, encoded, rtol=1e-5, atol=1e-6)
+    encoded = model.encode(qpos[:, :-1], qvel[:, :-1], torque, ground).token
+    torch.testing.assert_close(inputs.token, encoded, rtol=1e-5, atol=1e-6)
     decoded = model.decode(qpos[:, :-1], qvel[:, :-1], targets.double())
     torch.testing.assert_close(decoded[0], qpos[:, 1:], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(decoded[1], qvel[:, 1:], rtol=1e-4, atol=1e-4)
@@ -81,16 +82,17 @@ def test_batches_depend_on_the_generator_alone(sequences, seed):
     torch.rand(3)
     second = sequences.one_step(9, 3, Generator().manual_seed(seed))
     third = sequences.one_step(9, 3, Generator().manual_seed(seed + 1))
-    assert all(map(torch.equal, first, second))
-    assert not torch.equal(first[0], third[0])
+    assert torch.equal(first[0].token, second[0].token)
+    assert torch.equal(first[1], second[1])
+    assert not torch.equal(first[0].token, third[0].token)
 
 
 def test_statistics_are_those_of_the_whole_data_set(scene, generator):
     data = simulate(scene, 2 * PART + 300, 2, generator)
     data = data[is_sound(data)]
-    model = NeRD(scene, MLPConfig(1, 4))
+    model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 4))
     stats = data_stats(scene, data)
-    whole = raw_tokens(model.tokens, model.state_delta, data)
+    whole = raw_tokens(model.scene_features, model.state_delta, data)
     for key, samples in zip((TOKEN, TARGET), whole, strict=True):
         samples = samples.flatten(0, 1)
         assert stats[key].count == len(samples)
@@ -102,7 +104,7 @@ def test_statistics_are_those_of_the_whole_data_set(scene, generator):
 
 
 def test_normalised_data_have_mean_zero_and_size_one(model, sequences):
-    for key, x in ((TOKEN, sequences.tokens), (TARGET, sequences.targets)):
+    for key, x in ((TOKEN, sequences.features), (TARGET, sequences.targets)):
         x = x.flatten(0, 1).double()
         hardly_moves = model.normalize.std(key) < 1e-5  # near the floor, or on it
         std = x.std(0, correction=0)

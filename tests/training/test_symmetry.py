@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Generator
 
-from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.configs import NO_PREDICTIONS, TrainConfig
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
@@ -116,7 +116,12 @@ def test_statistics_are_those_of_all_images(scene, data):
 def test_batches_show_images_of_the_data(scene, data, generator):
     """Those of one step and those of rollouts, which the true solver also takes."""
     symmetry = Symmetry.of(scene, data)
-    model = NeRD(scene, MLPConfig(1, 4), symmetry.complete(data_stats(scene, data)))
+    model = NeRD(
+        scene,
+        NO_PREDICTIONS,
+        MLPConfig(1, 4),
+        symmetry.complete(data_stats(scene, data)),
+    )
     sequences = Sequences(model, data, torch.device("cpu"), symmetry)
     qpos, qvel, torque, terrain = sequences.rollout(32, 2, generator)
     dynamics = MujocoDynamics(scene, num_threads=1)
@@ -129,8 +134,8 @@ def test_batches_show_images_of_the_data(scene, data, generator):
     assert _apart(scene, path[QPOS], qpos[:, 1:]).median() < 1e-6
     loss = rollout_loss(model, qpos, qvel, torque, terrain, 0.02)
     assert loss.isfinite()
-    tokens, targets = sequences.one_step(64, 2, generator)
-    assert tokens.shape[:2] == targets.shape[:2] == (64, 2)
+    inputs, targets = sequences.one_step(64, 2, generator)
+    assert inputs.token.shape[:2] == targets.shape[:2] == (64, 2)
 
 
 def test_what_is_no_symmetry_is_refused():
