@@ -178,7 +178,7 @@ def test_bad_arguments_are_refused_in_one_sentence(generator):
     ):
         GroundTruthEnv(TASK, "warp")
     with pytest.raises(
-        ValueError, match=f"unknown task 'swim', expected one of {TASK}"
+        ValueError, match=f"unknown task 'swim', expected one of .*{TASK}"
     ):
         make_env("swim", dynamics="mujoco")
     with pytest.raises(ValueError, match="inference"):
