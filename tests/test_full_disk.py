@@ -21,7 +21,7 @@ from fuzz_files import in_child
 def write(kind, folder):
     scene = load_scene(SCENE)
     if kind == "checkpoint":
-        model = NeRD(scene, NETWORKS["transformer-2x64"])
+        model = NeRD(scene, NO_PREDICTIONS, NETWORKS["transformer-2x64"])
         return lambda: save_checkpoint(model, folder, make_card(model))
     if kind == "data":
         config = DataConfig(trajectories=100, steps=100, seed=1)
@@ -74,7 +74,7 @@ for how in sys.argv[2].split():
             subprocess.run(["umount", str(folder)], check=True)
 print(json.dumps(said))
 """
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+TOOLS, ROOT = Path(__file__).parent / "tools", Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def said() -> dict[str, list[str]]:
             [sys.executable, "-c", SCRIPT, root, " ".join(HOWS), " ".join(KINDS)],
             capture_output=True,
             text=True,
-            env={**os.environ, "PYTHONPATH": f"{BENCHMARKS}:{BENCHMARKS.parent}"},
+            env={**os.environ, "PYTHONPATH": f"{TOOLS}:{ROOT}"},
         )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

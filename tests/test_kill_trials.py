@@ -1,4 +1,4 @@
-"""Killed at random times, nothing is lost beyond the last interval; see the benchmark."""
+"""Killed at random times, nothing is lost beyond the last interval; see the tool."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ import pytest
 
 from torchrl_nerd.files import read_json
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+TOOLS = Path(__file__).parent / "tools"
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.slow)])
@@ -16,7 +16,7 @@ def test_nothing_is_lost(kills, seed, tmp_path):
     command = [sys.executable, "kill_trials.py", "--kills", str(kills)]
     figures = tmp_path / "kills.json"
     subprocess.run(
-        [*command, "--seed", str(seed), "--json", figures], check=True, cwd=BENCHMARKS
+        [*command, "--seed", str(seed), "--json", figures], check=True, cwd=TOOLS
     )
     rows = read_json(figures)["kinds"]
     assert sum(row["kills"] for row in rows.values()) == kills

@@ -22,6 +22,8 @@ from torchrl_nerd.evaluation.policy_transfer import summarize
 from torchrl_nerd.transforms import Stats
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+ROUNDING = 1e-7  # m/s and rad/s, of a model's float32 in batches of another size
+slow = pytest.mark.slow
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def test_sac_learns_from_the_asked_share_of_true_transitions(example, share):
     assert int(stored["is_true"].sum()) == share * cfg.frames
     for name in ("mujoco", "nerd"):
         rows = stored[stored["is_true"] == (name == "mujoco")]
-        assert not len(rows) or step_error(name, rows) == 0.0
+        assert not len(rows) or step_error(name, rows) < ROUNDING
     assert all(weight.isfinite().all() for weight in agent.loss.parameters())
 
 
@@ -87,7 +89,7 @@ def test_dyna_branches_start_at_replayed_states(example):
     starts = learned.reshape(-1, cfg.branch)[:, 0]
     is_replayed = (starts["qpos"][:, None] == true["qpos"]).all(-1).any(-1)
     assert is_replayed.all()
-    assert step_error("nerd", starts) == 0.0 < step_error("mujoco", starts)
+    assert step_error("nerd", starts) < ROUNDING < step_error("mujoco", starts)
 
     env = make_env(cfg.task, "mujoco", len(starts))
     path = dyna.branches(env, agent, starts, steps=2)
@@ -134,19 +136,16 @@ def test_transforms_say_the_same_in_a_foreign_env_and_in_a_buffer(example):
     )
 
 
-def test_a_model_learned_through_the_transforms_foresees_the_change(example):
+@slow
+def test_a_model_learned_through_the_transforms_predicts_the_change(example):
     transforms = example("transforms")
     errors = transforms.main(transforms.Config(frames=200, updates=50, batch_size=64))
     assert set(errors) == {"robot", "robot and contacts"}
     assert all(error < 0.9 for error in errors.values())
 
 
-slow = pytest.mark.slow  # four processes more; tests/envs has a ParallelEnv of both
-
-
-@pytest.mark.parametrize(
-    "way", ["processes", pytest.param("parallel_envs", marks=slow)]
-)
+@slow  # of processes; tests/envs has a ParallelEnv of both
+@pytest.mark.parametrize("way", ["processes", "parallel_envs"])
 def test_collectors_mix_both_dynamics(example, way):
     collect = example("collect")
     cfg = collect.Config(num_envs=3, horizon=4, batches=2)
@@ -165,8 +164,8 @@ def test_collectors_mix_both_dynamics(example, way):
             assert first[key].shape[1:] == part[key].shape, key
             assert first[key].dtype == part[key].dtype, key
     for index, name in enumerate(("nerd", "mujoco")):
-        assert step_error(name, first[index, :, 0]) == 0.0
-        assert step_error(name, first[1 - index, :, 0]) > 0.0
+        assert step_error(name, first[index, :, 0]) < ROUNDING
+        assert step_error(name, first[1 - index, :, 0]) > ROUNDING
 
 
 @slow
@@ -250,6 +249,7 @@ def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path)
     assert (tmp_path / "returns.json").is_file()
 
 
+@slow
 def test_a_step_that_leads_astray_is_taken_back(example, tmp_path):
     """However large the step, nothing is lost: the start is what is left then."""
     first_order = example("first_order")

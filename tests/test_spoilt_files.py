@@ -23,7 +23,7 @@ from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training.log import TrainingLog
 
 FILES = 12  # of each kind
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+TOOLS = Path(__file__).parent / "tools"
 
 
 @pytest.fixture(autouse=True)
@@ -131,8 +131,8 @@ def test_data_that_are_not_finite(tmp_path, rng):
 @pytest.mark.parametrize(
     "network",
     [
-        {"kind": "mlp-4x64", "width": 2**14, "depth": 2**14},
-        {"kind": "mlp-4x64", "width": 2**14, "depth": 2},
+        {"kind": "mlp", "width": 2**14, "depth": 2**14},
+        {"kind": "mlp", "width": 2**14, "depth": 2},
         {"kind": "gru", "width": 2**14, "layers": 2**14},
         {"kind": "transformer", "width": 2**14, "layers": 2, "heads": 2, "band": 2},
     ],
@@ -201,7 +201,5 @@ def test_odd_names_are_refused_in_one_sentence(call, name):
 def test_thousands_of_spoilt_files(seed, tmp_path):
     """Each in a process with limits on time and memory."""
     command = [sys.executable, "fuzz_files.py", "--files", "3000", "--seed", str(seed)]
-    subprocess.run(
-        [*command, "--json", tmp_path / "f.json"], check=True, cwd=BENCHMARKS
-    )
+    subprocess.run([*command, "--json", tmp_path / "f.json"], check=True, cwd=TOOLS)
     assert read_json(tmp_path / "f.json")["losses"] == []

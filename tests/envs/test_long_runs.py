@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from dynamics_helpers import EnvMaker, random_actions
+from helpers import slow_but
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv
 
@@ -61,7 +62,7 @@ def sizes(dynamics: str, rows: int, steps: int, seed: int) -> list[int]:
 
 
 @each_length
-@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+@pytest.mark.parametrize("dynamics", slow_but(["streaming"], ["streaming", "mujoco"]))
 def test_memory_does_not_grow_with_steps_and_resets(dynamics, rows, steps, seed):
     # in a process of its own: what other tests left behind is reused, or not, at any time
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
@@ -71,7 +72,8 @@ def test_memory_does_not_grow_with_steps_and_resets(dynamics, rows, steps, seed)
     assert last - first < GROWTH, f"{2 * (last - first) / steps:.0f} bytes a step"
 
 
-@pytest.mark.parametrize("resets", [5, pytest.param(3000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("resets", [5, 3000])
 def test_parallel_envs_reset_and_leave_no_process(resets, generator):
     resource_tracker.ensure_running()  # Python's own, which stays
     before = children()

@@ -1,6 +1,6 @@
 """Spoilt files through every public loader: refused in one sentence, or sound.
 
-    python benchmarks/fuzz_files.py --files 10000 --seed 0 --json fuzz.json
+    python tests/tools/fuzz_files.py --files 10000 --seed 0 --json fuzz.json
 
 Files are loaded in child processes with limits on time and memory. A loss is anything but
 a sound object or one sentence as a ValueError: another exception, a crash, a hang, a
@@ -57,7 +57,7 @@ def in_child(work: Callable[[], Iterable[str]]) -> list[str]:
         try:
             for line in work():
                 os.write(writer, json.dumps(line).encode() + b"\n")
-        except Exception:  # of the benchmark itself
+        except Exception:  # of this tool itself
             traceback.print_exc()
         finally:
             os._exit(0)

@@ -15,7 +15,7 @@ from torchrl_nerd.checkpoint import (
     make_card,
     save_checkpoint,
 )
-from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.configs import NO_PREDICTIONS, DataConfig, TrainConfig
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.generate import CARD, generate, load_data, simulate
 from torchrl_nerd.data.log_files import (
@@ -36,7 +36,7 @@ from torchrl_nerd.training.trainer import Trainer
 Found = dict[str, Tensor]
 """What a loader found: tensors by name, all of which must be finite."""
 
-EXCERPT = Path(__file__).parents[1] / "tests" / "data" / "tosses_excerpt.npz"
+EXCERPT = Path(__file__).parents[1] / "data" / "tosses_excerpt.npz"
 SCENE, CUBE = "cartpole", "cube_real"
 DATA = DataConfig(trajectories=6, steps=4)
 CHUNK = 2  # trajectories, in place of the package's own chunk
@@ -67,7 +67,7 @@ class Kind:
 
 
 def _make_checkpoint(folder: Path) -> None:
-    model = NeRD(load_scene(SCENE), NETWORKS["transformer-2x64"])
+    model = NeRD(load_scene(SCENE), NO_PREDICTIONS, NETWORKS["transformer-2x64"])
     save_checkpoint(model, folder, make_card(model))
 
 

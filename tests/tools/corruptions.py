@@ -39,7 +39,6 @@ OTHERS: tuple[Any, ...] = (
     *NAMES,
     *NUMBERS,
 )
-TYPES = ("tensorclass.NonTensorData", "_lazy.LazyStackedTensorDict", "_td.TensorDict")
 DTYPES = ("F64", "F32", "F16", "BF16", "F8_E4M3", "I64", "U8", "BOOL", "C64", "X9")
 
 
@@ -168,17 +167,6 @@ def _edit_json(path: Path, rng: Generator, marker: Path) -> None:
     path.write_text(json.dumps(content))
 
 
-def _edit_type(path: Path, rng: Generator, marker: Path) -> None:
-    """What a stored TensorDict says it is, with a pickle where that kind has one."""
-    folder, content = path.parent, json.loads(path.read_text())
-    content["_type"] = f"<class 'tensordict.{rng.choice(TYPES)}'>"
-    if rng.random() < 0.5:
-        content["data"] = "pickle.pkl"
-    path.write_text(json.dumps(content))
-    for name in ("other.pickle", "pickle.pkl"):
-        (folder / name).write_bytes(pickle.dumps({"data": Marker(marker)}))
-
-
 def _header(content: bytes) -> tuple[dict[str, Any], bytes]:
     size = int.from_bytes(content[:8], "little")
     return json.loads(content[8 : 8 + size]), content[8 + size :]
@@ -286,8 +274,6 @@ def corrupt(folder: Path, rng: Generator, marker: Path) -> str:
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     path = paths[int(rng.integers(len(paths)))]
     special = BY_SUFFIX.get(path.suffix, ())
-    if path.name == "meta.json":
-        special += (_edit_type,)
     ways = special if special and rng.random() < 0.6 else ANY
     way = ways[int(rng.integers(len(ways)))]
     way(path, rng, marker)

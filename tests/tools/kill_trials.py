@@ -1,6 +1,6 @@
 """Work that is killed at random times: what is on disk then, and what resuming makes of it.
 
-    python benchmarks/kill_trials.py --kills 100 --seed 0
+    python tests/tools/kill_trials.py --kills 100 --seed 0
 
 A child process generates data, trains or saves checkpoints, and tells by a byte after every
 interval that is done. It is killed (SIGKILL) at a random time; then what it told of must be
@@ -27,7 +27,7 @@ from torch import Generator
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
-from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.configs import NO_PREDICTIONS, DataConfig, TrainConfig
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.generate import generate, load_data, simulate
@@ -150,7 +150,7 @@ class Saving:
 
     def run(self, folder: Path, tell: Tell) -> None:
         """See `Work`."""
-        model = NeRD(load_scene(SCENE), NETWORKS["transformer-2x64"])
+        model = NeRD(load_scene(SCENE), NO_PREDICTIONS, NETWORKS["transformer-2x64"])
         # the last one again: its card may have been left behind by its weights
         for number in range(max(1, self.done(folder)), SAVES + 1):
             for weight in model.network.parameters():
