@@ -76,7 +76,7 @@ bench-check: $(STAMP) ## whether anything got slower, against a baseline of rati
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained
 
-model-ant-mlp: $(STAMP) ## the Ant's network alone: learned, tried by a policy, learned on
+model-ant-mlp: $(STAMP) ## the Ant's learned model: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp
 	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --use-symmetry \
 		--steps 46000 --rollout-steps 6000 --rollout-restarts 2 --bf16-fraction 0.85 \
@@ -90,7 +90,7 @@ model-ant-mlp: $(STAMP) ## the Ant's network alone: learned, tried by a policy, 
 		--rollout-lr-ratio 0.25 --validate-every 2000 --out runs/ant_policy
 	cp runs/ant_policy/best/* $(PRETRAINED)/ant-mlp/
 
-model-anymal-mlp: $(STAMP) ## ANYmal's network alone: learned, tried by two policies, learned on
+model-anymal-mlp: $(STAMP) ## ANYmal's learned model: two stages, the second with data along two policies
 	$(NERD) data anymal --trajectories 20000 --out datasets/anymal_mlp
 	$(NERD) train anymal --data datasets/anymal_mlp --network mlp-4x128 \
 		--steps 15000 --rollout-steps 1000 --bf16-fraction 0.8 --out runs/anymal_mlp
@@ -109,9 +109,10 @@ model-anymal-mlp: $(STAMP) ## ANYmal's network alone: learned, tried by two poli
 		--lr 0.004 --adamw-lr 0.0012 --validate-every 1000
 	cp runs/anymal_on/best/* $(PRETRAINED)/anymal-mlp/
 
-PENDULUM_MLP := --network mlp-4x120 --loss_eps 1.0 --bf16-fraction 0.9 --validate-every 6000
+PENDULUM_MLP := --network mlp-4x120 --predicted-force --unconstrained-motion \
+	--single-step-fraction 1.0 --loss-eps 1.0 --bf16-fraction 0.9 --validate-every 6000
 
-model-double_pendulum-mlp: $(STAMP) ## the double pendulum's network alone: two legs
+model-double_pendulum-mlp: $(STAMP) ## the double pendulum's MLP: two stages
 	$(NERD) data double_pendulum --trajectories 150000 --out datasets/double_pendulum_mlp
 	$(NERD) train double_pendulum --data datasets/double_pendulum_mlp $(PENDULUM_MLP) \
 		--steps 90000 --rollout-steps 4000 --rollout-lr-ratio 0.03 --out runs/double_pendulum_mlp
@@ -121,7 +122,8 @@ model-double_pendulum-mlp: $(STAMP) ## the double pendulum's network alone: two 
 		--out runs/double_pendulum_on
 	cp runs/double_pendulum_on/best/* $(PRETRAINED)/double_pendulum-mlp/
 
-# Policies, learned in the shipped models alone. A shipped one is that of its command.
+# Policies, learned without MuJoCo. Those of the Ant and of Franka learned in the first
+# edition's hybrids, whose place the analytic steps have taken.
 POLICIES := torchrl_nerd/policies
 PPO := OMP_NUM_THREADS=1 $(PY) examples/ppo.py
 BY_GRADIENTS := OMP_NUM_THREADS=1 $(PY) examples/first_order.py --compile \
@@ -138,19 +140,19 @@ policy-cartpole-swingup: policy-%: $(STAMP)
 
 policy-ant-spin_track: FRAMES := 24000000
 $(LEGGED): policy-%: $(STAMP)
-	$(PPO) --task $(subst -,/,$*) --compile --horizon 16 --minibatch 8192 --lr 1e-3 \
+	$(PPO) --task $(subst -,/,$*) --dynamics analytic --compile --horizon 16 --minibatch 8192 --lr 1e-3 \
 		--total-frames $(FRAMES) --out runs/$@
 	$(SHIP_POLICY)
 
 policy-franka-reach: policy-%: $(STAMP)
-	$(PPO) --task franka/reach --compile --seed 1 --out runs/$@-ppo
-	$(BY_GRADIENTS) --task franka/reach --start runs/$@-ppo --updates 850 --seed 1 --out runs/$@-on
-	$(BY_GRADIENTS) --task franka/reach --start runs/$@-on --updates 340 --seed 1 --out runs/$@
+	$(PPO) --task franka/reach --dynamics analytic --compile --seed 1 --out runs/$@-ppo
+	$(BY_GRADIENTS) --task franka/reach --dynamics analytic --start runs/$@-ppo --updates 850 --seed 1 --out runs/$@-on
+	$(BY_GRADIENTS) --task franka/reach --dynamics analytic --start runs/$@-on --updates 340 --seed 1 --out runs/$@
 	$(SHIP_POLICY)
 
 policy-franka-reach_torque: policy-%: $(STAMP)
-	$(PPO) --task franka/reach_torque --compile --seed 1 --out runs/$@-ppo
-	$(BY_GRADIENTS) --task franka/reach_torque --start runs/$@-ppo --updates 3200 --seed 1 --out runs/$@
+	$(PPO) --task franka/reach_torque --dynamics analytic --compile --seed 1 --out runs/$@-ppo
+	$(BY_GRADIENTS) --task franka/reach_torque --dynamics analytic --start runs/$@-ppo --updates 3200 --seed 1 --out runs/$@
 	$(SHIP_POLICY)
 
 format: $(STAMP) ## repair what ruff can repair
