@@ -1,12 +1,12 @@
-"""Learn a policy by gradients through the learned dynamics, and measure it in true ones.
+"""Learn a policy by gradients through the dynamics, and measure it in MuJoCo.
 
     python examples/first_order.py
     python examples/first_order.py --start runs/ppo --compile   # go on from a PPO policy
 
-MuJoCo has no gradients; a network has. The return of a window is differentiated with
-respect to the policy through reward, state, torque and action of every step, no critic and
-no score function; then the window moves on along the episode. What it brings the Franka
-beside PPO stands in docs/results.md.
+MuJoCo has no gradients; learned, hybrid and analytic dynamics have. The return of a window
+is differentiated with respect to the policy through reward, state, torque and action of
+every step, without a critic or a score function; then the window moves on along the
+episode.
 """
 
 import logging
@@ -22,9 +22,10 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LinearLR
 from tqdm import trange
 
-from torchrl_nerd import NeRDEnv, from_pretrained, make_env
+from torchrl_nerd import NeRDEnv, make_env
 from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.frame_stack import append_frame, stack_frames
+from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import (
     ReturnSummary,
@@ -44,6 +45,7 @@ class Config:
     """The defaults are for minutes on one core."""
 
     task: str = "franka/reach"  # what to learn
+    dynamics: str = "nerd"  # what to learn in: nerd, hybrid, analytic, a model's name
     start: Path | None = None  # folder of a policy to go on from, as PPO leaves it
     compile: bool = False  # steps and their gradients: minutes at first, then faster
     num_envs: int = 64  # rows that it learns from together
@@ -67,15 +69,15 @@ def make_policy(cfg: Config, env: NeRDEnv) -> Policy:
 
 
 def measure(cfg: Config, policy: Policy) -> ReturnSummary:
-    """What it earns in NeRD, from starts that the final evaluation does not have."""
-    env = make_env(cfg.task, "nerd", min(256, cfg.episodes), seed=cfg.seed + 1)
+    """Its return where it learns, from starts that the final evaluation does not have."""
+    env = make_env(cfg.task, cfg.dynamics, min(256, cfg.episodes), seed=cfg.seed + 1)
     returns = policy_returns(env, make_actor(policy))
     return summarize(returns, returns)
 
 
 def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]]:
-    """The policy that earned most in NeRD, and the mean reward of every window."""
-    model = from_pretrained(make_task(cfg.task).scene.name).requires_grad_(False)
+    """The policy with the largest return, and the mean reward of every window."""
+    model = resolve_model(cfg.dynamics, make_task(cfg.task).scene).requires_grad_(False)
     env = NeRDEnv(cfg.task, model, cfg.num_envs, cfg.seed, differentiable=True)
     policy = make_policy(cfg, env)
     if cfg.compile:
@@ -114,14 +116,13 @@ def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]
 
 def keep(cfg: Config, policy: Policy) -> None:
     """Write down the best one so far."""
-    save_policy(policy, cfg.out, {**asdict(cfg), "dynamics": "nerd"})
+    save_policy(policy, cfg.out, asdict(cfg))
 
 
 def step_back(policy: Policy, best: Policy, optimizer: Adam) -> None:
-    """Go on from the best one at half the step: the gradients of late led astray.
+    """Continue from the best policy at half the step size.
 
-    Where most rows are near chaos they say little, and a policy that they have made worse
-    meets more of it.
+    Near chaos gradients say little, and a policy that they made worse meets more of it.
     """
     policy.load_state_dict(best.state_dict())
     optimizer.state.clear()
