@@ -1,9 +1,10 @@
-"""What the documentation says exists: links, commands, names, examples."""
+"""What the documentation says exists: links, commands, names, examples, numbers."""
 
 import doctest
 import importlib
 import inspect
 import io
+import json
 import os
 import pkgutil
 import re
@@ -11,29 +12,27 @@ import shlex
 import subprocess
 import sys
 from contextlib import redirect_stdout
+from functools import cache
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
-from shutil import copyfile
 
-import equal_error
 import pytest
-import stability_table
 import torch
-from helpers import EXCERPT
 from tensordict import TensorDict
 
 import torchrl_nerd
 from torchrl_nerd import load_scene
-from torchrl_nerd.cli import COMMANDS, main
-from torchrl_nerd.evaluation.policy import Policy, save_policy
-from torchrl_nerd.robots import TASKS, make_task
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
+DOCS, README = ROOT / "docs", ROOT / "README.md"
+PAGES = sorted(DOCS.rglob("*.md"))
+EXPERIMENTS = sorted((ROOT / "experiments").rglob("*.md"))
+EVERYWHERE = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
 CODE = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
-RUN = [ROOT / "docs" / name for name in ("start.md", "drop_ins.md", "stability.md")]
-RUN += sorted((ROOT / "docs" / "howto").glob("*.md"))
+LINK = re.compile(r"!?\[([^\]]*)\]\(([^)\s]+)\)")
+MAX_WORDS = 25  # of a sentence
+MAX_ROW = 100  # characters of a table's row, links as they are shown
+MAX_PAGE, MAX_README = 300, 130  # lines
 PACKAGES = [
     "torchrl_nerd",
     *(f"torchrl_nerd.{m.name}" for m in pkgutil.iter_modules(torchrl_nerd.__path__)),
@@ -43,214 +42,220 @@ WITH_EXAMPLES = [path for path in SOURCES if ">>> " in path.read_text()]
 SHARED = {"load_scene": load_scene, "torch": torch, "TensorDict": TensorDict}
 """What examples take for granted."""
 
-BUDGETS = {
-    "data": "--trajectories 300 --steps 20 --quiet",
-    "train": "--network mlp-4x64 --steps 2 --rollout-steps 1 --batch-size 16 "
-    "--sequence-length 2 --rollout-batch-size 2 --rollout-length 2 --quiet",
-    "eval": "--rows 2 --quiet",
-    "finetune": "--epochs 1 --quiet",
-    "transfer": "--episodes 2 --quiet",
-    "play": "--steps 3 --draw drawing --quiet",
-    "plot": "--rows 2 --steps 3",
-    "bench": "--batches 1 --rows 2 --rounds 1 --steps 2 --no-compile --quiet",
-    "stability": "--cases batching --quiet",
-    "doctor": "--quiet",
+GENERATED = [
+    "reference/cli.md",
+    *(
+        f"reference/{module.name}.md"
+        for module in pkgutil.iter_modules(torchrl_nerd.__path__)
+        if module.ispkg and module.name not in ("cli", "pretrained", "policies")
+    ),
+]
+"""Pages that docs/generated.py makes: of each folder of the package, and of commands."""
+
+RESULTS = {  # row of README -> case, learned model, coarse MuJoCo
+    "Cartpole": ("cartpole", "passive", "cartpole", 1),
+    "double pendulum": ("double_pendulum", "ground 1", "double_pendulum", 1),
+    "Ant": ("ant", "passive", "ant-mlp", 4),
+    "ANYmal": ("anymal", "standing", "anymal-mlp", 2),
+    "Franka": ("franka", "random", "franka-mlp", 2),
+    "cube": ("cube", "toss", "cube-mlp", 4),
 }
-"""What commands of the pages get instead of, or beside, their own options."""
+QUANTITIES = {
+    "cart position": "slider",
+    "joint 1": "joint1",
+    "joint 2": "joint2",
+    "base position": "base_position",
+}
 
 
-def slow_page(page: Path):
-    """A page for `pytest.mark.parametrize`, slow where its code takes long."""
-    marks = [pytest.mark.slow] * (page.stem in ("pipelines", "drop_ins"))
-    return pytest.param(page, marks=marks, id=page.stem)
+def name_of(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def each(pages: list[Path]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("page", pages, ids=name_of)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return [code for kind, code in CODE.findall(page.read_text()) if kind == language]
 
 
 def prose(page: Path) -> str:
-    """A page without its code."""
-    return re.sub(r"`[^`\n]*`", "", CODE.sub("", page.read_text()))
+    """A page without its blocks of code."""
+    return CODE.sub("", page.read_text())
 
 
-def blocks(page: Path, *languages: str) -> list[str]:
-    return [code for kind, code in CODE.findall(page.read_text()) if kind in languages]
+def tables(page: Path) -> list[str]:
+    """The rows of a page's tables, links as they are shown."""
+    lines = prose(page).splitlines()
+    return [LINK.sub(r"\1", line) for line in lines if line.startswith("|")]
+
+
+def cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.strip("|").split("|")]
 
 
 def anchors(page: Path) -> set[str]:
     """Names of a page's headings, as links have them."""
-    titles = re.findall(r"^#+ (.+)$", CODE.sub("", page.read_text()), re.M)
+    titles = re.findall(r"^#+ (.+)$", prose(page), re.M)
     plain = (re.sub(r"[^\w\s-]", "", title.lower()) for title in titles)
     return {re.sub(r"[\s-]+", "-", title).strip("-") for title in plain}
 
 
-def leads_somewhere(page: Path, link: str) -> bool:
-    """Whether a relative link is to a file, and to a heading if it names one."""
-    path, _, anchor = link.partition("#")
-    target = (page.parent / path).resolve() if path else page
-    if not target.is_file() or not target.is_relative_to(ROOT):
-        return False
-    return not anchor or anchor in anchors(target)
+def sentences(page: Path) -> list[str]:
+    """Sentences of paragraphs and list items, without tables, headings and code."""
+    text = re.sub(r"^(\||#|    |<!--|>|!\[).*$", "", prose(page), flags=re.M)
+    text = re.sub(r"`[^`]*`", "x", LINK.sub(r"\1", text))
+    text = re.sub(r"^\s*(?:[-*]|\d+\.) ", "\n", text, flags=re.M)
+    found = []
+    for paragraph in re.split(r"\n\s*\n|:\n", text):
+        found += re.split(r"(?<=[.:!?])\s+", " ".join(paragraph.split()))
+    return found
 
 
-def test_every_relative_link_leads_somewhere():
-    links = [
-        (page, link)
-        for page in PAGES
-        for link in re.findall(r"\]\(([^)\s]+)\)", prose(page))
-        if "://" not in link
-    ]
-    assert len(links) > 50
-    dead = [f"{p.name}: {link}" for p, link in links if not leads_somewhere(p, link)]
-    assert not dead
+# -- form ----------------------------------------------------------------------------------
 
 
-def commands(page: Path) -> list[list[str]]:
-    """Words of every line of a page's shell blocks."""
-    lines = "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
-    return [shlex.split(line, comments=True) for line in lines]
+@each([README, *PAGES])
+def test_a_page_is_short(page):
+    lines = len(page.read_text().splitlines())
+    assert lines <= (MAX_README if page == README else MAX_PAGE)
 
 
-def gives_commands(page: Path) -> bool:
-    """Whether a page shows a command of the package."""
-    return any(words[:1] == ["nerd"] for words in commands(page))
+@each([README, *PAGES])
+def test_no_table_is_wider_than_the_page(page):
+    assert [row for row in tables(page) if len(row) > MAX_ROW] == []
 
 
-WITH_COMMANDS = [page for page in PAGES if gives_commands(page)]
+@each([README, *PAGES])
+def test_every_row_of_a_table_has_as_many_cells_as_its_header(page):
+    for table in re.findall(r"(?:^\|.*\n)+", prose(page), re.M):
+        widths = {row.replace("\\|", "").count("|") for row in table.splitlines()}
+        assert len(widths) == 1, table
 
 
-@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda p: p.name)
-def test_every_command_can_be_given(page, tmp_path, monkeypatch, capsys):
-    """Dry: of what it reads, the recorded tosses and policies alone must be there."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    for words in commands(page):
-        if words[:1] != ["nerd"]:
+@each([README, ROOT / "CONTRIBUTING.md", *PAGES])
+def test_sentences_are_short(page):
+    assert [s for s in sentences(page) if len(s.split()) > MAX_WORDS] == []
+
+
+def test_readme_has_its_parts_in_order():
+    text = README.read_text()
+    parts = (
+        "docs/figures/ant.gif",
+        "make demo",
+        "make test",
+        "make_env",
+        "`dynamics=`",
+    )
+    places = [text.index(part) for part in (*parts, "| robot |", "## Links")]
+    assert places == sorted(places)
+
+
+# -- links and names -----------------------------------------------------------------------
+
+
+@each([*EVERYWHERE, *EXPERIMENTS])
+def test_every_relative_link_leads_somewhere(page):
+    """A page that is made of a notebook counts as the notebook."""
+    text = re.sub(r"`[^`\n]*`", "", prose(page))
+    for _, link in LINK.findall(text):
+        if "://" in link:
             continue
-        for name in (word for word in words if word.endswith(".npz")):
-            copyfile(EXCERPT, name)
-        for option, folder in pairwise(words):
-            if option == "--policy":
-                scene = words[2] if words[1] == "data" else "ant"
-                name = next(name for name in TASKS if name.startswith(f"{scene}/"))
-                task = make_task(name)
-                sizes = [task.observation_size, task.controller.num_actions]
-                save_policy(Policy(sizes), Path(folder), {"task": name})
-        assert main([*words[1:], "--dry-run"]) == 0, capsys.readouterr().err
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        there = target.is_file() or target.with_suffix(".ipynb").is_file()
+        there = there or target in [DOCS / name for name in GENERATED]
+        assert there and target.is_relative_to(ROOT), f"{page.name}: {link}"
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target), f"{page.name}: {link}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", ["docs/start.md", "docs/howto/robot.md", "README.md"])
-def test_a_new_users_commands_work_one_after_the_other(
-    page, tmp_path, monkeypatch, capsys
-):
-    """From an empty folder, with tiny budgets."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(ROOT / "examples"))
-    copyfile(EXCERPT, "cube_tosses.npz")
-    ran = 0
-    for words in commands(ROOT / page):
-        if words == ["make", "demo"]:
-            ppo = importlib.import_module("ppo")
-            sizes = {"num_envs": 8, "horizon": 4, "total_frames": 32}
-            ppo.main(ppo.Run(episodes=2, **sizes))
-        elif words[:1] == ["nerd"]:
-            if words[1] == "train":  # else it draws all that the preset asks for
-                fine = [w for w in words if w in ("--reference", "rk4")]
-                assert main(within_budget(["data", words[2], *fine])) == 0
-            assert main(within_budget(words[1:])) == 0, capsys.readouterr().err
-            ran += 1
-    assert ran > 3
+@each(EVERYWHERE)
+def test_every_file_that_is_named_is_there(page):
+    """Files of the repository in `code`, from its root or from the package."""
+    pattern = r"`((?:[\w.-]+/)+[\w-]+\.(?:py|md|json|png|xml))`"
+    for name in re.findall(pattern, page.read_text()):
+        if re.search("[A-Z]{4}", name) or name.startswith(("runs/", "results/")):
+            continue
+        places = (ROOT / name, ROOT / "torchrl_nerd" / name, page.parent / name)
+        assert any(place.exists() for place in places), f"{page.name}: {name}"
 
 
-def within_budget(words: list[str]) -> list[str]:
-    """A command with its budget in place of its own numbers."""
-    budget, command = BUDGETS[words[0]].split(), list(words)
-    while budget:
-        option, value = budget.pop(0), []
-        if budget and not budget[0].startswith("--"):
-            value = [budget.pop(0)]
-        if option in command:
-            command[command.index(option) + 1] = value[0]
-        else:
-            command += [option, *value]
-    return command
+def test_the_site_shows_every_page_once():
+    """Notebooks too, of which docs/notebooks.py makes pages."""
+    nav = (ROOT / "mkdocs.yml").read_text().split("\nnav:")[1]
+    named = re.findall(r": ([\w/]+\.md)$", nav, re.M)
+    sources = [*PAGES, *DOCS.rglob("*.ipynb")]
+    there = [str(p.relative_to(DOCS).with_suffix(".md")) for p in sources]
+    assert sorted(named) == sorted([*there, *GENERATED])
 
 
-def help_of(command: str) -> str:
-    """What a command says of its options."""
-    said = io.StringIO()
-    with pytest.raises(SystemExit), redirect_stdout(said):
+# -- commands ------------------------------------------------------------------------------
+
+
+@cache
+def options_of(command: str) -> frozenset[str]:
+    """Options of a command, as its ``--help`` names them."""
+    from torchrl_nerd.cli import COMMANDS, main
+
+    assert command in COMMANDS, f"no command nerd {command}"
+    shown = io.StringIO()
+    with redirect_stdout(shown), pytest.raises(SystemExit) as stop:
         main([command, "--help"])
-    return said.getvalue()
+    assert stop.value.code == 0
+    return frozenset(re.findall(r"--[a-z0-9][a-z0-9-]*", shown.getvalue()))
 
 
-def test_every_option_that_is_named_exists():
-    """In `code` amid the text, where commands are cut short."""
-    unknown, known = [], {name: help_of(name) for name in COMMANDS}
-    for page in PAGES:
-        for name, options in re.findall(r"`nerd ([a-z]+)([^`]*)`", page.read_text()):
-            unknown += [
-                f"{page.name}: nerd {name} {option}"
-                for option in re.findall(r"--[a-z0-9-]+", options)
-                if not re.search(rf"{option}(?![\w-])", known.get(name, ""))
-            ]
-    assert not unknown
+@each(EVERYWHERE)
+def test_every_command_and_option_exists(page):
+    """In blocks of shell and in `code` amid the text."""
+    shell = "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
+    found = [line for line in shell if line.startswith("nerd ")]
+    found += re.findall(r"`(nerd [a-z]+[^`]*)`", prose(page))
+    for line in found:
+        words = shlex.split(line, comments=True)
+        if not words[1:] or not words[1].islower():  # `nerd COMMAND`
+            continue
+        asked = {word.partition("=")[0] for word in words if word.startswith("--")}
+        asked -= {"--help", "--version"}
+        assert not asked - options_of(words[1]), f"{page.name}: {line}"
 
 
-def is_there(page: Path, name: str) -> bool:
-    """Whether a page names a file of the repository, from its root or the package."""
-    if "NAME" in name or "SCENE" in name or name.startswith(("runs/", "results/")):
-        return True
-    places = (ROOT / name, ROOT / "torchrl_nerd" / name, page.parent / name)
-    return any(place.exists() for place in places)
+def test_every_make_target_exists():
+    makefile = (ROOT / "Makefile").read_text()
+    for page in EVERYWHERE:
+        shell = "\n".join(blocks(page, "sh"))
+        named = re.findall(r"^make ([\w-]+)", shell, re.M)
+        named += re.findall(r"`make ([\w-]+)", prose(page))
+        for target in named:
+            assert re.search(rf"^{target}:|\b{target}\b.*:", makefile, re.M), target
 
 
-def test_every_file_that_is_named_is_there():
-    pattern = r"`((?:[\w.-]+/)+[\w-]+\.(?:py|md|json|png))`"
-    named = [(p, name) for p in PAGES for name in re.findall(pattern, p.read_text())]
-    assert named
-    assert not [f"{p.name}: {name}" for p, name in named if not is_there(p, name)]
+# -- code ----------------------------------------------------------------------------------
+
+FIRST = [page for page in PAGES if blocks(page, "python")]
 
 
-@pytest.mark.parametrize("page", [slow_page(page) for page in RUN])
-def test_code_of_the_pages_runs(page, monkeypatch, tmp_path, capsys):
+@each([README, *FIRST])
+def test_code_of_the_page_runs(page, monkeypatch, tmp_path, capsys):
+    """Every block of README, the first one of other pages; all blocks compile."""
     monkeypatch.chdir(tmp_path)
-    names = {"__name__": "__main__"}  # a page's blocks follow on each other
-    for code in blocks(page, "python"):
-        exec(compile(code, page.name, "exec"), names)
+    names = {"__name__": "__main__"}
+    codes = [compile(code, page.name, "exec") for code in blocks(page, "python")]
+    for code in codes if page == README else codes[:1]:
+        exec(code, names)
     assert not list(tmp_path.iterdir())
 
 
-def test_code_of_every_page_can_be_read():
-    for page in PAGES:
-        for code in blocks(page, "python"):
-            compile(code, page.name, "exec")
-
-
-def test_every_public_name_says_what_it_is():
-    for name in PACKAGES:
-        module = importlib.import_module(name)
-        assert module.__doc__, name
-        for public in getattr(module, "__all__", []):
-            value = getattr(module, public)
-            if inspect.isclass(value) or inspect.isfunction(value):
-                assert inspect.getdoc(value), f"{name}.{public}"
-
-
-def test_every_public_name_is_in_the_reference():
-    pages = "".join(p.read_text() for p in (ROOT / "docs" / "reference").glob("*.md"))
-    shown = re.findall(r"^::: ([\w.]+)$", pages, re.M)
-    missing = []
-    for name in PACKAGES:
-        module = importlib.import_module(name)
-        for public in getattr(module, "__all__", []):
-            value = getattr(module, public)
-            home = getattr(value, "__module__", name)
-            if not any(
-                part in (f"{name}.{public}", f"{home}.{public}")
-                or getattr(sys.modules.get(part), public, None) is value
-                for part in shown
-            ):
-                missing.append(f"{name}.{public}")
-    assert not missing
+@pytest.mark.slow
+@each(FIRST)
+def test_all_code_of_the_page_runs(page, monkeypatch, tmp_path, capsys):
+    """In order, in one namespace."""
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "__main__"}
+    for code in blocks(page, "python"):
+        exec(compile(code, page.name, "exec"), names)
 
 
 @pytest.mark.parametrize("path", WITH_EXAMPLES, ids=lambda p: p.stem)
@@ -262,45 +267,75 @@ def test_examples_in_docstrings_run(path):
     assert tried > 0 and failed == 0
 
 
-def test_the_tables_of_hard_cases_are_what_was_measured():
-    found = stability_table.read(ROOT / "docs" / "figures")
-    page = (ROOT / "docs" / "stability.md").read_text()
-    assert stability_table.graded(found) in page
-    assert stability_table.informative(found) in page
+# -- results -------------------------------------------------------------------------------
 
 
-def test_the_table_of_equal_error_is_what_was_measured():
-    found = equal_error.read(ROOT / "docs" / "figures")
-    page = (ROOT / "docs" / "performance.md").read_text()
-    assert equal_error.table(found) in page
+def readme_results() -> list[list[str]]:
+    rows = [cells(row) for row in tables(README)]
+    header = next(i for i, row in enumerate(rows) if row[0] == "robot")
+    return rows[header + 2 : header + 8]
 
 
-def test_the_site_shows_every_page_once():
-    """Notebooks too, of which docs/notebooks.py makes pages."""
-    nav, docs = (ROOT / "mkdocs.yml").read_text().split("\nnav:")[1], ROOT / "docs"
-    named = re.findall(r": ([\w/]+\.md)$", nav, re.M)
-    sources = [*docs.rglob("*.md"), *docs.rglob("*.ipynb")]
-    there = [str(p.relative_to(docs).with_suffix(".md")) for p in sources]
-    assert len(named) > 15 and sorted(named) == sorted(there)
+def test_readme_has_a_row_per_robot():
+    assert [row[0] for row in readme_results()] == list(RESULTS)
+
+
+@pytest.mark.parametrize("row", readme_results(), ids=lambda row: row[0])
+def test_readme_s_results_are_what_was_measured(row):
+    """Means in results/eval_ROBOT.json, to two digits."""
+    robot, what, unit, network, *shown = row
+    scene, case, model, substeps = RESULTS[robot]
+    path = ROOT / "results" / f"eval_{scene}.json"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not measured yet")
+    quantity, steps = what.rsplit(", ", 1)
+    errors = {
+        entry["name"]: entry
+        for entry in json.loads(path.read_text())["results"]["errors"]
+        if (entry["case"], entry["steps"]) == (case, int(steps))
+        and entry["quantity"] == QUANTITIES[quantity]
+    }
+    plural = "" if substeps == 1 else "s"
+    coarse = f"MuJoCo Euler, {substeps} substep{plural}"
+    named = [model, "analytic", coarse, "paper (NeRD)"]
+    expected = [f"{errors[n]['mean']:.2g}" if n in errors else "-" for n in named]
+    assert [cell.replace("TBD", "") for cell in shown] == expected
+    assert unit == errors[model]["unit"] and errors[model]["kind"] == "learned"
+    card = torchrl_nerd.checkpoint.shipped_card(model)
+    assert card["network"]["kind"] == network.lower()
+
+
+# -- reference -----------------------------------------------------------------------------
+
+
+def test_every_public_name_is_described():
+    for name in PACKAGES:
+        module = importlib.import_module(name)
+        assert module.__doc__, name
+        for public in getattr(module, "__all__", []):
+            value = getattr(module, public)
+            if inspect.isclass(value) or inspect.isfunction(value):
+                assert inspect.getdoc(value), f"{name}.{public}"
+
+
+def test_everything_that_the_reference_names_exists():
+    pages = "".join(page.read_text() for page in PAGES)
+    names = re.findall(r"^::: ([\w.]+)$", pages, re.M)
+    assert names and all(find_spec(name) for name in names)
 
 
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     if find_spec("mkdocs") is None:
         pytest.skip("no mkdocs: make docs")
-    command = [
-        sys.executable,
-        "-m",
-        "mkdocs",
-        "build",
-        "--strict",
-        "-d",
-        tmp_path / "s",
-    ]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d"]
     env = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
+    site = tmp_path / "s"
+    done = subprocess.run(
+        [*command, site], cwd=ROOT, env=env, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
-    for page in (tmp_path / "s").rglob("*.html"):
+    for page in site.rglob("*.html"):
         text = page.read_text()
         loaded = r'<(?:script|img)[^>]+src="https?:|<link[^>]+stylesheet[^>]+https?:'
         assert not re.search(loaded, text), f"{page.name} fetches something"
