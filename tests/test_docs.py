@@ -245,7 +245,6 @@ def test_code_of_the_page_runs(page, monkeypatch, tmp_path, capsys):
     codes = [compile(code, page.name, "exec") for code in blocks(page, "python")]
     for code in codes if page == README else codes[:1]:
         exec(code, names)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
