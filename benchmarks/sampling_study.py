@@ -198,7 +198,11 @@ def table(rows: list[dict[str, Any]]) -> str:
             errors = (row[test][quantity][key] for key in ("mean", "final", "p95"))
             cells.append(" / ".join(_number(error) for error in errors))
         gap, own = row.get("transfer"), row.get("learned_there")
-        cells.append(f"{gap['gap']:+.3%} ± {gap['gap_interval']:.3%}" if gap else "-")
+        cells.append(
+            f"{gap['difference']:+.3%} ± {gap['difference_interval']:.3%}"
+            if gap
+            else "-"
+        )
         cells.append(f"{own['true_mean']:.0f}" if own else "not measured")
         lines.append(" | ".join(cells))
     return "\n".join(f"| {line} |" for line in lines)

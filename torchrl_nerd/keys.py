@@ -29,7 +29,7 @@ frame of their bodies, float64; a task's row parameter, drawn at each reset."""
 
 SENSORDATA = "sensordata"
 """What MuJoCo's sensors read during the last substep ``(*batch, nsensordata)``, float64.
-Only from true dynamics of a model that senses forces, and only on its way to the task."""
+Only from the ground truth of a model that senses forces; the task alone sees it."""
 
 ACTION = "action"
 """What the policy chose ``(*batch, num_actions)``, float32, in [-1, 1]."""
@@ -59,14 +59,12 @@ CONTACT_VELOCITY = "contact_velocity"
 ``(*batch, num_points * 4)``, m/s, zero beyond the margin."""
 
 CONTACT_DEPTH = "contact_depth"
-"""How deep each point's surface would lie in the ground at a few times within the control
-step if ``qvel`` stayed as it is ``(*batch, num_points * K)``, m, at least zero, and zero
-beyond the margin."""
+"""Predicted penetration of each contact point at K times within the control step
+``(*batch, num_points * K)``, m, at least zero, and zero beyond the margin."""
 
 CONTACT_FORCE = "contact_force"
-"""What the ground's springs and dampers would push every dof with over the control step if
-``qvel`` stayed as it is, in B_t ``(*batch, nv)``, N and N m. Only where the scene says that
-its springs are to be foreseen."""
+"""Predicted mean contact force on every dof over the control step, in B_t ``(*batch, nv)``,
+N and N m. Only where the model's `FeatureConfig` asks for it."""
 
 CONTACT_NORMAL = "contact_normal"
 """Ground normal at each point in B_t ``(*batch, num_points * 3)``, zero beyond the

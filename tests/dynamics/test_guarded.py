@@ -92,7 +92,7 @@ def test_asked_to_raise_it_names_the_rows(scene, generator):
     model = random_model(scene, generator)
     state, torque, terrain, _ = mixed_rows(scene, generator)
     guarded = GuardedDynamics(NeRDDynamics(model), "raise")
-    with pytest.raises(UntrustedError, match=r"of 12 rows beyond them, first row 0"):
+    with pytest.raises(UntrustedError, match=r"of 12 envs beyond them, first env 0"):
         guarded.step(state, torque, terrain)
 
 

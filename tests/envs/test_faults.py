@@ -155,7 +155,7 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     assert after["fault"][:, 0].tolist() == [int(i == row) for i in range(ROWS)]
     (path,) = tmp_path.iterdir()
     dump = read_dump(path)
-    assert dump.about["reason"] == "action" and dump.about["row"] == str(row)
+    assert dump.about["reason"] == "action" and dump.about["env"] == str(row)
     assert torch.equal(dump.steps["qpos"][1:], good["qpos"][row])
     assert ("features" in dump.steps.keys()) == isinstance(model, NeRD)
     if isinstance(model, NeRD):
@@ -174,7 +174,7 @@ def test_the_command_replays_a_dump(generator, tmp_path, capsys):
     env.reset()
     act(env, torch.full(env.action_spec.shape, torch.inf))
     assert main(["replay", str(tmp_path / "fault_action.safetensors")]) == 0
-    assert "action in row 0 of cartpole" in capsys.readouterr().out
+    assert "action in env 0 of cartpole" in capsys.readouterr().out
     (tmp_path / "other").write_text("no dump")
     assert main(["replay", str(tmp_path / "other")]) == 2
     assert "expected a fault's dump" in capsys.readouterr().err

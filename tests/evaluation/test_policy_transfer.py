@@ -81,9 +81,9 @@ def test_summary_of_known_returns() -> None:
     summary = summarize(torch.tensor([110.0, 330.0, 0.0], dtype=torch.float64), truth)
     assert summary.episodes == 3
     assert summary.mean == pytest.approx(440.0 / 3.0)
-    assert summary.gap == pytest.approx(0.1)
+    assert summary.difference == pytest.approx(0.1)
     spread = torch.tensor([10.0, 30.0]).std().item()
-    assert summary.gap_interval == pytest.approx(1.96 * spread / 2**0.5 / 200.0)
+    assert summary.difference_interval == pytest.approx(1.96 * spread / 2**0.5 / 200.0)
 
 
 @pytest.mark.parametrize("truth", [torch.zeros(5), torch.ones(1)])
@@ -98,8 +98,8 @@ def test_true_engines_agree_and_truth_is_added(policy: Policy) -> None:
         "dm_control": 3,
         "mujoco": 6,
     }
-    assert abs(summaries["dm_control"].gap) < 1e-6
-    assert summaries["mujoco"].gap == 0.0
+    assert abs(summaries["dm_control"].difference) < 1e-6
+    assert summaries["mujoco"].difference == 0.0
     assert len(transfer_table(summaries).splitlines()) == 3
 
 

@@ -1,4 +1,4 @@
-"""``nerd replay``: a fault again, in learned and true dynamics."""
+"""``nerd replay``: the steps before a fault again, in the model and in MuJoCo."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from torchrl_nerd.evaluation.replay import read_dump, replay
 
 @dataclass(frozen=True)
 class Replay(DeviceCommand):
-    """The steps that led to a fault, again in learned and true dynamics.
+    """The steps before a fault again, in the model and in MuJoCo.
 
     Envs with a dump_dir leave dumps: make_env(..., dump_dir=Path("faults")).
 
@@ -25,14 +25,14 @@ class Replay(DeviceCommand):
     """Checkpoint folder; the shipped model of its scene by default."""
 
     def run(self) -> dict[str, Any]:
-        """Print a line per step and return the figures."""
+        """Print a line per step and return the results."""
         dump = read_dump(self.file)
         about = dump.about
         model = from_pretrained(self.model or about["scene"], dump.scene)
         model = model.to(self.device)
         steps = replay(dump, model)
         print(
-            f"{about['reason']} in row {about.get('row', '?')} of {about['scene']}, "
+            f"{about['reason']} in env {about.get('env', '?')} of {about['scene']}, "
             f"stepped by {about.get('dynamics', '?')}"
         )
         print("  ".join(f"{key:>14}" for key in steps[0]))

@@ -68,15 +68,15 @@ class Stability(DeviceCommand):
         ground_truth = DynamicsStepper(MujocoDynamics(scene))
         tested = DynamicsStepper(dynamics_of(model, compile=self.compile))
         results, count = [], sum(case.supports(tested) for case in cases)
-        figures: dict[str, Any] = {"scene": self.scene, "seed": self.seed}
-        figures["scale"] = self.scale
-        found = run_cases(ground_truth, tested, cases, self.seed, self.scale)
-        for result in tqdm(found, "cases", count, leave=False, disable=self.quiet):
+        found: dict[str, Any] = {"scene": self.scene, "seed": self.seed}
+        found["scale"] = self.scale
+        trials = run_cases(ground_truth, tested, cases, self.seed, self.scale)
+        for result in tqdm(trials, "cases", count, leave=False, disable=self.quiet):
             verdict = "pass" if result.passes else "FAIL"
             tqdm.write(f"{result.case:<21}{verdict:<6}{result.seconds:>7} s")
             results.append(result)
-            figures |= as_json([result])
-            self.keep(figures)  # hours of long cases outlive an interruption
+            found |= as_json([result])
+            self.keep(found)  # hours of long cases outlive an interruption
         print()
         print(as_table(results, model.kind))
         if self.plot is not None:
@@ -85,4 +85,4 @@ class Stability(DeviceCommand):
                 self.plot,
                 f"{self.scene}: hard cases",
             )
-        return figures
+        return found

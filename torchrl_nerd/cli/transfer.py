@@ -1,4 +1,4 @@
-"""``nerd transfer``: what a policy earns, learned against true."""
+"""``nerd transfer``: returns of a policy in a model and in MuJoCo."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from torchrl_nerd.robots import make_task
 
 @dataclass(frozen=True)
 class Transfer(DeviceCommand):
-    """Returns of a policy in learned and in true dynamics, and the gap.
+    """Returns of a policy in several dynamics, and the difference from MuJoCo.
 
     Example: nerd transfer ant/run --episodes 256
 
@@ -28,9 +28,9 @@ class Transfer(DeviceCommand):
     dynamics: tuple[str, ...] = ("nerd", "mujoco")
     """Any of nerd, mujoco, dm_control, mujoco_warp, checkpoint folders."""
     episodes: int = 2048
-    """Per dynamics."""
+    """Episodes per dynamics."""
     seed: int = 500
-    """Of the resets."""
+    """Seed of the resets."""
     quiet: bool = False
     """No progress bar."""
 
@@ -56,5 +56,5 @@ class Transfer(DeviceCommand):
             quiet=self.quiet,
         )
         print(transfer_table(summaries))
-        figures = {name: asdict(summary) for name, summary in summaries.items()}
-        return {"task": self.task, "seed": self.seed, "returns": figures}
+        returns = {name: asdict(summary) for name, summary in summaries.items()}
+        return {"task": self.task, "seed": self.seed, "returns": returns}

@@ -20,7 +20,7 @@ class Dynamics(Protocol):
     kind: str
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all rows)."""
+        """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all envs)."""
         ...
 
     def step(
@@ -37,7 +37,7 @@ class Dynamics(Protocol):
             terrain: ``(num_envs, terrain.size)`` where the ground varies.
 
         Returns:
-            A new tensordict; rows that the physics could not step are not finite. True
+            A new tensordict; envs that the physics could not step are not finite. True
             dynamics of a model that senses forces adds ``sensordata``.
         """
         ...
@@ -59,7 +59,7 @@ def check_step(
     if scene.terrain is not None and scene.terrain.is_per_row:
         if terrain is None:
             raise ValueError(
-                f"scene '{scene.name}' has a ground per row: got no terrain"
+                f"scene '{scene.name}' has a ground per env: got no terrain"
             )
         scene.terrain.check(terrain, (rows, scene.terrain.size))
     for name, (value, shape) in expected.items():

@@ -1,4 +1,4 @@
-"""Ground truth on dm_control: one `Physics` per row, stepped as dm_control steps it."""
+"""Ground truth on dm_control: one `Physics` per env, stepped as dm_control steps it."""
 
 import warnings
 from typing import TYPE_CHECKING
@@ -30,11 +30,11 @@ def make_physics(scene: Scene) -> "Physics":
 
 
 class DMControlDynamics:
-    """The same rows on dm_control `Physics` objects, bit for bit what it would give.
+    """The same envs on dm_control `Physics` objects, bit for bit what it would give.
 
-    A row whose state is the one its `Physics` was left in goes on from there, as an
-    episode of dm_control does; any other state is written in first. For many rows
-    `MujocoDynamics` is faster: here every row costs a Python call.
+    An env whose state is the one its `Physics` was left in goes on from there, as an
+    episode of dm_control does; any other state is written in first. For many envs
+    `MujocoDynamics` is faster: here every env costs a Python call.
 
     Args:
         scene: robot, ground and substeps.
@@ -67,7 +67,7 @@ class DMControlDynamics:
         joint_torque: Tensor,
         terrain: Tensor | None = None,
     ) -> TensorDictBase:
-        """See `Dynamics.step`. Rows on which MuJoCo gave up come back as NaN."""
+        """See `Dynamics.step`. Envs on which MuJoCo gave up come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
         if len(self._rows) != len(joint_torque):
             self.reset(state)
@@ -109,7 +109,7 @@ class DMControlDynamics:
         qvel: np.ndarray,
         pose: np.ndarray | None,
     ) -> None:
-        """Put a row where it should be, unless it is there already."""
+        """Put an env where it should be, unless it is there already."""
         data, size = physics.data, 3 * physics.model.nmocap
         is_there = np.array_equal(data.qpos, qpos) and np.array_equal(data.qvel, qvel)
         if pose is not None:

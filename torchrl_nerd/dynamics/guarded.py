@@ -11,7 +11,7 @@ from torchrl_nerd.dynamics.nerd import NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL, TRUST
 
 Guard = Literal["flag", "truncate", "raise", "fallback"]
-"""What to do with a row that is not trusted: say so under ``trust``; also end its episode
+"""What to do with an env that is not trusted: say so under ``trust``; also end its episode
 as ``truncated``; refuse to go on; or let MuJoCo step it."""
 
 
@@ -26,14 +26,14 @@ class GuardedDynamics:
     """A `NeRDDynamics` whose every step says how far its input may be trusted.
 
     ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
-    the inverse of `OODScore`: 0.5 is twice as far out. A row that is not finite
-    has trust 0. Rows below ``least_trust`` are untrusted. In ``"fallback"`` MuJoCo steps
+    the inverse of `OODScore`: 0.5 is twice as far out. An env that is not finite
+    has trust 0. Envs below ``least_trust`` are untrusted. In ``"fallback"`` MuJoCo steps
     them until they have been trusted for ``patience`` steps in a row: a swing that is too
-    fast at its bottom looks familiar at its top. The network sees their true states, so
-    that it takes over again with a true history.
+    fast at its bottom is familiar at its top. The network sees the states of MuJoCo, so
+    that it takes over again with their history.
 
     Args:
-        learned: what steps the trusted rows.
+        learned: what steps the trusted envs.
         guard: what to do with the others.
         least_trust: in (0, 1]; 1 distrusts about one training state in a hundred.
         patience: control steps, for ``"fallback"``; 0 hands back at once.
@@ -66,7 +66,7 @@ class GuardedDynamics:
         self.kind = learned.kind
         self.guard, self.least_trust, self.patience = guard, least_trust, patience
         self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
-        self.truth = MujocoDynamics(self.scene) if guard == "fallback" else None
+        self.ground_truth = MujocoDynamics(self.scene) if guard == "fallback" else None
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """See `Dynamics.reset`."""
@@ -85,7 +85,7 @@ class GuardedDynamics:
         """See `Dynamics.step`; the next state also holds ``trust (num_envs, 1)``.
 
         Raises:
-            UntrustedError: with the guard ``"raise"``, naming the rows.
+            UntrustedError: with the guard ``"raise"``, naming the envs.
         """
         after, distance = self.learned.scored_step(state, joint_torque, terrain)
         assert distance is not None  # for the type checker: it was asked for
@@ -95,22 +95,22 @@ class GuardedDynamics:
             worst = float(trust.min())
             raise UntrustedError(
                 f"expected inputs like those of training, got {int(rows.sum())} of "
-                f"{len(rows)} rows beyond them, first row {int(rows.nonzero()[0])}, "
+                f"{len(rows)} envs beyond them, first env {int(rows.nonzero()[0])}, "
                 f"least trust {worst:.2g}"
             )
-        if self.truth is not None:
+        if self.ground_truth is not None:
             rows = self._not_yet_calm(rows)
-        if self.truth is not None and rows.any():
+        if self.ground_truth is not None and rows.any():
             ground = None if terrain is None else terrain[rows]
             some = state.select(QPOS, QVEL)[rows]
-            self.truth.reset(some)  # no warm start of other rows
-            true = self.truth.step(some, joint_torque[rows], ground)
+            self.ground_truth.reset(some)  # no warm start of other envs
+            exact = self.ground_truth.step(some, joint_torque[rows], ground)
             for key in (QPOS, QVEL):
-                after[key] = after[key].index_put((rows,), true[key])
+                after[key] = after[key].index_put((rows,), exact[key])
         return after.set(TRUST, trust[:, None].to(torch.float32))
 
     def _not_yet_calm(self, untrusted: Tensor) -> Tensor:
-        """Rows ``(num_envs,)`` that are untrusted or were so lately; counts this step."""
+        """Envs ``(num_envs,)`` that are untrusted or were so lately; counts this step."""
         if len(self._calm) != len(untrusted):
             self._calm = torch.full_like(untrusted, self.patience, dtype=torch.long)
         is_late = self._calm < self.patience

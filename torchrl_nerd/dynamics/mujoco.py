@@ -1,4 +1,4 @@
-"""Ground truth: all rows through MuJoCo's thread-pooled rollout in one call."""
+"""Ground truth: all envs through MuJoCo's thread-pooled rollout in one call."""
 
 import copy
 import os
@@ -54,10 +54,10 @@ def default_threads() -> int:
 
 
 class MujocoDynamics:
-    """MuJoCo itself, substeps and threads in C, no Python loop over rows.
+    """MuJoCo itself, substeps and threads in C, no Python loop over envs.
 
     The solver's warm start is carried from step to step (it changes results by less than
-    the solver's tolerance) and cleared for rows that are reset.
+    the solver's tolerance) and cleared for envs that are reset.
 
     Args:
         scene: robot, ground and substeps.
@@ -104,7 +104,7 @@ class MujocoDynamics:
         joint_torque: Tensor,
         terrain: Tensor | None = None,
     ) -> TensorDictBase:
-        """See `Dynamics.step`. Rows that MuJoCo gave up on come back as NaN."""
+        """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
         states = self.rollout(state, joint_torque[:, None], terrain)
         last = cast(TensorDictBase, states[:, 0])
@@ -134,10 +134,10 @@ class MujocoDynamics:
         timestep = self._model.opt.timestep
         velocity = slice(1 + qpos.shape[1], 1 + qpos.shape[1] + qvel.shape[1])
         before = fine[:, -2, velocity] if fine.shape[1] > 1 else qvel
-        with np.errstate(invalid="ignore"):  # infinite rows are found below
+        with np.errstate(invalid="ignore"):  # infinite envs are found below
             self._warmstart = (fine[:, -1, velocity] - before) / timestep
         states = fine[:, self.scene.substeps - 1 :: self.scene.substeps]
-        # a row that MuJoCo gave up on stopped before the end: its clock is behind
+        # an env that MuJoCo gave up on stopped before the end: its clock is behind
         clock = self.scene.control_step * np.arange(1, states.shape[1] + 1)
         is_late = abs(states[:, :, 0] - clock) > 0.5 * timestep
         position = np.ascontiguousarray(states[:, :, 1 : velocity.start])

@@ -1,4 +1,4 @@
-"""Ground truth on a GPU: all rows as one batch of MuJoCo Warp, in float32."""
+"""Ground truth on a GPU: all envs as one batch of MuJoCo Warp, in float32."""
 
 from contextlib import AbstractContextManager
 from typing import Any, cast
@@ -23,20 +23,20 @@ LARGEST = 1e10  # m, rad, m/s, rad/s: MuJoCo's mjMAXVAL, beyond which it gives u
 
 
 class MujocoWarpDynamics:
-    """MuJoCo Warp: states stay on the device, one launch of kernels for all rows.
+    """MuJoCo Warp: states stay on the device, one launch of kernels for all envs.
 
     States are float64 like everywhere, but Warp computes in float32: a step agrees with
     `MujocoDynamics` to float32's rounding, and far from the origin positions are as
     coarse as float32 is there. On a GPU the order of sums, and with it the last digits,
     may change from run to run. The first step of a scene compiles kernels, minutes once;
     Warp keeps them on the disk. The solver's warm start is carried from step to step and
-    cleared for rows that are reset.
+    cleared for envs that are reset.
 
     Args:
         scene: robot, ground and substeps.
-        device: ``"cuda"`` or, slowly and one row after the other, ``"cpu"``.
-        max_contacts: memory for so many contacts a row; by default as many as its geoms
-            can have. Where fewer are given and more occur, rows come back as NaN.
+        device: ``"cuda"`` or, slowly and one env after the other, ``"cpu"``.
+        max_contacts: memory for so many contacts an env; by default as many as its geoms
+            can have. Where fewer are given and more occur, envs come back as NaN.
         is_capturing: on a GPU, replay the control step as one CUDA graph.
 
     Raises:
@@ -76,7 +76,7 @@ class MujocoWarpDynamics:
         from torchrl_nerd.dynamics.warp_frames import straighten_frames
 
         self._model.callback.contactfilter = straighten_frames
-        self._model.opt.warn_overflow = 0  # such rows become NaN
+        self._model.opt.warn_overflow = 0  # such envs become NaN
         self._data: Any = None
         self._graph: Any = None
         self._rows = 0
@@ -111,7 +111,7 @@ class MujocoWarpDynamics:
         joint_torque: Tensor,
         terrain: Tensor | None = None,
     ) -> TensorDictBase:
-        """See `Dynamics.step`. Rows that cannot be stepped come back as NaN."""
+        """See `Dynamics.step`. Envs that cannot be stepped come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
         if len(joint_torque) != self._rows:
             self._allocate(len(joint_torque))
@@ -138,9 +138,9 @@ class MujocoWarpDynamics:
     def _write(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
     ) -> Tensor:
-        """Put rows where they should be; bool ``(rows,)``: those that can be stepped.
+        """Put envs where they should be; bool ``(rows,)``: those that can be stepped.
 
-        The others stand at rest meanwhile, so that their numbers cost no other row.
+        The others stand at rest meanwhile, so that their numbers cost no other env.
         """
         qpos, qvel, force = (
             value.to(self.device, torch.float32)
@@ -165,7 +165,7 @@ class MujocoWarpDynamics:
         return is_sound
 
     def _has_overflown(self) -> Tensor:
-        """Rows ``(rows,)`` that lost contacts or constraints for want of memory."""
+        """Envs ``(rows,)`` that lost contacts or constraints for want of memory."""
         kinds = self._engine.OverflowType
         lost = kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE
         return (self._view("overflow") & int(lost | kinds.CCD)) != 0
@@ -181,7 +181,7 @@ class MujocoWarpDynamics:
         return self._warp.ScopedStream(self._warp.stream_from_torch(self.device))
 
     def _allocate(self, rows: int) -> None:
-        """Memory for so many rows, at rest, with nothing remembered."""
+        """Memory for so many envs, at rest, with nothing remembered."""
         self._rows, self._graph, self._data = rows, None, None
         if not rows:
             return
@@ -200,7 +200,7 @@ class MujocoWarpDynamics:
             )
 
     def _advance(self) -> None:
-        """One control step of all rows, replayed as a graph from the second one on."""
+        """One control step of all envs, replayed as a graph from the second one on."""
         if self._graph is not None:
             with self._scope():
                 self._warp.capture_launch(self._graph)

@@ -44,7 +44,7 @@ def import_warp() -> tuple[Any, Any]:
 def warp_model(scene: Scene) -> mujoco.MjModel:
     """The scene's model driven by joint torques alone, in flags that Warp knows.
 
-    It never resets a row by itself, so there is nothing to switch off.
+    It never resets an env by itself, so there is nothing to switch off.
     """
     model = torque_model(scene)
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -52,7 +52,7 @@ def warp_model(scene: Scene) -> mujoco.MjModel:
 
 
 def largest_constraints(model: mujoco.MjModel, max_contacts: int) -> int:
-    """How many scalar constraints a row can have with so many contacts."""
+    """How many scalar constraints an env can have with so many contacts."""
     condim = int(max(model.geom_condim, default=1))
     is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     each = max(1, 2 * (condim - 1)) if is_pyramid else condim
@@ -62,5 +62,5 @@ def largest_constraints(model: mujoco.MjModel, max_contacts: int) -> int:
 
 
 def largest_contacts(model: mujoco.MjModel, pairs: int) -> int:
-    """How many contacts a row can have where so many pairs of geoms may touch."""
+    """How many contacts an env can have where so many pairs of geoms may touch."""
     return pairs * (CONTACTS_PER_HEIGHT_FIELD if model.nhfield else CONTACTS_PER_PAIR)

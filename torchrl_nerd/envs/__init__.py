@@ -1,4 +1,4 @@
-"""TorchRL envs in learned and true dynamics, with equal specs."""
+"""TorchRL envs in any dynamics, with equal specs."""
 
 from torchrl_nerd.envs.ground_truth import GroundTruthEnv
 from torchrl_nerd.envs.make import make_env

@@ -34,27 +34,27 @@ MAX_SEED = 2**63
 class SceneEnv(EnvBase):
     """A task in any dynamics: everything around the solver, written once.
 
-    Per row: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
+    Per env: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
     the control step that led here (zero after a reset); where a task holds an action over
-    several control steps, over the last of them. Random numbers are each row's own, so a
-    row's episodes do not depend on how many rows there are. ``reset(td, set_state=True)``
+    several control steps, over the last of them. Random numbers are each env's own, so its
+    episodes do not depend on how many envs there are. ``reset(td, set_state=True)``
     starts from the ``qpos``, ``qvel`` and parameters in ``td``.
 
-    A row whose action or next state is not finite, or that runs away, keeps its last state
-    and ends as ``terminated``; no other row notices. ``fault`` says why, see
+    An env whose action or next state is not finite, or that runs away, keeps its last state
+    and ends as ``terminated``; no other env notices. ``fault`` says why, see
     `envs.faults`. With `GuardedDynamics` ``trust`` says how far a step may be believed.
 
     Args:
         task: reset distribution, observation, reward, end.
         dynamics: what steps the state.
-        num_envs: rows.
+        num_envs: how many envs.
         seed: of the resets.
         device: where states, observations and rewards live.
         dump_dir: where faults leave dumps for `nerd replay`; none are written without.
 
     Raises:
-        ValueError: no rows, a dynamics of another scene, or a folder that cannot be
+        ValueError: no envs, a dynamics of another scene, or a folder that cannot be
             written.
     """
 
@@ -184,7 +184,7 @@ class SceneEnv(EnvBase):
         self.full_done_spec = Composite(flags, shape=rows, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Begin each row's stream anew."""
+        """Begin each env's stream anew."""
         if seed is None or not 0 <= seed < MAX_SEED:
             raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed}")
         self.seed = seed
@@ -192,7 +192,7 @@ class SceneEnv(EnvBase):
         self._episode = torch.zeros_like(self._episode)
 
     def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
-        """Restore states and episode counts; the history of every row starts empty."""
+        """Restore states and episode counts; the history of every env starts empty."""
         result = super().load_state_dict(state_dict, *args, **kwargs)
         self.dynamics.reset(self.state)
         return result
@@ -255,9 +255,9 @@ class SceneEnv(EnvBase):
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Rows that go on keep what they show: as TorchRL's, in a third of its time.
+        """Envs that go on keep what they show: as TorchRL's, in a third of its time.
 
-        What is not the env's, such as the last action, is zero where some rows begin anew.
+        What is not the env's, such as the last action, is zero where some envs begin anew.
         """
         rows = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is None or rows is None or rows.all():

@@ -15,7 +15,7 @@ from torchrl_nerd.tasks import Task
 
 
 class DmEnvironment(dm_env.Environment):
-    """One row of a `SceneEnv`.
+    """One env of a `SceneEnv`.
 
     The observation is one array ``(D,)``, float32; an action is ``(A,)`` in [-1, 1]. An
     episode that failed ends with discount 0, one that ran out of time with discount 1.

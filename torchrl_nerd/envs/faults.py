@@ -1,8 +1,8 @@
-"""What can go wrong in a row, found row by row, and written down to be replayed.
+"""What can go wrong in an env, found env by env, and written down to be replayed.
 
-A fault ends its row as ``terminated`` at its last good state and leaves the others bitwise
+A fault ends its env as ``terminated`` at its last good state and leaves the others bitwise
 as they are. With a folder to write to, the first fault of each kind leaves a dump there:
-the last states, torques, actions and the ground of one such row, and what the model made
+the last states, torques, actions and the ground of one such env, and what the model made
 of them.
 """
 
@@ -28,7 +28,7 @@ HISTORY = 16  # control steps in a dump
 
 
 def find_faults(action: Tensor, moved: Mapping[str, Tensor]) -> Tensor:
-    """The reason of each row's fault, an index of `REASONS`.
+    """The reason of each env's fault, an index of `REASONS`.
 
     Args:
         action: ``(num_envs, num_actions)``.
@@ -74,7 +74,7 @@ class FaultRecorder:
     def record(
         self, state: Mapping[str, Tensor], action: Tensor, torque: Tensor, fault: Tensor
     ) -> list[Path]:
-        """Remember a step; write what it broke for the first time.
+        """Keep a step; write what it broke for the first time.
 
         Args:
             state: before the step, ``[num_envs]``.
@@ -101,7 +101,7 @@ class FaultRecorder:
             state, torque = (here[QPOS], here[QVEL]), here["joint_torque"]
             features = self.model.features(*state, torque, here.get(TERRAIN))
             tensors["features"] = features.detach().cpu()
-        about = {**self.about, "reason": REASONS[kind], "row": str(row)}
+        about = {**self.about, "reason": REASONS[kind], "env": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
         write_tensors(path, tensors, about)
         return path

@@ -1,4 +1,4 @@
-"""A task in true dynamics."""
+"""A task in ground-truth dynamics."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +34,7 @@ class GroundTruthEnv(SceneEnv):
     Args:
         task: id of a registered task, or a task.
         engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"``.
-        num_envs: rows.
+        num_envs: how many envs.
         seed: of the resets.
         device: where states, observations and rewards live, and where MuJoCo Warp runs;
             the others run on the CPU.

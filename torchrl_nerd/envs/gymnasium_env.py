@@ -1,4 +1,4 @@
-"""Any of our envs as a `gymnasium.Env`, or many rows at once as a `gymnasium.VectorEnv`.
+"""Any of our envs as a `gymnasium.Env`, or many envs at once as a `gymnasium.VectorEnv`.
 
 `torchrl_nerd.gymnasium` registers both for every task.
 """
@@ -26,7 +26,7 @@ Info = dict[str, Any]
 
 
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One row: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
+    """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
     Args:
         task: id of a task, or a task.
@@ -65,15 +65,15 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """All rows of one batched env: one call of the dynamics steps them all.
+    """All envs of one batched env: one call of the dynamics steps them all.
 
-    A row that has ended begins its next episode at the next step, whatever its action
+    An env that has ended begins its next episode at the next step, whatever its action
     then is, with a reward of zero: Gymnasium's mode ``NEXT_STEP``.
 
     Args:
         task: id of a task, or a task.
         dynamics: as for `make_env`.
-        num_envs: rows.
+        num_envs: how many envs.
         seed: of the resets, until `reset` is given another; None for a fresh one.
         device: where the env computes.
     """
@@ -102,7 +102,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Begin an episode in each row; with a seed, the first of its rows' streams."""
+        """Begin an episode in each env; with a seed, the first of its envs' streams."""
         super().reset(seed=seed)
         if seed is not None:
             self.env.set_seed(seed)
@@ -112,7 +112,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Observations, rewards, terminated, truncated of all rows; an empty info."""
+        """Observations, rewards, terminated, truncated of all envs; an empty info."""
         after, begins = _act(self.env, actions), self._is_over
         observation, reward, terminated, truncated = _results(after)
         if begins.any():
@@ -128,7 +128,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _spaces(env: SceneEnv) -> tuple[Box, Box]:
-    """Observation and action space of one row."""
+    """Observation and action space of one env."""
     width, size = env.task.observation_size, env.task.controller.num_actions
     observation = Box(-np.inf, np.inf, (width,), np.float32)
     return observation, Box(-1.0, 1.0, (size,), np.float32)
@@ -143,7 +143,7 @@ def _act(env: SceneEnv, actions: np.ndarray) -> TensorDictBase:
 def _results(
     after: TensorDictBase,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Observation, reward (float64), terminated and truncated, one entry per row."""
+    """Observation, reward (float64), terminated and truncated, one entry per env."""
     reward = _numpy(after["reward"].double())[:, 0]
     terminated, truncated = (
         _numpy(after[key])[:, 0] for key in ("terminated", "truncated")

@@ -1,4 +1,4 @@
-"""What an env shows where only some of its rows begin anew."""
+"""What an env shows where only some of its envs begin anew."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def merge_reset(
     Args:
         rows: bool ``(num_envs,)``: which begin anew.
         before: what the env showed.
-        fresh: what it shows after the reset, of all rows.
+        fresh: what it shows after the reset, of all envs.
     """
     new = dict(fresh.items())
     return new | {
@@ -33,7 +33,7 @@ def _beside(rows: Tensor, value: Tensor) -> Tensor:
 
 
 def _emptied(rows: Tensor, value: Any) -> Any:
-    """Zeros in those rows, of a tensor or of all that a tensordict holds."""
+    """Zeros in those envs, of a tensor or of all that a tensordict holds."""
     if isinstance(value, Tensor):
         return value.masked_fill(_beside(rows, value), 0)
     if isinstance(value, TensorDictBase):

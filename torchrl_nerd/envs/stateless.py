@@ -14,14 +14,14 @@ class StatelessEnv(EnvBase):
     """Steps from the state that the tensordict holds, whatever its batch size.
 
     TorchRL's planners (`CEMPlanner`, `MPPIPlanner`) try many actions from one state and so
-    need an env that takes any batch and remembers nothing; a `SceneEnv` has a fixed number
-    of rows, each with its state. This is a view of one: a tensordict of another state
+    need an env that takes any batch and keeps no state; a `SceneEnv` has a fixed number
+    of envs, each with its state. This is a view of one: a tensordict of another state
     than the env was left in sets that state, so its history is empty; one that the env
     itself has just returned goes on, with its history. A reset begins episodes as in
-    ``env``; without a tensordict it gives all its rows.
+    ``env``; without a tensordict it gives all its envs.
 
     Args:
-        env: what steps; its ``num_envs`` is the number of rows of every tensordict, as
+        env: what steps; its ``num_envs`` is the number of envs of every tensordict, as
             states to plan for times candidates.
 
     Examples:

@@ -1,9 +1,9 @@
-"""Random numbers that belong to a row, not to a batch.
+"""Random numbers that belong to an env, not to a batch.
 
-Row i of episode k gets the same numbers whatever the number of rows, whichever rows are
-reset beside it, and on every device: each number is a hash of (seed, row, episode, index).
+Env i of episode k gets the same numbers whatever the number of envs, whichever envs are
+reset beside it, and on every device: each number is a hash of (seed, env, episode, index).
 The hash is SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number
-generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). Whatever counts rows and
+generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). Whatever counts envs and
 numbers is made outside of compiled code and handed in: there products with a range that is
 made on the spot are not kept modulo 2^64 (torch 2.13 on a CPU).
 """
@@ -28,7 +28,7 @@ def _mix(x: Tensor) -> Tensor:
 
 
 def row_keys(seed: int, rows: int, device: torch.device | str = "cpu") -> Tensor:
-    """What sets the streams of rows apart, int64 ``(rows,)``."""
+    """What sets the streams of envs apart, int64 ``(rows,)``."""
     row = torch.arange(rows, device=device)
     key = _mix(torch.full_like(row, seed) * GOLDEN)
     return _mix(key + (row + 1) * GOLDEN)
@@ -44,7 +44,7 @@ def uniforms(keys: Tensor, episode: Tensor, offsets: Tensor) -> Tensor:
 
     Args:
         keys: ``(rows,)``, see `row_keys`.
-        episode: ``(rows,)`` int64: how many episodes each row has begun.
+        episode: ``(rows,)`` int64: how many episodes each env has begun.
         offsets: ``(count,)``, see `stream_offsets`.
     """
     keys = _mix(keys + (episode + 1) * GOLDEN)

@@ -49,7 +49,7 @@ class Transition:
             self.least_trust = dynamics.least_trust
 
     def step(self, state: Tensors, action: Tensor, age: Tensor) -> Tensors:
-        """All that one action leads to; a row at fault keeps its state and ends.
+        """All that one action leads to; an env at fault keeps its state and ends.
 
         Args:
             state: ``qpos``, ``qvel`` and the task's parameters, ``(num_envs, size)``.
@@ -119,12 +119,12 @@ class Transition:
         streams: tuple[Tensor, Tensor, Tensor],
         given: Tensors,
     ) -> Tensors:
-        """New episodes for some rows; the others stay bitwise as they are.
+        """New episodes for some envs; the others stay bitwise as they are.
 
         Args:
             state: as in `step`.
             rows: ``(num_envs,)`` bool: which.
-            streams: of the rows' random numbers, see `streams.uniforms`.
+            streams: of the envs' random numbers, see `streams.uniforms`.
             given: what of a start is not left to chance.
 
         Returns:

@@ -1,1 +1,1 @@
-"""Figures that compare learned with true dynamics, alone and under a policy."""
+"""Metrics and plots that compare dynamics, alone and under a policy."""

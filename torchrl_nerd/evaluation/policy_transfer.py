@@ -1,7 +1,8 @@
-"""What a policy earns in learned and in true dynamics, from the same starts.
+"""Returns of a policy in several dynamics, from the same starts.
 
 Protocol of the paper's table 1: whole episodes from the task's reset distribution, the
-policy's mean action, the undiscounted sum of rewards; gap = (learned - true) / true.
+policy's mean action, the undiscounted sum of rewards. The return difference is
+(mean - mean in MuJoCo) / mean in MuJoCo.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
 from torchrl_nerd.tasks import Task
 
-TRUTH = "mujoco"
+GROUND_TRUTH = "mujoco"
 NORMAL_95 = 1.96  # half width of a 95% interval, in standard errors
 
 
@@ -32,24 +33,24 @@ class ReturnSummary:
     | ``episodes`` | how many |
     | ``mean``, ``std`` | of the returns over episodes |
     | ``interval`` | half width of the 95% interval of the mean |
-    | ``gap`` | (mean - true mean) / true mean, over the same starts; 0 for the truth |
-    | ``gap_interval`` | half width of its 95% interval, from paired differences |
+    | ``difference`` | relative to the mean in MuJoCo, over the same starts |
+    | ``difference_interval`` | half width of its 95% interval, from paired differences |
     """
 
     episodes: int
     mean: float
     std: float
     interval: float
-    gap: float
-    gap_interval: float
+    difference: float
+    difference_interval: float
 
 
 @torch.no_grad()
 def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
-    """Undiscounted return of one whole episode per row, ``(num_envs,)``, float64.
+    """Undiscounted return of one whole episode per env, ``(num_envs,)``, float64.
 
-    A row that ends early earns nothing after its end. Actions are the policy's mean; it
-    is shown as many observations as it remembers.
+    Rewards after an early end do not count. Actions are the policy's mean; it gets as many
+    stacked observations as it was trained with.
     """
     env = stack_frames(env, frame_stack_of(actor))
     tensordict = env.reset()
@@ -65,31 +66,33 @@ def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
     return returns.squeeze(-1)
 
 
-def summarize(returns: Tensor, true_returns: Tensor) -> ReturnSummary:
-    """Mean, spread and gap.
+def summarize(returns: Tensor, expected: Tensor) -> ReturnSummary:
+    """Mean, spread and difference from MuJoCo.
 
     Args:
         returns: ``(episodes,)``.
-        true_returns: ``(true_episodes,)`` in the true dynamics; entry i of both began in
-            the same state. The gap is over the entries that both have.
+        expected: ``(num_expected,)`` in MuJoCo; entry i of both began in the same state.
+            The difference is over the entries that both have.
 
     Raises:
-        ValueError: fewer than two episodes, or returns of zero, which have no gap.
+        ValueError: fewer than two episodes, or a mean return of zero in MuJoCo.
     """
-    both = min(len(returns), len(true_returns))
+    both = min(len(returns), len(expected))
     if both < 2:
         raise ValueError(f"expected at least 2 episodes for an interval, got {both}")
-    difference = returns[:both] - true_returns[:both]
-    true_mean = float(true_returns[:both].mean())
-    if true_mean == 0.0:
-        raise ValueError("expected a task with rewards: the true mean return is zero")
+    difference = returns[:both] - expected[:both]
+    mean = float(expected[:both].mean())
+    if mean == 0.0:
+        raise ValueError(
+            "expected a task with rewards: the mean return in MuJoCo is zero"
+        )
     return ReturnSummary(
         episodes=len(returns),
         mean=float(returns.mean()),
         std=float(returns.std()),
         interval=_interval(returns),
-        gap=float(difference.mean()) / true_mean,
-        gap_interval=_interval(difference) / abs(true_mean),
+        difference=float(difference.mean()) / mean,
+        difference_interval=_interval(difference) / abs(mean),
     )
 
 
@@ -112,9 +115,9 @@ def transfer(
     Args:
         task: a task, or its id.
         actor: any TorchRL policy, on ``device``.
-        dynamics: what `make_env` takes; the truth, MuJoCo, is added where it is missing.
+        dynamics: what `make_env` takes; MuJoCo is added where it is missing.
         episodes: in each dynamics (paper, table 1: 2,048).
-        slow_episodes: the first so many of them on dm_control, which steps row by row.
+        slow_episodes: the first so many of them on dm_control, which is slower.
         seed: of the starts.
         device: where all envs live.
         quiet: no progress bar, as by default.
@@ -125,12 +128,14 @@ def transfer(
     Raises:
         ValueError: see `summarize` and `make_env`.
     """
-    returns, names = {}, dict.fromkeys((*map(str, dynamics), TRUTH))
+    returns, names = {}, dict.fromkeys((*map(str, dynamics), GROUND_TRUTH))
     for name in tqdm(names, "dynamics", disable=quiet):
         rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
         env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
         returns[name] = policy_returns(env, actor)
-    return {name: summarize(value, returns[TRUTH]) for name, value in returns.items()}
+    return {
+        name: summarize(value, returns[GROUND_TRUTH]) for name, value in returns.items()
+    }
 
 
 def mean_returns(
@@ -148,9 +153,12 @@ def mean_returns(
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     """Lines for the terminal: one dynamics each, with 95% intervals."""
     width = max(12, *(len(name) + 1 for name in summaries))
-    rows = [f"{'dynamics':<{width}}{'episodes':>9}{'return':>18}{'std':>9}{'gap':>20}"]
+    heads = f"{'episodes':>9}{'return':>18}{'std':>9}{'against MuJoCo':>20}"
+    rows = [f"{'dynamics':<{width}}{heads}"]
     for name, s in summaries.items():
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
-        gap = f"{s.gap:+.3%} ± {s.gap_interval:.3%}"
-        rows.append(f"{name:<{width}}{s.episodes:>9}{mean:>18}{s.std:>9.1f}{gap:>20}")
+        difference = f"{s.difference:+.3%} ± {s.difference_interval:.3%}"
+        rows.append(
+            f"{name:<{width}}{s.episodes:>9}{mean:>18}{s.std:>9.1f}{difference:>20}"
+        )
     return "\n".join(rows)

@@ -1,4 +1,4 @@
-"""A fault again, in learned and true dynamics, from the dump that it left."""
+"""The steps before a fault again, in the model and in MuJoCo, from its dump."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ class Dump:
 
     | field | meaning |
     |---|---|
-    | ``about`` | scene, dynamics, reason, row |
+    | ``about`` | scene, dynamics, reason, env |
     | ``steps`` | ``[T]``: states, actions and torques up to the fault |
     """
 
@@ -55,33 +55,32 @@ def read_dump(path: Path) -> Dump:
 
 
 def replay(dump: Dump, model: Model) -> list[dict[str, float]]:
-    """Every step of a dump from its recorded state, in both dynamics.
+    """Every step of a dump from its recorded state, in the model and in MuJoCo.
 
     Returns:
-        For each step the largest speed before and after it in either dynamics, the
-        largest difference of their velocities, and the input's distance from the training
-        data (`Coverage.distance`).
+        For each step the largest speed before it and after it in both, the largest
+        difference of their velocities, and the input's out-of-distribution score.
     """
-    learned, truth = dynamics_of(model), MujocoDynamics(dump.scene)
-    rows = []
-    learned.reset(dump.steps[:1])
+    tested, ground_truth = dynamics_of(model), MujocoDynamics(dump.scene)
+    found = []
+    tested.reset(dump.steps[:1])
     for step in range(len(dump.steps)):
         now = dump.steps[step : step + 1]
         terrain = now.get(TERRAIN, None)
         state, torque = now.select(QPOS, QVEL), now["joint_torque"]
-        mine, distance = learned.scored_step(state, torque, terrain)
-        truth.reset(state)
-        true = truth.step(state, torque, terrain)
-        rows.append(
+        mine, score = tested.scored_step(state, torque, terrain)
+        ground_truth.reset(state)
+        exact = ground_truth.step(state, torque, terrain)
+        found.append(
             {
                 "speed": _largest(state[QVEL]),
-                "speed, MuJoCo": _largest(true[QVEL]),
-                "speed, learned": _largest(mine[QVEL]),
-                "apart": _largest(mine[QVEL] - true[QVEL]),
-                "distance": float("nan") if distance is None else float(distance[0]),
+                "speed, MuJoCo": _largest(exact[QVEL]),
+                "speed, model": _largest(mine[QVEL]),
+                "difference": _largest(mine[QVEL] - exact[QVEL]),
+                "OOD score": float("nan") if score is None else float(score[0]),
             }
         )
-    return rows
+    return found
 
 
 def _largest(x: Tensor) -> float:

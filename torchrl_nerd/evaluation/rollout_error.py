@@ -1,4 +1,4 @@
-"""Open-loop error: learned against true dynamics from the same start, never corrected.
+"""Open-loop error: a model against MuJoCo from the same start, never corrected.
 
 Protocol of the paper's Fig. 3 and appendix C.2: starts from the task's reset
 distribution, the same actions in both (none: passive), errors of every step averaged over
@@ -63,7 +63,7 @@ def initial_states(source: Source, rows: int, seed: int) -> TensorDict:
 def action_drive(
     source: Source, rows: int, steps: int, seed: int, random_actions: bool = False
 ) -> Drive:
-    """The source's controller on actions that do not look at the state.
+    """The source's controller on actions that do not depend on the state.
 
     Actions are zero, or uniform in [-1, 1] at every step. The controller sees the state
     that the dynamics it drives has led to.
@@ -89,7 +89,7 @@ def open_loop(
     """Positions after each step, ``(rows, steps, nq)``.
 
     Args:
-        dynamics: learned or true.
+        dynamics: of any kind.
         start: ``qpos``, ``qvel`` and, where the ground varies, ``terrain``.
         steps: how many.
         joint_torque: ``(rows, steps, num_actuated)``, or a function of step and state;
@@ -97,20 +97,22 @@ def open_loop(
     """
     rows, terrain = start.batch_size[0], start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL)
-    idle = state.get(QPOS).new_zeros(rows, len(dynamics.scene.actuated))
+    zero = state.get(QPOS).new_zeros(rows, len(dynamics.scene.actuated))
     dynamics.reset(state)
     positions = []
     for step in range(steps):
         if callable(joint_torque):
             torque = joint_torque(step, state)
         else:
-            torque = idle if joint_torque is None else joint_torque[:, step]
+            torque = zero if joint_torque is None else joint_torque[:, step]
         state = dynamics.step(state, torque, terrain)
         positions.append(state[QPOS])
     return torch.stack(positions, 1)
 
 
-def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, Tensor]:
+def position_errors(
+    scene: Scene, ground_truth: Tensor, learned: Tensor
+) -> dict[str, Tensor]:
     """Error of every quantity at every step, ``(rows, steps)``.
 
     A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
@@ -119,9 +121,9 @@ def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, T
     model, errors = scene.model, {}
     if scene.base.is_floating:
         q = scene.base.qpos_address
-        offset = truth[..., q : q + 3] - learned[..., q : q + 3]
+        offset = ground_truth[..., q : q + 3] - learned[..., q : q + 3]
         errors["base_position"] = torch.linalg.vector_norm(offset, dim=-1)
-        quats = (x[..., q + 3 : q + 7] for x in (truth, learned))
+        quats = (x[..., q + 3 : q + 7] for x in (ground_truth, learned))
         errors["base_orientation"] = orientation_error(*quats)
     joints = {}
     for joint in range(model.njnt):
@@ -129,10 +131,10 @@ def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, T
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             continue
         if kind == mujoco.mjtJoint.mjJNT_BALL:
-            quats = (x[..., q : q + 4] for x in (truth, learned))
+            quats = (x[..., q : q + 4] for x in (ground_truth, learned))
             joints[model.joint(joint).name] = orientation_error(*quats)
             continue
-        error = truth[..., q] - learned[..., q]
+        error = ground_truth[..., q] - learned[..., q]
         if kind == mujoco.mjtJoint.mjJNT_HINGE:
             error = wrap_angle(error)
         joints[model.joint(joint).name] = error.abs()
@@ -144,7 +146,7 @@ def position_errors(scene: Scene, truth: Tensor, learned: Tensor) -> dict[str, T
 
 
 def open_loop_errors(
-    truth: Dynamics,
+    ground_truth: Dynamics,
     learned: Dynamics,
     start: TensorDict,
     steps: int,
@@ -153,14 +155,14 @@ def open_loop_errors(
     """`position_errors` of two rollouts from the same start, ``(rows, steps)`` by quantity.
 
     Args:
-        truth: true dynamics.
-        learned: of the same robot.
+        ground_truth: MuJoCo.
+        learned: other dynamics of the same robot.
         start: see `open_loop`, as ``steps`` and ``joint_torque``.
         steps: control steps.
         joint_torque: N or N m.
     """
-    paths = [open_loop(d, start, steps, joint_torque) for d in (truth, learned)]
-    return position_errors(truth.scene, *paths)
+    paths = [open_loop(d, start, steps, joint_torque) for d in (ground_truth, learned)]
+    return position_errors(ground_truth.scene, *paths)
 
 
 def unit_of(scene: Scene, quantity: str) -> str:
@@ -194,7 +196,7 @@ def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary
 def passive_errors(
     source: Source,
     learned: Dynamics,
-    truth: Dynamics,
+    ground_truth: Dynamics,
     horizons: list[int],
     rows: int,
     seed: int,
@@ -215,7 +217,7 @@ def passive_errors(
         tick()
         return drive(step, state)
 
-    errors = open_loop_errors(truth, learned, start, steps, ticking_drive)
+    errors = open_loop_errors(ground_truth, learned, start, steps, ticking_drive)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
         for horizon in horizons

@@ -17,13 +17,13 @@ from torchrl_nerd.robots import make_task
 def report_transfer(
     task: str, actor: Actor, learned_in: str, episodes: int, seed: int, folder: Path
 ) -> dict[str, ReturnSummary]:
-    """Print returns and gaps in every dynamics; write them.
+    """Print returns in every dynamics; write them.
 
     Args:
         task: its id.
         actor: any TorchRL policy.
-        learned_in: the dynamics that the policy has met; measured beside the shipped
-            model, MuJoCo and dm_control.
+        learned_in: the dynamics that the policy was trained in; measured beside the
+            shipped model, MuJoCo and dm_control.
         episodes: in each, see `transfer`.
         seed: of the starts.
         folder: gets ``returns.json``.

@@ -117,7 +117,7 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Pairs of the robot's own shapes between which MuJoCo looks for contact.
+    """Pairs of the robot's own shapes between which MuJoCo detects contact.
 
     Not those of one body, of a body and its parent, or that the model excludes. Source:
     https://mujoco.readthedocs.io/en/stable/computation/index.html#selection

@@ -1,4 +1,4 @@
-"""Robots of others: MJCF files, the dm_control suite, Gymnasium's MuJoCo environments.
+"""Third-party robots: MJCF files, the dm_control suite, Gymnasium's MuJoCo environments.
 
 All give a compiled model and a control step; everything else is read from the model.
 """

@@ -1,4 +1,4 @@
-"""Tasks of the dm_control suite in any dynamics: the suite's own code, rows of tensors."""
+"""Tasks of the dm_control suite in any dynamics: the suite's own code, envs of tensors."""
 
 from collections.abc import Callable
 from math import ceil
@@ -18,9 +18,9 @@ from torchrl_nerd.tasks.task import State, Task
 class SuiteTask(Task):
     """Reward, observation, resets and time limit of ``dm_control/DOMAIN-TASK``.
 
-    They are the suite's, unchanged, and each row costs its Python. The observation is the
+    They are the suite's, unchanged, and each env costs its Python. The observation is the
     suite's, flattened in its order; an action of -1 to 1 spans the control range. A task
-    that reads contact forces (hopper's feet) is shown those of the true dynamics' last
+    that reads contact forces (hopper's feet) is shown those of the ground truth's last
     substep, as in the suite. Learned dynamics know none: there MuJoCo computes them at
     the state and the action that led to it.
 
@@ -76,7 +76,7 @@ class SuiteTask(Task):
         return self._judged(next_state)[..., 1] > 0.0
 
     def _judged(self, state: State) -> Tensor:
-        """Reward, end and observation of each row; the control is zero after a reset."""
+        """Reward, end and observation of each env; the control is zero after a reset."""
         qpos = state[QPOS]
         ctrl = qpos.new_zeros(*qpos.shape[:-1], self._num_ctrl)
         if ACTION in state.keys():

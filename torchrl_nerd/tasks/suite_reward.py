@@ -2,7 +2,7 @@
 
 The suite's `Task` reads a `Physics`. Here that `Physics` is never stepped: a state is
 written in and only what the suite reads is brought up to date. On a cheetah that takes 5 us
-of about 80 us a row, the rest being the suite's own Python; threads gain nothing, since
+of about 80 us an env, the rest being the suite's own Python; threads gain nothing, since
 they wait for each other in it.
 """
 
@@ -20,14 +20,14 @@ PARTS = (  # of mj_forward: positions, velocities and the sensors of both
     mujoco.mj_kinematics,
     mujoco.mj_comPos,
     mujoco.mj_comVel,
-    mujoco.mj_subtreeVel,  # or its sensors would read what the row before left
+    mujoco.mj_subtreeVel,  # or its sensors would read what the env before left
     mujoco.mj_sensorPos,
     mujoco.mj_sensorVel,
 )
 
 
 class SuiteReward:
-    """Reset distribution, reward, observation and end of ``domain-task``, row by row.
+    """Reset distribution, reward, observation and end of ``domain-task``, env by env.
 
     | attribute | meaning |
     |---|---|
@@ -96,7 +96,7 @@ class SuiteReward:
         if len(self.targets):
             model.geom_pos[self.targets] = row[velocity:ctrl].reshape(-1, 3)
         if len(felt) and np.isnan(felt).any():
-            data.qacc_warmstart = 0.0  # nothing is left of the row before
+            data.qacc_warmstart = 0.0  # nothing is left of the env before
             mujoco.mj_forward(model, data)
         else:
             for update in PARTS:

@@ -10,13 +10,13 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.controllers import Controller
 
 State = Mapping[str, Tensor]
-"""``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's row parameters; after a step
+"""``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's parameters; after a step
 also the ``action`` that led there and, where the dynamics feels forces, ``sensordata``. A
 TensorDict is one."""
 
 
 class Task(ABC):
-    """Pure functions of the state; the same ones for learned and true dynamics.
+    """Pure functions of the state; the same ones for all dynamics.
 
     | attribute | meaning |
     |---|---|
@@ -24,7 +24,7 @@ class Task(ABC):
     | ``num_uniforms`` | random numbers that one reset takes |
     | ``observation_size`` | width of the observation |
     | ``frame_skip`` | control steps over which an action is held |
-    | ``parameters`` | row parameters drawn at a reset and kept, key -> width |
+    | ``parameters`` | parameters of each env, drawn at a reset and kept, key -> width |
     """
 
     horizon: int

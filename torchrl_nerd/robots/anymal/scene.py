@@ -25,9 +25,9 @@ LIMIT_DAMPING = 10.0  # N m s/rad; limit_kd
 # along its shank, 0.88 kg upright. The whole damping rattles at 6 m/s when standing.
 CONTACT = {"ke": 5.1e4, "kd": 375.0, "kf": 275.0, "mu": 0.625}
 
-# The stance that the published policies stand in, knees outward, rad, leg by leg (HAA,
+# The nominal pose of the published policies, knees outward, rad, leg by leg (HAA,
 # HFE, KFE). The reference lists its numbers for LF, RF, LH, RH, but its importer orders
-# the legs RH, LH, RF, LF; the usual stance (HFE +0.4 fore, knees inward) is the other one.
+# the legs RH, LH, RF, LF; the usual pose (HFE +0.4 fore, knees inward) is the other one.
 STANDING_POSE = (
     *(-0.03, -0.4, 0.8),
     *(0.03, -0.4, 0.8),

@@ -1,4 +1,4 @@
-"""Conservation: energy, momentum, and closed forms of free motion."""
+"""Conservation: energy, momentum, and closed forms of unconstrained motion."""
 
 import mujoco
 import numpy as np

@@ -7,7 +7,7 @@ from scipy.stats import mannwhitneyu
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import open_loop_errors
 from torchrl_nerd.evaluation.stability.case import Metrics, Trial, hard_case
