@@ -1,20 +1,21 @@
 """A training that was killed at any moment ends in the bits of one that was not."""
 
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
 from dynamics_helpers import random_model
 from safetensors.torch import load_file
+from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import simulate
+from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, make_task
@@ -33,7 +34,11 @@ CONFIG = TrainConfig(
     save_every=4,
     validate_every=3,
 )
-PHASES = {"one-step": 6, "save": 8, "rollout": 18}
+STOPS = [
+    pytest.param(6, marks=pytest.mark.slow),
+    pytest.param(8, marks=pytest.mark.slow),
+    18,
+]
 """Where a run is stopped: between saves, right at one, among the rollouts."""
 KILLS = {
     "Trainer.update": (1, 7, 15, 20),
@@ -44,6 +49,8 @@ KILLS = {
 }
 """Function of the module -> calls at whose beginning the process is killed."""
 MOMENTS = [(name, call) for name, calls in KILLS.items() for call in calls]
+USUAL = [("Trainer.update", 15), ("RunState.save", 2), ("write_json", 2)]
+"""Tested always: among rollouts, between a model and its state, before the state's card."""
 
 KILLED = """
 import os, signal, sys
@@ -51,7 +58,7 @@ from functools import reduce
 from pathlib import Path
 import torch
 from torch import Generator
-from torchrl_nerd.data.generate import simulate
+from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.training import trainer as module
@@ -86,11 +93,14 @@ assert statuses == [signal.SIGKILL] * len(statuses), statuses
 """
 
 
-def make_trainer(folder: Path, start: NeRD | None = None) -> Trainer:
-    scene = load_scene(SCENE)
-    data = simulate(scene, 60, 10, Generator().manual_seed(1))
-    task, how = make_task(TASK), {"horizons": (2, 4), "quiet": True}
-    return Trainer(scene, data, task, CONFIG, folder, init_from=start, **how)
+@cache
+def data() -> TensorDict:
+    return simulate(load_scene(SCENE), 60, 10, Generator().manual_seed(1))
+
+
+def make_trainer(folder: Path, init_from: NeRD | None = None) -> Trainer:
+    how = {"horizons": (2, 4), "quiet": True, "init_from": init_from}
+    return Trainer(load_scene(SCENE), data(), make_task(TASK), CONFIG, folder, **how)
 
 
 @pytest.fixture(scope="module")
@@ -101,19 +111,23 @@ def whole(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory) -> Path:
-    """Folders ``function-call`` of runs that ended at that call."""
-    root = tmp_path_factory.mktemp("killed")
+def kill(moments: list[tuple[str, int]], root: Path) -> Path:
+    """Make folders ``function-call`` of runs that ended at that call."""
     code = KILLED.format(
         threads=torch.get_num_threads(),
-        moments=MOMENTS,
+        moments=moments,
         config=asdict(CONFIG),
         scene=SCENE,
         task=TASK,
     )
     subprocess.run([sys.executable, "-c", code, str(root)], check=True)
     return root
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Path:
+    """Folders of the usual moments."""
+    return kill(USUAL, tmp_path_factory.mktemp("killed"))
 
 
 def assert_same_bits(folder: Path, expected: Path) -> None:
@@ -134,8 +148,8 @@ def assert_same_bits(folder: Path, expected: Path) -> None:
     assert steps[0] == steps[1]
 
 
-@pytest.mark.parametrize("stop", PHASES.values(), ids=PHASES)
-def test_a_stopped_run_goes_on_to_the_same_bits(stop, whole, tmp_path):
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_stopped_run_resumes_to_the_same_bits(stop, whole, tmp_path):
     make_trainer(tmp_path).run(until=stop)
     resumed = make_trainer(tmp_path)
     assert resumed.step == stop // CONFIG.save_every * CONFIG.save_every
@@ -146,7 +160,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(stop, whole, tmp_path):
 def test_a_run_with_a_start_goes_on_to_the_same_bits(tmp_path, generator):
     start = random_model(load_scene(SCENE), generator, CONFIG.network)
     for folder in ("whole", "stopped"):
-        until = PHASES["rollout"] if folder == "stopped" else None
+        until = 18 if folder == "stopped" else None
         make_trainer(tmp_path / folder, start).run(until)
     resumed = make_trainer(tmp_path / "stopped", start)
     assert 0 < resumed.step < CONFIG.total_steps
@@ -158,18 +172,26 @@ def test_a_run_with_a_start_goes_on_to_the_same_bits(tmp_path, generator):
             make_trainer(tmp_path / "stopped", another)
 
 
-@pytest.mark.parametrize(("name", "call"), MOMENTS, ids=lambda value: str(value))
-def test_a_killed_run_goes_on_to_the_same_bits(name, call, killed, whole, tmp_path):
-    folder = shutil.copytree(killed / f"{name}-{call}", tmp_path / "killed")
+def assert_resumes(moment: tuple[str, int], root: Path, whole: Path) -> None:
+    """What was killed at a moment resumes from its last save to the bits of the whole."""
+    folder = root / "{}-{}".format(*moment)
     resumed = make_trainer(folder)
     assert resumed.step % CONFIG.save_every == 0
-    uninterrupted = make_trainer(tmp_path / "whole")
-    if resumed.step:
-        uninterrupted.run(until=resumed.step)
-    assert min(resumed.best, 1e300) == min(uninterrupted.best, 1e300)
     resumed.run()
     assert_same_bits(folder, whole)
     assert not list(folder.rglob(".*.tmp"))
+
+
+@pytest.mark.parametrize("moment", USUAL, ids=str)
+def test_a_killed_run_resumes_to_the_same_bits(moment, killed, whole):
+    assert_resumes(moment, killed, whole)
+
+
+@pytest.mark.slow
+def test_at_every_moment(whole, tmp_path):
+    kill(MOMENTS, tmp_path)
+    for moment in MOMENTS:
+        assert_resumes(moment, tmp_path, whole)
 
 
 def test_a_finished_run_is_left_as_it_is(whole):

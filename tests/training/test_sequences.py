@@ -70,9 +70,10 @@ def test_tokens_and_targets_are_those_of_the_windows(model, sequences, seed):
         50, 4, Generator().manual_seed(seed)
     )
     ground = None if terrain is None else terrain[:, None].expand(-1, 4, -1)
-    encoded = model.encode(qpos[:, :-1], qvel[:, :-1], torque, ground).token
-    torch.testing.assert_close(inputs.token, encoded, rtol=1e-5, atol=1e-6)
-    decoded = model.decode(qpos[:, :-1], qvel[:, :-1], targets.double())
+    state = qpos[:, :-1], qvel[:, :-1]
+    encoded = model.encode(*state, torque, ground)
+    torch.testing.assert_close(inputs.token, encoded.token, rtol=1e-5, atol=1e-6)
+    decoded = model.decode(state, encoded, targets.double())
     torch.testing.assert_close(decoded[0], qpos[:, 1:], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(decoded[1], qvel[:, 1:], rtol=1e-4, atol=1e-4)
 

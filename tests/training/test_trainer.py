@@ -1,21 +1,23 @@
 """Training: the loss falls on every robot, and bad requests are refused in a sentence."""
 
 from dataclasses import replace
+from functools import cache
+from itertools import cycle
 from pathlib import Path
 
 import pytest
 import torch
-from dynamics_helpers import each_free
+from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import PRESETS, load_scene, make_task
+from torchrl_nerd.robots import PRESETS, SCENES, load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss
@@ -36,22 +38,34 @@ BRIEF = TrainConfig(
 )
 
 
+NETWORK_NAMES = ("mlp-4x64", "transformer-2x64", "gru")
+CASES = [(list(SCENES)[0], name) for name in NETWORK_NAMES]
+CASES += list(zip(list(SCENES)[1:], cycle(NETWORK_NAMES), strict=False))
+"""Every network on one scene, and every scene with one network."""
+
+
+@cache
+def trajectories(scene: Scene, steps: int) -> TensorDict:
+    data = simulate(scene, 200, steps, Generator().manual_seed(0))
+    return data[is_sound(data)]
+
+
 def make_trainer(scene: Scene, config: TrainConfig, folder: Path, steps=12) -> Trainer:
-    data = simulate(scene, 200, steps, Generator().manual_seed(config.seed))
-    task = make_task(PRESETS[scene.name].task)
-    data, horizons = data[is_sound(data)], (2, 5)
-    return Trainer(scene, data, task, config, folder, horizons=horizons, quiet=True)
+    task, data = make_task(PRESETS[scene.name].task), trajectories(scene, steps)
+    return Trainer(scene, data, task, config, folder, horizons=(2, 5), quiet=True)
 
 
 def loss_of(trainer: Trainer, seed: int) -> float:
     generator = Generator().manual_seed(seed)
-    tokens, targets = trainer.sequences.one_step(256, 8, generator)
+    inputs, targets = trainer.sequences.one_step(256, 8, generator)
     with torch.no_grad():
-        return float(one_step_loss(trainer.model.network(tokens), targets, 0.01))
+        output = trainer.model.network(inputs.token)
+        return float(one_step_loss(inputs.change(output), targets, 0.01))
 
 
-@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
-def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
+@pytest.mark.parametrize(("name", "network"), CASES)
+def test_the_loss_falls_and_checkpoints_load(name, network, tmp_path, seed):
+    scene = load_scene(name)
     trainer = make_trainer(scene, replace(BRIEF, network=network, seed=seed), tmp_path)
     before = loss_of(trainer, seed)
     model = trainer.run()
@@ -70,24 +84,26 @@ def test_the_loss_falls_and_checkpoints_load(scene, network, tmp_path, seed):
     assert set(card["validation_error"]) == {"2", "5"}
 
 
-@each_free
-def test_a_step_that_is_corrected_learns_too(scene, tmp_path, seed):
-    config = replace(
-        BRIEF, network="free", seed=seed, steps=200, single_step_fraction=1.0
-    )
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [("cartpole", "unconstrained"), ("double_pendulum", "penalty-contact-1-stage")],
+)
+def test_a_hybrid_learns_too(name, step, tmp_path, seed):
+    scene = load_scene(name)
+    config = replace(BRIEF, network="mlp-2x64", step=step, seed=seed, steps=200)
+    config = replace(config, single_step_fraction=1.0)
     trainer = make_trainer(scene, config, tmp_path)
-    before = loss_of(trainer, seed)
-    path = open_loop(NeRDDynamics(trainer.run()), initial_states(scene, 5, seed), 20)
+    before, start = loss_of(trainer, seed), initial_states(scene, 5, seed)
+    path = open_loop(NeRDDynamics(trainer.run()), start, 20)
     assert loss_of(trainer, seed) < before and path.isfinite().all()
     again = load_checkpoint(tmp_path / "last")
-    assert torch.equal(
-        open_loop(NeRDDynamics(again), initial_states(scene, 5, seed), 20), path
-    )
-    with pytest.raises(ValueError, match="without use_symmetry for a model with a sim"):
+    assert again.kind == "hybrid"
+    assert torch.equal(open_loop(NeRDDynamics(again), start, 20), path)
+    with pytest.raises(ValueError, match="without use_symmetry for a hybrid"):
         make_trainer(scene, replace(config, use_symmetry=True), tmp_path / "other")
 
 
-@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
+@pytest.mark.parametrize("network", NETWORK_NAMES)
 def test_bfloat16_learns_as_much_and_leaves_weights_and_outputs_alone(
     network, tmp_path, seed
 ):
@@ -199,7 +215,7 @@ def test_counts_of_zero_are_refused(name):
         TrainConfig(**{name: 0})
 
 
-@pytest.mark.parametrize("network", ["transformer-2x64", "mlp-4x64", "gru"])
+@pytest.mark.parametrize("network", NETWORK_NAMES)
 def test_every_weight_has_one_optimizer(network, tmp_path):
     trainer = make_trainer(SCENE, replace(BRIEF, network=network), tmp_path)
     matrices, others = split_parameters(trainer.model.network)
