@@ -28,17 +28,18 @@ def two_threads():
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
 def test_parts_are_the_whole(parts, generator):
-    def double(pair: dict[str, Tensor], other: Tensor | None, number: int) -> tuple:
-        return {"sum": pair["a"] + number, "same": pair["b"]}, other, number
+    def double(x: Tensor, y: Tensor | None, number: int) -> tuple:
+        return 2.0 * x, y, number
 
-    pair = {k: torch.rand(6, 2, generator=generator) for k in ("a", "b")}
-    each = RowThreads(double)
+    def alone(x: Tensor, y: Tensor | None, number: int) -> Tensor:
+        return x + number
+
+    x = torch.rand(6, 2, generator=generator)
     for other in (None, torch.rand(6, generator=generator)):
-        found, expected = each(parts, pair, other, 5), double(pair, other, 5)
-        for key, value in expected[0].items():
-            assert torch.equal(found[0][key], value)
+        found = RowThreads(double)(parts, x, other, 5)
+        assert torch.equal(found[0], 2.0 * x) and found[2] == 5
         assert found[1] is other if other is None else torch.equal(found[1], other)
-        assert found[2] == 5
+        assert torch.equal(RowThreads(alone)(parts, x, other, 5), x + 5)
 
 
 def test_as_many_parts_as_pay():

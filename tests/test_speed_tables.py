@@ -1,21 +1,17 @@
-"""Tables of speed: rates at equal error, and what an early exit could spare."""
+"""Tables of speed: rates at equal error."""
 
 import json
 import shutil
 from dataclasses import asdict, replace
 
 import draw_races
-import early_exit
 import equal_error
 import pytest
 import torch
 from stability_table import FIGURES
-from tensordict import TensorDict
 
-from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
 from torchrl_nerd.evaluation.bench.rates import Rate
 from torchrl_nerd.evaluation.bench.report import BenchReport
-from torchrl_nerd.robots import load_scene
 
 
 def race(
@@ -54,25 +50,6 @@ def test_beyond_mujoco_s_rows(generator):
     assert found.alone == pytest.approx((3.0 / fastest, 3.0 / fastest))
     (found,) = equal_error.ratios(race((0.5, 3.0), *true))
     assert "so exact" in equal_error.written(found.alone)
-
-
-def test_who_flies_and_who_rests(generator):
-    scene = load_scene("cube")
-    state = TensorDict(scene.sample_initial(3, generator)[0], [3])
-    state["qpos"][:, 2] = torch.tensor([5.0, 0.0, 0.0]).double()
-    state["qvel"][2] = 0.0
-    clear, slow = early_exit.kinds(UnconstrainedStep(scene), scene, state, None)
-    assert clear.tolist() == [True, False, False]
-    assert slow.tolist() == [False, False, True]
-
-
-def test_shares_of_a_scene(seed, tmp_path):
-    path = tmp_path / "shares.json"
-    options = early_exit.Options(("cube",), rows=3, seed=seed, json=path)
-    (found,) = early_exit.main(options)  # a cube has no motors
-    assert found.drive == "passive" and found.steps == 80
-    assert 0.0 < found.flying < 1.0 and found.resting >= 0.0
-    assert found.bound >= 1.0 and path.exists()
 
 
 def test_an_arm_s_race_is_drawn_of_its_ends(tmp_path):
