@@ -17,11 +17,11 @@ def test_rollouts_are_plotted(tmp_path, seed, capsys):
         "--steps",
         "5",
         "--case",
-        "ground 1",
+        "terrain 1",
     ]
     argv += ["--seed", str(seed), "--out", str(out), "--json", str(results)]
     assert main(argv) == 0
-    assert f"{out}: 4 trajectories of 5 steps, ground 1" in capsys.readouterr().out
+    assert f"{out}: 4 trajectories of 5 steps, terrain 1" in capsys.readouterr().out
     content = json.loads(results.read_text())
     assert out.exists() and len(content["seconds"]) == 6
     assert content["dynamics"] == ["double_pendulum", "MuJoCo"]

@@ -54,7 +54,7 @@ GENERATED = [
 
 RESULTS = {  # row of README -> case, learned model, coarse MuJoCo
     "Cartpole": ("cartpole", "passive", "cartpole", 1),
-    "double pendulum": ("double_pendulum", "ground 1", "double_pendulum", 1),
+    "double pendulum": ("double_pendulum", "terrain 1", "double_pendulum", 1),
     "Ant": ("ant", "passive", "ant-mlp", 4),
     "ANYmal": ("anymal", "standing", "anymal-mlp", 2),
     "Franka": ("franka", "random", "franka-mlp", 2),

@@ -73,7 +73,7 @@ def test_ppo_learns_in_one_dynamics_and_is_measured_in_all(
     returns = json.loads((tmp_path / "returns.json").read_text())
     assert set(returns) == {"nerd", "mujoco", "dm_control"}
     for summary in returns.values():
-        assert summary["episodes"] == 4 and abs(summary["gap"]) < 0.05
+        assert summary["episodes"] == 4 and abs(summary["difference"]) < 0.05
     assert "dm_control  " in capsys.readouterr().out
     assert (tmp_path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     card = json.loads((tmp_path / "policy.json").read_text())

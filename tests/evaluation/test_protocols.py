@@ -74,7 +74,7 @@ def test_published_figures_of_the_cartpole():
 
 def test_published_figures_of_the_double_pendulum():
     expected = {
-        (f"ground {ground}", 100, joint): value
+        (f"terrain {ground}", 100, joint): value
         for (ground, joint), value in table(DOUBLE_PENDULUM).items()
     }
     assert len(expected) == 14

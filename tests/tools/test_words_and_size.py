@@ -13,7 +13,7 @@ from tools.size import count_comments, measure
         "class GroundedNeRD(NeRD):",
         "rollout_lr: float = 1.0",
         "def fault_folder(self):",
-        "looks = 2",
+        "num_looks = 2",
         "--own-actions",
         "Coverage.distance",
     ],

@@ -21,7 +21,7 @@ from torchrl_nerd.settings import expect_at_least
 class Plot(DeviceCommand):
     """Error, energy and distance to the terrain over time, of one set of rollouts.
 
-    Example: nerd plot double_pendulum --case "ground 3" --out rollouts.png
+    Example: nerd plot double_pendulum --case "terrain 3" --out rollouts.png
     """
 
     scene: Positional[str]

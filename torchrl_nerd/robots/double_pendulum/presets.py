@@ -10,7 +10,7 @@ from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
 def protocol() -> EvaluationProtocol:
     """Paper, appendix C.2: no ground in reach (0) and grounds 1 to 6."""
     cases = {
-        f"ground {number}": DoublePendulumPassive(number)
+        f"terrain {number}": DoublePendulumPassive(number)
         for number in range(len(GROUNDS))
     }
     first = (0.004, 0.012, 0.008, 0.005, 0.011, 0.029, 0.008)

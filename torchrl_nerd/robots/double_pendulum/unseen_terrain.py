@@ -4,7 +4,7 @@ A contact point sees the nearest surface's distance and normal, whatever the sur
 so the trained weights run unchanged. Two things they cannot see: a surface that touches a
 link between its contact points, as the edge of a box does, and that MuJoCo gives a height
 field one contact for every prism of it that a cap dips into, so that its ground is
-several times stiffer near seams than a plane. The flat field, which is ground 1 of the
+several times stiffer near seams than a plane. The flat field, which is terrain 1 of the
 paper as a height field, shows how much of an error is the latter.
 """
 
