@@ -7,7 +7,7 @@ from PIL import Image
 
 from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.policy import Policy, save_policy
-from torchrl_nerd.evaluation.render.opengl import find_gl
+from torchrl_nerd.evaluation.render.renderer import find_gl
 from torchrl_nerd.files import read_json
 
 has_gl = pytest.mark.skipif(

@@ -7,13 +7,8 @@ from typing import Any
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
-from torchrl_nerd.evaluation.render.opengl import require_gl
-from torchrl_nerd.evaluation.render.side_by_side import (
-    FixedActions,
-    fixed_actions,
-    policy_actions,
-    roll_out_both,
-)
+from torchrl_nerd.evaluation.render.renderer import require_gl
+from torchrl_nerd.evaluation.render.side_by_side import FixedActions, roll_out_both
 from torchrl_nerd.evaluation.render.video import check_video, write_video
 from torchrl_nerd.evaluation.shipped_policies import shipped_policies
 from torchrl_nerd.files import folder_name
@@ -73,34 +68,24 @@ class Play(DeviceCommand):
         if self.steps is not None:
             expect_at_least(1, steps=self.steps)
             steps = self.steps
-        frame_stack, folder = 1, self.policy
+        folder, actor = self.policy, self.actions or "random"
         if folder is None and self.actions is None:
             folder = shipped_policies().get(self.task)
-        if folder is None:
-            act = fixed_actions(task, steps, self.seed, self.actions or "random")
-        else:
-            policy = load_policy(folder, task).to(self.device)
-            act, frame_stack = policy_actions(make_actor(policy)), policy.frame_stack
+        if folder is not None:
+            actor = make_actor(load_policy(folder, task).to(self.device))
         require_gl()
-        pair = roll_out_both(
-            self.task,
-            (self.dynamics, "mujoco"),
-            act,
-            steps,
-            self.seed,
-            not self.open_loop,
-            self.device,
-            frame_stack,
-        )
+        both, closed_loop = (self.dynamics, "mujoco"), not self.open_loop
+        how = (steps, self.seed, closed_loop, self.device)
+        pair = roll_out_both(self.task, both, actor, *how)
         frames = write_video(pair, out, self.width, self.slowdown, self.quiet)
         print(f"{out}: {pair.seconds:.2f} s, {frames} frames")
         rollouts = []
-        for name, kind, returns in zip(
-            pair.names, pair.kinds, pair.returns, strict=True
-        ):
-            print(f"{name:<20}{kind:<14}return {float(returns[-1]):.1f}")
-            one = {"dynamics": name, "kind": kind, "return": float(returns[-1])}
-            rollouts.append(one)
+        for i in range(2):
+            one = {"dynamics": pair.names[i], "kind": pair.kinds[i]}
+            rollouts.append({**one, "return": float(pair.returns[i][-1])})
+            print(
+                f"{pair.names[i]:<20}{pair.kinds[i]:<14}{pair.returns[i][-1]:.1f} return"
+            )
         return {
             "task": self.task,
             "video": out,

@@ -68,8 +68,8 @@ class Plot(DeviceCommand):
         args = (steps, self.trajectories, self.seed, is_random)
         traces = compare_traces(source, both, *args)
         names = (model_title(name, scene), "MuJoCo")
-        kinds = [f"{n} ({one.kind})" for n, one in zip(names, both, strict=True)]
-        plot_traces(traces, names, f"{self.scene}, {case}: {' and '.join(kinds)}", out)
+        title = f"{self.scene}, {case}: {names[0]} ({both[0].kind}) against MuJoCo"
+        plot_traces(traces, names, title, out)
         print(f"{out}: {self.trajectories} trajectories of {steps} steps, {case}")
         results: dict[str, Any] = {"scene": self.scene, "case": case, "dynamics": names}
         results["seconds"] = traces.seconds.tolist()

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
-from torchrl_nerd.evaluation.render.opengl import find_gl
+from torchrl_nerd.evaluation.render.renderer import find_gl
 
 PACKAGES = (
     *("torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium"),

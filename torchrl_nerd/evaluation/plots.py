@@ -8,8 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch import Tensor
-
 from torchrl_nerd.evaluation.rollout_error import unit_of
 from torchrl_nerd.evaluation.traces import Traces
 from torchrl_nerd.files import write_atomically
@@ -67,45 +65,35 @@ def plot_traces(traces: Traces, names: Sequence[str], title: str, path: Path) ->
     figure, axes = make_figure(panels, PANEL_HEIGHT * panels)
     figure.suptitle(title, fontsize=11)
     count = len(next(iter(traces.errors.values())))
+    what = (
+        f"Error over {count} trajectories: mean and 5% to 95% (lower is better \u2193)"
+    )
     for panel, unit in zip(axes, kinds, strict=False):
         quantities = [name for name in units if units[name] == unit]
         for color, name in zip(COLORS * len(quantities), quantities, strict=False):
-            _plot_band(panel, traces.seconds, traces.errors[name], color, name)
-        panel.set_title(
-            f"Error over {count} trajectories: mean and 5% to 95% (lower is better \u2193)",
-            fontsize=9,
-            loc="left",
-        )
-        panel.set(ylabel=f"error ({unit})", ylim=(0.0, None))
-        panel.legend(
-            frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5)
-        )
-    lines = {"Energy": ("energy (J)", traces.energies)}
+            error = traces.errors[name].nan_to_num(nan=float("inf"))
+            low, high = (error.quantile(q, 0) for q in BAND)
+            panel.fill_between(traces.seconds, low, high, color=color, alpha=0.15, lw=0)
+            label = name.replace("_", " ")
+            panel.plot(traces.seconds, error.mean(0), color=color, label=label)
+        panel.set_ylim(bottom=0.0)
+        _annotate(panel, what, f"error ({unit})")
+    lines = [("Energy", "energy (J)", traces.energies)]
     if traces.distances is not None:
-        lines["Smallest distance to the terrain"] = ("distance (m)", traces.distances)
-    for panel, (what, (label, both)) in zip(
-        axes[len(kinds) :], lines.items(), strict=True
-    ):
+        lines.append(("Distance to the terrain", "distance (m)", traces.distances))
+    for panel, (what, label, both) in zip(axes[len(kinds) :], lines, strict=True):
         for i in (1, 0):
-            panel.plot(
-                traces.seconds, both[i], STYLES[1 - i], color=COLORS[i], label=names[i]
-            )
-        panel.set_title(f"{what}, trajectory of median error", fontsize=9, loc="left")
-        panel.set_ylabel(label)
-        panel.legend(
-            frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5)
-        )
+            (line,) = panel.plot(traces.seconds, both[i], STYLES[1 - i], label=names[i])
+            line.set_color(COLORS[i])
+        _annotate(panel, f"{what}, trajectory of median error", label)
     axes[-1].set_xlabel("time (s)")
     save_figure(figure, path)
 
 
-def _plot_band(
-    axes: "Axes", seconds: Tensor, error: Tensor, color: str, name: str
-) -> None:
-    error = error.nan_to_num(nan=float("inf"))
-    low, high = (error.quantile(q, 0) for q in BAND)
-    axes.fill_between(seconds, low, high, color=color, alpha=0.15, lw=0)
-    axes.plot(seconds, error.mean(0), color=color, label=name.replace("_", " "))
+def _annotate(axes: "Axes", title: str, label: str) -> None:
+    axes.set_title(title, fontsize=9, loc="left")
+    axes.set_ylabel(label)
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def make_figure(

@@ -5,8 +5,7 @@ import pytest
 import torch
 from helpers import FLOATER, make_scene
 
-from torchrl_nerd.evaluation.render.opengl import find_gl
-from torchrl_nerd.evaluation.render.renderer import RobotRenderer
+from torchrl_nerd.evaluation.render.renderer import RobotRenderer, find_gl
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene

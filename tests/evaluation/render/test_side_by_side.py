@@ -4,11 +4,7 @@ import pytest
 import torch
 
 from torchrl_nerd.evaluation.policy import Policy, make_actor
-from torchrl_nerd.evaluation.render.side_by_side import (
-    fixed_actions,
-    policy_actions,
-    roll_out_both,
-)
+from torchrl_nerd.evaluation.render.side_by_side import roll_out_both
 from torchrl_nerd.robots import make_task
 
 STEPS = 6
@@ -22,10 +18,8 @@ def test_equal_dynamics_give_equal_rollouts(task_id, frame_stack, seed):
     sizes = (frame_stack * task.observation_size, 8, task.controller.num_actions)
     policy = Policy(sizes, frame_stack=frame_stack)
     torch.nn.init.normal_(policy.mlp[-1].weight)
-    act = policy_actions(make_actor(policy.eval()))
-    pair = roll_out_both(
-        task_id, ("mujoco", "mujoco"), act, STEPS, seed, frame_stack=frame_stack
-    )
+    actor = make_actor(policy.eval())
+    pair = roll_out_both(task_id, ("mujoco", "mujoco"), actor, STEPS, seed)
     assert torch.equal(*pair.paths) and torch.equal(*pair.returns)
     assert len(pair.paths[0]) == len(pair.returns[0]) == STEPS + 1
     assert not torch.equal(pair.paths[0][0], pair.paths[0][-1])
@@ -33,40 +27,43 @@ def test_equal_dynamics_give_equal_rollouts(task_id, frame_stack, seed):
 
 
 @pytest.mark.parametrize("closed_loop", [True, False])
-def test_the_policy_sees_what_it_acts_on(closed_loop, seed):
+def test_in_closed_loop_the_policy_acts_on_what_it_sees(closed_loop, seed):
     seen: list[torch.Tensor] = []
 
-    def act(step, shown):
+    def actor(shown):
         seen.append(shown["qpos"][0].clone())
-        return torch.full((1, 1), 0.3 if len(seen) % 2 else -0.3)
+        return shown.set("action", torch.full((1, 1), 0.3 if len(seen) % 2 else -0.3))
 
-    pair = roll_out_both("cartpole/swingup", BOTH, act, STEPS, seed, closed_loop)
+    pair = roll_out_both("cartpole/swingup", BOTH, actor, STEPS, seed, closed_loop)
     learned, truth = pair.paths
+    assert pair.kinds == ["learned", "ground truth"]
     assert torch.equal(learned[0], truth[0]) and not torch.equal(learned[2], truth[2])
-    if closed_loop:
-        assert torch.equal(torch.stack(seen[0::2]), truth[:-1])
-        assert torch.equal(torch.stack(seen[1::2]), learned[:-1])
-        assert abs(learned[-1] - truth[-1]).max() > 1e-3  # the actions are opposite
-    else:
-        assert torch.equal(torch.stack(seen), truth[:-1])
-        assert abs(learned[-1] - truth[-1]).max() < 1e-3
+    assert torch.equal(torch.stack(seen[0::2]), learned[:-1])
+    assert torch.equal(torch.stack(seen[1::2]), truth[:-1])
+    # the policy pushes the two carts to opposite sides; in open loop to the same
+    assert (abs(learned[-1] - truth[-1]).max() > 1e-3) == closed_loop
 
 
-@pytest.mark.parametrize("task_id", ["ant/run", "cube/toss"])
-def test_fixed_actions_are_those_of_their_seed(task_id, seed):
-    task = make_task(task_id)
-    draws = [fixed_actions(task, STEPS, s, "random") for s in (seed, seed, seed + 1)]
-    first, same, other = (torch.cat([d(i, {}) for i in range(STEPS)]) for d in draws)
-    assert torch.equal(first, same) and (first.abs() <= 1.0).all()
-    assert first.shape == (STEPS, task.controller.num_actions)
-    assert first.numel() == 0 or not torch.equal(first, other)
-    assert not fixed_actions(task, STEPS, seed, "zero")(0, {}).any()
+def test_random_actions_are_those_of_their_seed_and_the_same_in_both(seed):
+    def path(actor, seed):
+        pair = roll_out_both("ant/run", ("mujoco", "mujoco"), actor, STEPS, seed)
+        assert torch.equal(*pair.paths)
+        return pair.paths[0]
+
+    first, same, other = (path("random", s) for s in (seed, seed, seed + 1))
+    assert torch.equal(first, same) and not torch.equal(first, other)
+    assert torch.equal(path("zero", seed)[0], first[0])
+    assert not torch.equal(path("zero", seed), first)
 
 
 def test_the_rollouts_end_with_the_first_episode(seed):
     """Full force to one side takes the cart off its rail."""
     pair = roll_out_both(
-        "cartpole/swingup", BOTH, lambda step, shown: torch.ones(1, 1), 300, seed
+        "cartpole/swingup",
+        BOTH,
+        lambda td: td.set("action", torch.ones(1, 1)),
+        300,
+        seed,
     )
     assert pair.ending in ("nerd terminated", "mujoco terminated")
     assert len(pair.paths[0]) == len(pair.paths[1]) < 301

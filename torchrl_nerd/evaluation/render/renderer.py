@@ -1,15 +1,72 @@
-"""Images of a robot by `mujoco.Renderer`, with a camera that follows it."""
+"""Images of a robot by `mujoco.Renderer`, with or without a screen.
+
+MuJoCo chooses its OpenGL library from ``MUJOCO_GL`` when it is first imported, and without
+that variable takes one that needs a screen. `find_gl` tries the libraries in a child
+process, because a broken driver can end the process.
+"""
 
 import copy
+import os
+import platform
+import subprocess
+import sys
+from functools import cache
+from importlib import import_module
 
 import mujoco
 import numpy as np
+from mujoco.rendering.classic import gl_context
 from torch import Tensor
 
-from torchrl_nerd.evaluation.render.opengl import make_renderer
 from torchrl_nerd.scenes import Scene
 
+LIBRARIES = {
+    "Linux": ("egl", "osmesa", "glfw"),
+    "Darwin": ("cgl",),
+    "Windows": ("glfw",),
+}
 MARGIN = 1.25  # room around a robot that the camera follows
+PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+renderer = mujoco.Renderer(model, 8, 8)
+renderer.update_scene(mujoco.MjData(model))
+renderer.render()
+renderer.close()
+print("rendered", flush=True)
+"""
+
+
+def find_gl() -> str | None:
+    """The first OpenGL library that works here, such as ``"egl"``, or None.
+
+    If ``MUJOCO_GL`` is set, only the library that it names is tried.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    names = (asked,) if asked else LIBRARIES[platform.system()]
+    return next((name for name in names if _renders(name)), None)
+
+
+@cache
+def _renders(name: str) -> bool:
+    env = {**os.environ, "MUJOCO_GL": name}
+    done = subprocess.run([sys.executable, "-c", PROBE], env=env, capture_output=True)
+    return b"rendered" in done.stdout
+
+
+def require_gl() -> str:
+    """The library of `find_gl`.
+
+    Raises:
+        ValueError: none works; what to install.
+    """
+    name = find_gl()
+    if name is None:
+        raise ValueError(
+            "expected an OpenGL library for rendering, but none works on this machine: "
+            "install libegl1 and libgl1-mesa-dri, or libosmesa6"
+        )
+    return name
 
 
 class RobotRenderer:
@@ -47,7 +104,9 @@ class RobotRenderer:
             pose, size = ground.mocap_pose(terrain).numpy(), 3 * self.model.nmocap
             self.data.mocap_pos.flat = pose[:size]
             self.data.mocap_quat.flat = pose[size:]
-        self._renderer = make_renderer(self.model, width, height)
+        # MuJoCo made its own choice when it was imported, see above
+        gl_context.GLContext = import_module(f"mujoco.{require_gl()}").GLContext
+        self._renderer = mujoco.Renderer(self.model, height, width)
 
     def render(self, qpos: Tensor) -> np.ndarray:
         """Image ``(height, width, 3)``, uint8, of the robot at ``qpos (nq,)``."""

@@ -1,27 +1,24 @@
 """One task from one start in two dynamics: a policy acts in each, step by step."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Generator, Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.envs.frame_stack import stack_frames
+from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
 from torchrl_nerd.keys import ACTION, QPOS, TERRAIN
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.tasks import Task
 
 TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
 FixedActions = Literal["random", "zero"]
-Act = Callable[[int, TensorDictBase], Tensor]
-"""``(step, what the env returned) -> action (1, num_actions)``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,64 +51,47 @@ class SideBySide:
         return self.step_size * (len(self.paths[0]) - 1)
 
 
-def fixed_actions(task: Task, steps: int, seed: int, kind: FixedActions) -> Act:
-    """Actions that do not depend on the state: uniform in [-1, 1], or zero."""
-    shape = (steps, 1, task.controller.num_actions)
-    actions = torch.zeros(shape)
-    if kind == "random":
-        actions.uniform_(-1.0, 1.0, generator=Generator().manual_seed(seed))
-    return lambda step, shown: actions[step]
-
-
-def policy_actions(actor: Actor) -> Act:
-    """The mean action of a policy."""
-
-    def act(step: int, shown: TensorDictBase) -> Tensor:
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return actor(shown.clone())[ACTION]
-
-    return act
-
-
 @torch.no_grad()
 def roll_out_both(
     task: str,
     dynamics: Sequence[str | Path],
-    act: Act,
+    actor: Actor | FixedActions,
     steps: int,
     seed: int = 0,
     closed_loop: bool = True,
     device: torch.device | str = "cpu",
-    frame_stack: int = 1,
 ) -> SideBySide:
     """Roll out a task in two dynamics until the first of the two episodes ends.
 
     Args:
         task: id of a registered task.
-        dynamics: two, as `make_env` takes them; by convention the second is ``"mujoco"``.
-        act: chooses the actions.
+        dynamics: two, as `make_env` takes them; the second one is the ground truth.
+        actor: a policy, whose mean action is taken; or ``"random"`` actions, uniform in
+            [-1, 1], or ``"zero"`` ones, the same in both.
         steps: of the envs, at most.
-        seed: of the start.
-        closed_loop: ``act`` sees each env's own observation. In open loop the first env
-            repeats the actions of the second.
+        seed: of the start and of random actions.
+        closed_loop: the policy acts on each env's own observation. In open loop the first
+            env repeats the actions of the second.
         device: of the envs.
-        frame_stack: how many observations ``act`` sees, see `stack_frames`.
 
     Returns:
         Both rollouts, on the CPU.
     """
-    envs = [
-        stack_frames(make_env(task, name, 1, seed, device), frame_stack)
-        for name in dynamics
-    ]
+    frames = 1 if isinstance(actor, str) else frame_stack_of(actor)
+    envs = [stack_frames(make_env(task, x, 1, seed, device), frames) for x in dynamics]
     shown = [env.reset() for env in envs]  # one seed, one start
-    terrain = shown[1].get(TERRAIN, None)
+    terrain, generator = shown[1].get(TERRAIN, None), Generator().manual_seed(seed)
     paths = [[td[QPOS][0]] for td in shown]
     rewards, ending = [[0.0], [0.0]], "steps"
-    for step in range(steps):
-        actions = [act(step, shown[1])] * 2
-        if closed_loop:
-            actions[0] = act(step, shown[0])
+    for _ in range(steps):
+        if isinstance(actor, str):
+            u = 2.0 * torch.rand(envs[1].action_spec.shape, generator=generator) - 1.0
+            actions = [(u if actor == "random" else 0.0 * u).to(device)] * 2
+        else:
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                actions = [actor(td.clone())[ACTION] for td in shown]
+        if not closed_loop:
+            actions[0] = actions[1]
         for i, (env, action) in enumerate(zip(envs, actions, strict=True)):
             td = TensorDict({ACTION: action}, env.batch_size, device=env.device)
             shown[i] = env.step(td)["next"]
