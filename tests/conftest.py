@@ -2,7 +2,8 @@
 
 A test that takes ``scene`` or ``task_id`` runs once for each one registered, so a new
 robot is tested by being there. Where a test has several parameters, a few cases cover every
-value of each; the rest of the product is marked slow, see `cover_products`.
+value of each, with one scene and one task of each robot; the rest of the product is marked
+slow, see `cover_products`.
 
 Random inputs of a test are the same at every run. ``pytest --seed N`` draws others,
 ``--seed random`` new ones at every run; a failure shows its seed.
@@ -21,7 +22,7 @@ from helpers import EXCERPT
 
 from torchrl_nerd.data.log_files import read_log
 from torchrl_nerd.data.recorded import Recording, complete
-from torchrl_nerd.robots import SCENES, TASKS, load_scene
+from torchrl_nerd.robots import ROBOTS, SCENES, TASKS, load_scene
 from torchrl_nerd.scenes import Scene
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -29,6 +30,12 @@ logging.getLogger("torchrl").setLevel(logging.ERROR)
 
 PRODUCT = 8
 """Cases of a test with several parameters up to which all of them run by default."""
+OTHERS = [
+    name
+    for robot in ROBOTS.values()
+    for name in (*list(robot.scenes)[1:], *list(robot.tasks)[1:])
+]
+"""Scenes and tasks of a robot beside its first."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -49,14 +56,19 @@ def cover_products(cases: list[pytest.Function]) -> None:
     expensive = ("slow", "gpu")
     cases = [case for case in cases if not any(map(case.get_closest_marker, expensive))]
     values = {  # the same object in every case that has it
-        case: {(name, id(value)) for name, value in case.callspec.params.items()}
+        case: {(name, id(x)) for name, x in case.callspec.params.items()}
         for case in cases
         if hasattr(case, "callspec")
     }
-    missing = set().union(*values.values())
-    counts = Counter(name for name, _ in missing)
+    counts = Counter(name for name, _ in set().union(*values.values()))
     if len(cases) <= PRODUCT or sum(count > 1 for count in counts.values()) < 2:
         return
+    missing = {
+        (name, id(x))
+        for case in values
+        for name, x in case.callspec.params.items()
+        if (x.name if isinstance(x, Scene) else str(x)) not in OTHERS
+    }
     order = sorted(cases, key=lambda case: crc32(case.nodeid.encode()))
     while missing:
         best = max(order, key=lambda case: len(values[case] & missing))
