@@ -77,7 +77,7 @@ def test_every_command_explains_itself(command, capsys):
     assert ("--quiet" in text) == (command not in SOON_DONE)
 
 
-@pytest.mark.parametrize("command", ["data", "train"])
+@pytest.mark.parametrize("command", ["data", "train", "finetune"])
 def test_help_explains_every_flag(command, capsys):
     with pytest.raises(SystemExit):
         main([command, "--help"])
@@ -118,7 +118,7 @@ def test_the_version(capsys):
     assert capsys.readouterr().out == f"nerd {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["data", "train"])
+@pytest.mark.parametrize("command", ["data", "train", "finetune"])
 def test_help_shows_the_preset_of_the_scene(command, scene, capsys):
     preset = PRESETS[scene.name]
     with pytest.raises(SystemExit) as stop:
@@ -170,7 +170,7 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
     assert "resume the run in runs/cartpole" in text
 
 
-@pytest.mark.parametrize("command", ["data", "train"])
+@pytest.mark.parametrize("command", ["data", "train", "finetune"])
 def test_a_dry_run_refuses_what_the_run_would(command, capsys):
     assert "'unicorn'" in refusal(capsys, command, "unicorn", "--dry-run")
 
@@ -230,7 +230,7 @@ def test_what_cannot_be_read_is_pointed_at(argv, words, capsys):
     assert words in captured.err and captured.out == ""
 
 
-@pytest.mark.parametrize("command", ["data", "train"])
+@pytest.mark.parametrize("command", ["data", "train", "finetune"])
 def test_a_folder_that_cannot_be_written_is_refused(command, tmp_path, capsys):
     place = tmp_path / "taken"
     place.write_text("not a folder")

@@ -134,42 +134,28 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """How to fine-tune.
-
-    | field | meaning |
-    |---|---|
-    | ``update`` | what changes: physical parameters (without gradients), or all weights,
-      the last layer (head), low-rank changes; None: physics of an analytic step, else all |
-    | ``evaluations`` | of physics, in each of two stages |
-    | ``epochs`` | at most; an epoch shows every training window once |
-    | ``batch_size`` | windows per update |
-    | ``sequence_length`` | control steps of a rollout |
-    | ``short_history_fraction`` | share of updates, the first ones, at half of it |
-    | ``rank`` | of low-rank changes |
-    | ``lr`` | peak step size |
-    | ``clip`` | largest norm of the gradient |
-    | ``states`` | of a validation window, and of those that physics is fitted to |
-    | ``validate_every`` | updates between rollouts of the validation windows |
-    | ``patience`` | validations without progress, at full length, before it stops |
-    | ``seed`` | of batches |
+    """Settings of fine-tuning on recorded trajectories.
 
     Raises:
         SettingError: a value that cannot be.
     """
 
+    # what changes: physical parameters (physics), all weights, the last layer (head), or
+    # low-rank changes; default: physics for an analytic step, all for a network
     update: Update | None = None
-    evaluations: int = 90
-    epochs: float = 2.0
-    batch_size: int = 384
-    sequence_length: int = 24
+    evaluations: int = 90  # of physical parameters, in each of two stages
+    epochs: float = 2.0  # at most; an epoch shows every training window once
+    batch_size: int = 384  # windows per update
+    sequence_length: int = 24  # control steps of a rollout
+    # share of updates, the first ones, on rollouts of half the length
     short_history_fraction: float = 0.5
-    rank: int = 4
-    lr: float = 1e-3
-    clip: float = 0.3
-    states: int = 80
-    validate_every: int = 20
-    patience: int = 4
-    seed: int = 0
+    rank: int = 4  # of low-rank changes
+    lr: float = 1e-3  # peak learning rate of Adam
+    clip: float = 0.3  # largest norm of the gradient
+    states: int = 80  # of a validation window, and of windows that physics is fitted to
+    validate_every: int = 20  # updates between validations
+    patience: int = 4  # validations without progress, at full length, before it stops
+    seed: int = 0  # of batches
 
     def __post_init__(self) -> None:
         if self.update not in (None, *get_args(Update)):

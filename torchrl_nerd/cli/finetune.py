@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_nerd.cli.command import DeviceCommand
-from torchrl_nerd.cli.options import Flat, Positional, recorded_scene
+from torchrl_nerd.cli.options import Flat, Positional, SceneName, recorded_scene
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.files import writable_folder
@@ -23,18 +23,17 @@ class Finetune(DeviceCommand):
     Example: nerd finetune cube --from cube_tosses.npz --model runs/cube/best
     """
 
-    scene: Positional[str]
-    """Name of the robot; cube stands for cube_real, the recorded one."""
+    scene: Positional[SceneName]
     recorded: Annotated[Path, tyro.conf.arg(name="from")]
     """Recorded trajectories, npz or CSV."""
     out: Path | None = None
-    """Folder of the run; runs/SCENE_finetuned by default."""
+    """Folder of the run; default runs/SCENE_finetuned."""
     model: str | None = None
-    """What to start from: a shipped model, a checkpoint folder, or analytic (a free body's
-    physical parameters); by default analytic for the cube, else the robot's model."""
+    """Where to start: a shipped model, a checkpoint folder, or analytic (one free body with
+    physical parameters); default analytic for the cube, else the robot's model."""
     config: Flat[FinetuneConfig] = field(default_factory=FinetuneConfig)
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""
