@@ -9,7 +9,7 @@ from mkdocs.structure.files import File, Files
 
 
 def as_markdown(notebook: str, own: str) -> str:
-    """The cells in order; code as code, ``!`` commands as commands.
+    """The cells in order, each with its stored output; ``!`` commands as commands.
 
     Links to other notebooks lead to their pages; to its ``own`` file, to that file.
     """
@@ -20,6 +20,8 @@ def as_markdown(notebook: str, own: str) -> str:
             is_shell = text.startswith("!")
             language = "sh" if is_shell else "python"
             text = f"```{language}\n{text.removeprefix('!')}\n```"
+            printed = "".join(line for out in cell["outputs"] for line in out["text"])
+            text += f"\n\n```text\n{printed}```" if printed else ""
         parts.append(text)
     page = "\n\n".join(parts)
     return re.sub(rf"\((?!{re.escape(own)}\))(\S+)\.ipynb\)", r"(\1.md)", page)
