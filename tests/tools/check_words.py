@@ -79,7 +79,13 @@ WORDS = {
 """Left column of the glossary as a regular expression, and what to write instead."""
 
 ALLOWED = {
-    r"figures(?! \d)": ("docs/*", "mkdocs.yml", "*plot*", "tests/test_docs.py"),
+    r"figures(?! \d)": (
+        "README.md",
+        "docs/*",
+        "mkdocs.yml",
+        "*plot*",
+        "tests/test_docs.py",
+    ),
     r"(not )?met": ("*.json",),
     r"springs": ("torchrl_nerd/scenes/support.py",),
 }
