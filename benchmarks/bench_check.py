@@ -22,8 +22,8 @@ import tyro
 from tqdm import tqdm
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.bench.contenders import Contender, learned_contenders
-from torchrl_nerd.evaluation.bench.rates import Race, Turn
+from torchrl_nerd.evaluation.bench.candidates import Candidate, models
+from torchrl_nerd.evaluation.bench.rates import RateBenchmark, Sample
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene
@@ -34,12 +34,12 @@ TOLERANCE = 0.2
 """Share by which a ratio may fall: on a busy machine the same code's fell by up to 17%
 between two runs, by 12% beyond its spread; most stayed within 8%."""
 LEAST_ROUNDS = 5
-TRUTH = "MuJoCo"
+MUJOCO = "MuJoCo"
 
 
 @dataclass
 class Options:
-    """What to race, for how long, and against what."""
+    """What to measure, for how long, and against what."""
 
     tasks: tuple[str, ...] = ("cartpole/swingup", "double_pendulum/passive", "ant/run")
     rows: int = 512
@@ -69,19 +69,19 @@ def summarize(samples: list[float]) -> Ratio:
     return Ratio(middle, 1.57 * (high - low) / len(samples) ** 0.5 / middle)
 
 
-def ratios(turns: Mapping[str, Turn]) -> dict[str, float]:
+def ratios(samples: Mapping[str, Sample]) -> dict[str, float]:
     """Ratios of one round, by what they compare."""
-    truth, found = turns[TRUTH], {}
-    for name in turns:
-        if "," in name or name == TRUTH:
+    mujoco, found = samples[MUJOCO], {}
+    for name in samples:
+        if "," in name or name == MUJOCO:
             continue
-        alone = turns[name].steps_per_s
-        found[f"{name} / MuJoCo"] = alone / truth.steps_per_s
-        found[f"{name}: env / dynamics"] = turns[name].envs_per_s / alone
-        if f"{name}, window" in turns:
-            window = turns[f"{name}, window"].steps_per_s
+        alone = samples[name].steps_per_s
+        found[f"{name} / MuJoCo"] = alone / mujoco.steps_per_s
+        found[f"{name}: env / dynamics"] = samples[name].env_steps_per_s / alone
+        if f"{name}, window" in samples:
+            window = samples[f"{name}, window"].steps_per_s
             found[f"{name}: streaming / window"] = alone / window
-        compiled = turns[f"{name}, compiled"].steps_per_s
+        compiled = samples[f"{name}, compiled"].steps_per_s
         found[f"{name}: compiled / eager"] = compiled / alone
     return found
 
@@ -109,27 +109,24 @@ def compare(
     return said
 
 
-def runners(scene: Scene, threads: int) -> list[Contender]:
+def runners(scene: Scene, threads: int) -> list[Candidate]:
     """MuJoCo at the scene's own substeps, and the shipped models."""
-    learned = learned_contenders(scene, is_compiling=True)
-    return [
-        Contender(TRUTH, False, lambda here: MujocoDynamics(here, threads)),
-        *(c for c in learned if ", bf16" not in c.name),
-    ]
+    own = Candidate(MUJOCO, "simulator", lambda here: MujocoDynamics(here, threads))
+    return [own, *models(scene, variants=("compiled", "window"))]
 
 
 def measure(options: Options) -> dict[str, Ratio]:
-    """Race every task until the ratios are known, or the rounds are done."""
+    """Measure every task until the ratios are known, or the rounds are done."""
     found = {}
     for task_id in options.tasks:
         task = make_task(task_id)
-        race = Race(
+        benchmark = RateBenchmark(
             runners(task.scene, options.threads), task, options.rows, options.seed
         )
         rounds: list[dict[str, float]] = []
         known: dict[str, Ratio] = {}
         for _ in tqdm(range(options.rounds), task_id, disable=None):
-            rounds.append(ratios(race.round()))
+            rounds.append(ratios(benchmark.round()))
             if len(rounds) < LEAST_ROUNDS:
                 continue
             known = {
@@ -142,14 +139,13 @@ def measure(options: Options) -> dict[str, Ratio]:
 
 
 def conditions(options: Options) -> dict[str, Any]:
-    """What a baseline holds for: another task, batch, thread or network is another race."""
-    models = {
+    """What a baseline holds for: tasks, batch, threads and networks."""
+    networks = {
         c.name: asdict(c.make(make_task(task_id).scene).model.config)  # pyright: ignore
         for task_id in options.tasks
-        for c in learned_contenders(make_task(task_id).scene, is_compiling=False)
-        if "," not in c.name
+        for c in models(make_task(task_id).scene)
     }
-    return {"rows": options.rows, "threads": options.threads, "networks": models}
+    return {"rows": options.rows, "threads": options.threads, "networks": networks}
 
 
 def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, float]:
@@ -174,8 +170,8 @@ def main(options: Options) -> list[str]:
     expect_at_least(LEAST_ROUNDS, rounds=options.rounds)
     expect_at_least(1, rows=options.rows, threads=options.threads)
     torch.set_num_threads(options.threads)
-    race = conditions(options)
-    before = {} if options.write else read_baseline(options.baseline, race)
+    about = conditions(options)
+    before = {} if options.write else read_baseline(options.baseline, about)
     found = measure(options)
     for name, ratio in found.items():
         was = f", was {before[name]:.3g}" if name in before else ""
@@ -183,7 +179,7 @@ def main(options: Options) -> list[str]:
     if options.write:
         versions = {"torch": torch.__version__, "mujoco": mujoco.__version__}
         rows = {name: asdict(ratio) for name, ratio in found.items()}
-        write_json(options.baseline, race | versions | {"ratios": rows})
+        write_json(options.baseline, about | versions | {"ratios": rows})
         return []
     return compare(found, before, TOLERANCE)
 

@@ -17,6 +17,8 @@ import torch
 import tyro
 
 from torchrl_nerd import NeRDEnv
+from torchrl_nerd.configs import NO_PREDICTIONS
+from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
@@ -50,24 +52,24 @@ def timed(owner: object, name: str) -> list[float]:
 
 
 def step_times(
-    task: str, model: NeRD | None, rows: int, steps: int
+    task: str, model: Model | str, rows: int, steps: int
 ) -> dict[str, float]:
     """Median seconds of a step and of its dynamics, and the shares of the rest."""
     env = NeRDEnv(task, model, num_envs=rows)
     dynamics, own = timed(env.dynamics, "step"), timed(env, "_step")
-    contact = env.dynamics.model.tokens.contact  # pyright: ignore
-    looks = [
+    contact = env.dynamics.model.scene_features.contact  # pyright: ignore
+    evaluations = [
         timed(getattr(contact, name), "forward")
         for name in ("kinematics", "ground")
         if contact.terrain is not None
     ]
     td, whole = env.rand_action(env.reset()), timed(env, "step")
-    looking = []
+    contact_s = []
     for _ in range(steps):
-        for seconds in looks:  # several looks a step, where contacts are foreseen
+        for seconds in evaluations:  # several a step where contacts are predicted
             seconds.clear()
         env.step(td)
-        looking.append(sum(map(sum, looks)))
+        contact_s.append(sum(map(sum, evaluations)))
     calls = list(zip(dynamics, own, whole, strict=True))
     return {
         "step_s": median(whole),
@@ -75,7 +77,7 @@ def step_times(
         "torchrl_share": median(1.0 - own / whole for _, own, whole in calls),
         "task_share": median((own - inner) / whole for inner, own, whole in calls),
         "contact_share": median(
-            look / inner for look, inner in zip(looking, dynamics, strict=True)
+            part / inner for part, inner in zip(contact_s, dynamics, strict=True)
         ),
     }
 
@@ -85,9 +87,9 @@ def main(options: Options) -> None:
     if options.threads:
         torch.set_num_threads(options.threads)
     scene = make_task(options.task).scene
-    models = {"shipped": None}
+    models: dict[str, Model | str] = {"nerd": "nerd"}
     models |= {
-        name: NeRD(scene, NETWORKS[name])
+        name: NeRD(scene, NO_PREDICTIONS, NETWORKS[name])
         for name in ("transformer-2x64", "transformer-4x128", "paper")
     }
     figures = {}

@@ -20,12 +20,13 @@ from typing import Any, cast
 import mujoco
 import torch
 import tyro
+from step_cost import memory_bytes
 from tensordict import TensorDict
 
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
-from torchrl_nerd.evaluation.bench.cost import memory_bytes
-from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_in_turn
+from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, two_in_turn
 from torchrl_nerd.files import write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
@@ -109,8 +110,8 @@ def stepper(dynamics: Dynamics, state: TensorDict) -> Callable[[int], None]:
 
 def measure(scene: Scene, batch: int, options: Options) -> Point:
     """One point of the curves."""
-    state = states_on_the_way(scene, batch, options.seed)
-    model = NeRD(scene, network_config(options.network))
+    state = mid_states(scene, batch, options.seed)
+    model = NeRD(scene, NO_PREDICTIONS, network_config(options.network))
     learned = NeRDDynamics(model, compile=options.compile)
     true = MujocoDynamics(scene, num_threads=1)
     one, other = (Runner(stepper(x, state), time.process_time) for x in (learned, true))
@@ -133,7 +134,7 @@ def memory_table() -> dict[str, int]:
     """Bytes of history that one row adds, by preset: the same in every scene."""
     scene = load_scene("cartpole")
     networks = {
-        name: NeRDDynamics(NeRD(scene, config)).network
+        name: NeRDDynamics(NeRD(scene, NO_PREDICTIONS, config)).network
         for name, config in NETWORKS.items()
     }
     return {name: memory_bytes(network) for name, network in networks.items()}

@@ -4,8 +4,8 @@
     python benchmarks/streaming.py cartpole --presets tiny --rows 64 --no-compile
 
 Untrained networks of the scene's sizes, since their speed does not depend on weights; that
-both err alike is seen in the races of trained ones (`nerd bench cartpole`). All take turns
-in one run.
+both have the same error is seen with trained ones: `nerd bench cartpole --variants window`.
+All take turns in one run.
 """
 
 from dataclasses import asdict, dataclass
@@ -16,8 +16,9 @@ import tyro
 from scaling import stepper
 from tyro.conf import Positional
 
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.bench.rates import Runner, states_on_the_way, two_in_turn
+from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, two_in_turn
 from torchrl_nerd.files import write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
@@ -54,8 +55,8 @@ class Speed:
 
 def measure(scene: Scene, preset: str, is_compiled: bool, options: Options) -> Speed:
     """Both ways of one network."""
-    state = states_on_the_way(scene, options.rows, options.seed)
-    model = NeRD(scene, network_config(preset))
+    state = mid_states(scene, options.rows, options.seed)
+    model = NeRD(scene, NO_PREDICTIONS, network_config(preset))
     streaming, window = (
         Runner(stepper(NeRDDynamics(model, way, compile=is_compiled), state))
         for way in ("streaming", "window")

@@ -8,9 +8,6 @@ train the same networks on the same data from the same seeds. The script writes 
 test rollouts, in m and rad at 100 and 500 steps, and the time of an update of the matrices.
 """
 
-import platform
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -25,8 +22,8 @@ from torch import Generator, Tensor
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
-from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.optimizers import make_adamw, split_parameters
 from torchrl_nerd.training.trainer import Trainer
@@ -155,7 +152,7 @@ def train(options: Options, name: str, network: str, seed: int) -> dict[str, Any
         NeRDDynamics(model),
         MujocoDynamics(scene),
         list(HORIZONS),
-        rows=TEST_ROLLOUTS,
+        num_trajectories=TEST_ROLLOUTS,
         seed=TEST_SEED,
     )
     return {**found, **metrics(errors)}
@@ -185,16 +182,7 @@ def main() -> None:
                 results.append(train(options, name, network, seed))
                 print(results[-1], flush=True)
     if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        about = {
-            "command": f"python experiments/muon.py {' '.join(sys.argv[1:])}",
-            "commit": commit,
-            "machine": f"{platform.machine()}, 1 thread, torch {torch.__version__}",
-            "seed": list(options.seeds),
-        }
-        write_json(options.json, {**about, "results": results})
+        write_results(options.json, results, list(options.seeds))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 import subprocess
 import sys
 from itertools import pairwise
@@ -12,6 +13,10 @@ from helpers import slow_but
 
 from torchrl_nerd import __version__
 from torchrl_nerd.cli import COMMANDS, main
+from torchrl_nerd.evaluation.bench.candidates import mujoco_name, simulators
+from torchrl_nerd.evaluation.bench.error_table import PAPER
+from torchrl_nerd.evaluation.bench.evaluation_set import cases_of
+from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.robots import PRESETS, SCENES, load_scene
 
@@ -135,7 +140,7 @@ def test_help_shows_the_preset_of_the_scene(command, scene, capsys):
         ("data cartpole --trajectories 300 --steps 7", "draw 300 trajectories of"),
         ("train cartpole --network mlp-4x64", "begin a run in runs/cartpole"),
         ("train cartpole --reference rk4", "to datasets/cartpole-rk4"),
-        ("eval cartpole --rows 77", "rows                77"),
+        ("eval cartpole --num-trajectories 77", "num_trajectories    77"),
         ("stability cube --cases resting", "('resting',)"),
         ("doctor --json out.json", "out.json"),
     ],
@@ -197,10 +202,10 @@ def test_an_unknown_scene_is_refused(command, capsys):
         ("train cartpole --save-every 0", "save_every of at least 1"),
         ("train cartpole --threads -1", "threads"),
         ("train cartpole --device nowhere", "nowhere"),
-        ("eval cartpole --rows 1", "at least 2 rows, got 1"),
-        ("eval cartpole --rows -3", "at least 2 rows, got -3"),
+        ("eval cartpole --num-trajectories 1", "at least 2, got 1"),
+        ("eval cartpole --num-trajectories -3", "at least 2, got -3"),
         ("eval cartpole --device nowhere", "nowhere"),
-        ("eval cartpole --model nowhere", "checkpoint folder, got 'nowhere'"),
+        ("eval cartpole --model nowhere", "unknown dynamics 'nowhere'"),
     ],
 )
 def test_bad_input_is_refused(argv, words, tmp_path, monkeypatch, capsys):
@@ -275,32 +280,45 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
     assert read(figures["train"])["training"]["steps_done"] == 42
     assert main(argv) == 0  # finished: nothing to do
 
-    rows = "16"
-    argv = ["eval", name, "--model", best, "--rows", rows, "--seed", str(seed)]
-    argv += ["--quiet"]
+    argv = ["eval", name, "--model", best, "--num-trajectories", "8", "--quiet"]
+    argv += ["--seed", str(seed)]
     capsys.readouterr()
     assert main([*argv, "--json", str(figures["eval"])]) == 0
-    table = capsys.readouterr().out.splitlines()[1:]
-    content, protocol = read(figures["eval"]), PRESETS[name].protocol()
-    assert content["command"] == "eval" and content["version"] == __version__
-    assert content["configuration"].items() >= {"model": best, "rows": 16}.items()
-    assert (content["scene"], content["rows"], content["seed"]) == (name, 16, seed)
+    table = capsys.readouterr().out
+    record, protocol = read_results(figures["eval"]), PRESETS[name].protocol()
+    line = shlex.split(record["command"])
+    assert line[:2] == ["nerd", "eval"] and set(line[2:]) == set(argv[1:]) - {"--quiet"}
+    content, expected = record["results"], {c.name for c in simulators(scene)}
+    assert (record["seed"], content["scene"]) == (seed, name)
+    assert content["ground_truth"] == mujoco_name(scene) and mujoco_name(scene) in table
     quantities = scene.model.njnt
     if scene.base.is_floating:
         quantities = 2 + (scene.model.njnt > 1)  # base, its orientation, all joints
-    expected = len(protocol.cases) * len(protocol.horizons) * quantities
-    assert len(content["errors"]) == len(table) == expected
-    for row, line in zip(content["errors"], table, strict=True):
-        for key in ("mean", "interval", "final", "p95"):  # null: the rows blew up
-            assert row[key] is None or row[key] >= 0.0
-        key = (row["case"], row["steps"], row["quantity"])
-        assert row["paper"] == protocol.published.get(key)
-        assert row["case"] in line and row["quantity"] in line
+    for case, _, _ in cases_of(protocol):
+        for horizon in protocol.horizons:
+            assert f"{case}, {horizon} steps" in table
+            rows = [
+                row
+                for row in content["errors"]
+                if (row["case"], row["steps"]) == (case, horizon)
+            ]
+            names = {row["name"] for row in rows}
+            assert names - {PAPER} >= expected | {best}
+            assert sum(row["name"] == best for row in rows) == quantities
+            for row in rows:
+                is_paper = row["name"] == PAPER
+                for key in ("mean", "interval", "final", "p95"):  # null: it diverges
+                    assert row[key] is None or row[key] >= 0.0
+                if row["kind"] == "ground truth":
+                    assert row["mean"] == row["final"] == row["p95"] == 0.0
+                if is_paper:
+                    key = (row["case"], row["steps"], row["quantity"])
+                    assert row["mean"] == protocol.published[key]
 
     half = tmp_path / "half.json"
     assert main([*argv, "--bf16", "--json", str(half)]) == 0
-    assert read(half)["bf16"] and not content["bf16"]
-    assert read(half)["errors"] != content["errors"]  # of other rounding
+    rounded = read_results(half)["results"]["errors"]
+    assert rounded != content["errors"]  # of other rounding
 
 
 @pytest.mark.slow
@@ -318,14 +336,14 @@ def test_a_third_party_robot_from_data_to_figures(tmp_path, seed, monkeypatch, c
     for place in ("datasets", "runs"):
         assert [path.name for path in (tmp_path / place).iterdir()] == [folder]
 
-    model = ["--model", f"runs/{folder}/best", "--rows", "8", "--json", "eval.json"]
-    model += ["--quiet"]
-    assert main(["eval", name, *model]) == 0
-    rows = json.loads((tmp_path / "eval.json").read_text())["errors"]
-    assert {(row["case"], row["steps"]) for row in rows} == {
+    model = ["--model", f"runs/{folder}/best", "--num-trajectories", "8"]
+    assert main(["eval", name, *model, "--json", "eval.json", "--quiet"]) == 0
+    rows = read_results(tmp_path / "eval.json")["results"]["errors"]
+    learned = [row for row in rows if row["kind"] == "learned"]
+    assert {(row["case"], row["steps"]) for row in learned} == {
         (case, steps) for case in ("passive", "random") for steps in (20, 100)
     }
-    assert len(rows) == 4 * load_scene(name).model.njnt
+    assert len(learned) == 4 * load_scene(name).model.njnt
     capsys.readouterr()
     assert f"no model of '{name}' is shipped" in refusal(capsys, "eval", name)
 
@@ -368,7 +386,7 @@ def test_names_of_robots_are_names_of_folders(name, expected):
 
 
 def test_progress_is_shown_apart_from_the_table(tmp_path, monkeypatch, capsys):
-    model = ["--model", "cartpole-mlp", "--rows", "2"]
+    model = ["--model", "cartpole-mlp", "--num-trajectories", "2"]
     assert main(["eval", "cartpole", *model]) == 0
     shown = capsys.readouterr()
     assert "cartpole:" in shown.err and "it/s" in shown.err
@@ -385,9 +403,14 @@ def test_a_scene_is_explained(scene, tmp_path, capsys):
 
 
 def test_the_shipped_cartpole_is_as_good_as_the_paper(tmp_path):
-    path = tmp_path / "figures.json"
-    assert main(["eval", "cartpole", "--rows", "64", "--json", str(path)]) == 0
-    rows = [row for row in read(path)["errors"] if row["steps"] == 100]
-    assert {row["quantity"] for row in rows} == {"slider", "hinge"}
-    for row in rows:
-        assert 0.0 < row["mean"] < 2.0 * row["paper"]
+    path = tmp_path / "results.json"
+    sizes = ["--num-trajectories", "64", "--model", "cartpole", "--json", str(path)]
+    assert main(["eval", "cartpole", *sizes, "--quiet"]) == 0
+    rows = read_results(path)["results"]["errors"]
+    found = {
+        (row["name"], row["quantity"]): row["mean"]
+        for row in rows
+        if (row["case"], row["steps"]) == ("passive", 100)
+    }
+    for quantity in ("slider", "hinge"):
+        assert 0.0 < found["cartpole", quantity] < 2.0 * found[PAPER, quantity]

@@ -16,12 +16,12 @@ WITH_DEVICE = [
 NO_MODEL = {"data", "explain", "doctor"}  # MuJoCo, timings and checks of the processor
 SMALL = {
     "train": "cartpole --data set --quiet --steps 1 --rollout-steps 0",
-    "eval": "cartpole --rows 2",
+    "eval": "cartpole --num-trajectories 2",
     "finetune": f"cube --from {EXCERPT} --quiet",
     "transfer": "cartpole/swingup --policy policy --episodes 2",
     "play": "cartpole/swingup --steps 2 --quiet",
     "plot": "cartpole --rows 2 --steps 2",
-    "bench": "cartpole --batches 1 --rows 2 --rounds 1 --steps 2",
+    "bench": "cartpole --batches 1 --num-trajectories 2 --rounds 1 --steps 2",
     "stability": "cartpole --cases batching",
     "replay": "faults/fault_action.safetensors",
 }

@@ -100,7 +100,9 @@ def test_true_engines_agree_and_truth_is_added(policy: Policy) -> None:
     }
     assert abs(summaries["dm_control"].difference) < 1e-6
     assert summaries["mujoco"].difference == 0.0
-    assert len(transfer_table(summaries).splitlines()) == 3
+    table = transfer_table(summaries)
+    assert len(table.splitlines()) == 4 and "another simulator (Warp)" in table
+    assert {s.kind for s in summaries.values()} == {"ground truth"}
 
 
 @pytest.mark.parametrize("frame_stack", [1, 3])

@@ -32,9 +32,8 @@ def test_it_earns_in_both_dynamics_what_the_paper_does(task, seed) -> None:
     earned = transfer(task, actor, ("nerd", "mujoco"), episodes=32, seed=seed)
     for summary in earned.values():
         assert summary.mean + 2.0 * summary.interval > PAPER[task]
-    assert (
-        abs(earned["nerd"].difference) < 0.01 + 2.0 * earned["nerd"].difference_interval
-    )
+    learned = earned["nerd"]
+    assert abs(learned.difference) < 0.01 + 2.0 * learned.difference_interval
 
 
 def test_a_task_without_one_is_refused_in_a_sentence(capsys) -> None:

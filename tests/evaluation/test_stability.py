@@ -1,6 +1,5 @@
 """Every hard case runs on every robot, and MuJoCo is within its tolerances."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -13,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_nerd.cli.main import INTERRUPTED, main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.evaluation.stability.case import Case
 from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.evaluation.stability.measures import mechanics
@@ -181,7 +181,7 @@ def test_the_command_writes_table_json_and_plot(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "| history |" in shown and "| batching |" in shown
     named = {"scene", "seed", "scale", "history", "batching"}
-    assert named <= set(json.loads(out.read_text()))
+    assert named <= set(read_results(out)["results"])
     assert plot.stat().st_size > 1000
 
 
@@ -189,7 +189,7 @@ def test_figures_outlive_an_interruption(tmp_path, monkeypatch):
     out, run = tmp_path / "s.json", CASES["batching"].run
 
     def interrupted(*arguments):
-        assert "history" in json.loads(out.read_text())
+        assert "history" in read_results(out)["results"]
         assert run(*arguments)
         raise KeyboardInterrupt
 
@@ -197,8 +197,9 @@ def test_figures_outlive_an_interruption(tmp_path, monkeypatch):
     monkeypatch.setitem(CASES, "batching", broken)
     arguments = ["cartpole", "--cases", "history", "batching", "--scale", "0.01"]
     assert main(["stability", *arguments, "--json", str(out)]) == INTERRUPTED
-    written = json.loads(out.read_text())
-    assert written["configuration"]["scene"] == written["scene"] == "cartpole"
+    record = read_results(out)
+    written = record["results"]
+    assert written["scene"] == "cartpole" and "stability cartpole" in record["command"]
     assert "history" in written and "batching" not in written
 
 

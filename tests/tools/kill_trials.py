@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 import torch
@@ -162,7 +162,7 @@ class Saving:
         """See `Work`."""
         if not (folder / "card.json").exists():
             return 0
-        weights = list(load_checkpoint(folder).network.parameters())
+        weights = list(cast(NeRD, load_checkpoint(folder)).network.parameters())
         numbers = {float(n) for weight in weights for n in weight.detach().unique()}
         if len(numbers) > 1:
             raise ValueError(f"expected weights of one checkpoint, got {numbers}")

@@ -1,22 +1,23 @@
-"""``nerd bench``: speed against error, the shipped models and MuJoCo in one race."""
+"""``nerd bench``: speed and error of MuJoCo and of every model of a scene."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_nerd.cli.command import DeviceCommand
+from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.evaluation.bench.plot import plot_race
-from torchrl_nerd.evaluation.bench.report import bench
-from torchrl_nerd.evaluation.bench.table import bench_table
+from torchrl_nerd.evaluation.bench.plot import plot_bench
+from torchrl_nerd.evaluation.bench.report import bench, bench_table
 from torchrl_nerd.robots import load_scene
 
 
 @dataclass(frozen=True)
-class Bench(DeviceCommand):
-    """Speed against error: the shipped models and MuJoCo, coarse and fine, in one race.
+class Bench(MeasuringCommand):
+    """Speed and error of MuJoCo, at many settings, and of every model of a scene.
 
-    Example: nerd bench cartpole --json results/bench.json --plot results/bench.png
+    Errors are against MuJoCo with a solver so fine that its own error no longer counts.
+
+    Example: nerd bench cartpole --json results/bench_cartpole.json --plot bench.png
 
     Example: nerd bench dm_control/cheetah-run --models runs/dm_control-cheetah-run/best
     """
@@ -25,26 +26,24 @@ class Bench(DeviceCommand):
     """Name of the robot: cartpole, double_pendulum, ant, ..., dm_control/DOMAIN-TASK."""
     models: tuple[str, ...] = ()
     """Names of models, or checkpoint folders; all that are shipped for it by default."""
+    variants: tuple[str, ...] = ("compiled",)
+    """Other ways to run each model: compiled, guarded, window, bf16, "bf16 compiled"."""
     batches: tuple[int, ...] = (1, 64, 512, 4096)
-    """Rows stepped together."""
-    rows: int = 256
+    """Trajectories stepped together."""
+    num_trajectories: int = 256
     """Trajectories per case, for the errors."""
     rounds: int = 5
-    """Turns of each contender."""
+    """Samples of each candidate's speed; the median is shown."""
     seed: int = 500
-    """Of the starts."""
+    """Of the initial states."""
     steps: int | None = None
     """Horizon of the errors; the paper's by default."""
-    compile: bool = True
-    """Have compiled rows."""
     threads: int | None = None
     """Processor threads; torch's own choice by default."""
-    budget: tuple[float, ...] = ()
-    """Largest mean errors, in the table's order: names the fastest row within them."""
     without: tuple[str, ...] = ()
-    """Rows with one of these in their names take no part, as in --without mlp bf16."""
+    """Leave out candidates with one of these in their names, as in --without RK4 mlp."""
     plot: Path | None = None
-    """Draw the race to this PNG."""
+    """Draw error against speed to this PNG."""
     quiet: bool = False
     """No progress bars."""
 
@@ -54,15 +53,15 @@ class Bench(DeviceCommand):
         return self.plot
 
     def run(self) -> dict[str, Any]:
-        """Print the tables and return their figures."""
+        """Print the tables and return their numbers."""
         report = bench(
             load_scene(self.scene),
             self.batches,
-            self.rows,
+            self.num_trajectories,
             self.rounds,
             self.seed,
             self.steps,
-            self.compile,
+            self.variants,
             self.threads,
             self.device,
             self.quiet,
@@ -70,9 +69,6 @@ class Bench(DeviceCommand):
             self.models,
         )
         print(bench_table(report))
-        for batch in self.batches if self.budget else ():
-            choice = report.choice(batch, self.budget) or "none"
-            print(f"fastest within {self.budget}, {batch} rows: {choice}")
         if self.plot is not None:
-            plot_race(report, self.plot)
-        return report.figures()
+            plot_bench(report, self.plot)
+        return report.results()

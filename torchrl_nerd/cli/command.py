@@ -1,14 +1,19 @@
 """Base classes of commands: options, dry run, record of the results, device."""
 
+import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from torchrl_nerd import __version__
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.files import write_json
 from torchrl_nerd.settings import expect_device
+
+SHOWN = ("json", "plot", "quiet", "dry_run")
+"""Options that change no result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +74,34 @@ class DeviceCommand(Command):
 
     def __post_init__(self) -> None:
         expect_device(self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuringCommand(DeviceCommand):
+    """A command that writes its results in the schema of ``results/``."""
+
+    def keep(self, results: dict[str, Any]) -> None:
+        """Write results, command line, commit, machine and seed to `record`."""
+        if self.record is not None:
+            seed = getattr(self, "seed", None)
+            how = {"command": self.command_line(), "device": self.device}
+            write_results(self.record, results, seed, **how)
+
+    def command_line(self) -> str:
+        """The command line that does the same again, without what only shows or writes."""
+        words = ["nerd", type(self).__name__.lower()]
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.default is MISSING:  # positional
+                words.append(str(value))
+            elif value != field.default and field.name not in SHOWN:
+                option = field.name.replace("_", "-")
+                if isinstance(value, bool):
+                    words.append(f"--{option}" if value else f"--no-{option}")
+                else:
+                    values = value if isinstance(value, tuple) else (value,)
+                    words += [f"--{option}", *map(str, values)]
+        return shlex.join(words)
 
 
 def _leaves(options: Any) -> Iterator[tuple[str, Any]]:

@@ -1,5 +1,6 @@
-"""``nerd eval``: open-loop error against true physics or recorded tosses."""
+"""``nerd eval``: open-loop error against MuJoCo or recorded trajectories."""
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -8,29 +9,44 @@ import torch
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli.command import DeviceCommand
+from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional, recorded_scene
 from torchrl_nerd.data.log_files import load_recording
-from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
+from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.evaluation.bench.candidates import models, mujoco_name, simulators
+from torchrl_nerd.evaluation.bench.error_table import ErrorRow, error_rows, error_table
+from torchrl_nerd.evaluation.bench.evaluation_set import cases_of, evaluation_set
 from torchrl_nerd.evaluation.recorded_error import (
     STATES,
     compare,
     errors_as_text,
     rivals,
 )
-from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
-from torchrl_nerd.robots import PRESETS, load_scene, protocol_of, recorded_protocol
+from torchrl_nerd.evaluation.results import make_record
+from torchrl_nerd.files import write_json
+from torchrl_nerd.robots import (
+    PRESETS,
+    EvaluationProtocol,
+    load_scene,
+    protocol_of,
+    recorded_protocol,
+)
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import expect_at_least
+
+GROUND_TRUTH = "ground truth"
 
 
 @dataclass(frozen=True)
-class Eval(DeviceCommand):
-    """Open-loop error of a model against true physics, beside the paper's figures.
+class Eval(MeasuringCommand):
+    """Open-loop error of MuJoCo at coarser settings and of every model, beside the paper.
 
-    Robots of others start within their own sampling ranges, without and with actions.
+    All start in the same states, get the same actions and are measured against the same
+    ground truth: MuJoCo with the scene's own integrator and substeps, as in the paper, or
+    the reference solver. Passive, and driven by random actions where there are actuators.
 
-    Example: nerd eval cartpole --json results/cartpole.json
+    Example: nerd eval cartpole --json results/eval_cartpole.json
 
     Example: nerd eval cube --data cube_tosses.npz --split test --baselines
     """
@@ -39,20 +55,20 @@ class Eval(DeviceCommand):
     """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
     or an MJCF file."""
     model: Path | None = None
-    """Checkpoint folder; the shipped model by default."""
-    rows: int = 2048
+    """Name of a shipped model, or a checkpoint folder; all that are shipped by default."""
+    num_trajectories: int = 2048
     """Trajectories per case."""
     seed: int = 500
-    """Of the starts; test seeds are never used in training or validation."""
+    """Of the initial states; test seeds are never used in training or validation."""
     inference: Inference = "streaming"
     """streaming, or window: the paper's recomputation."""
     bf16: bool = False
     """Network in bfloat16, state in float64: for processors that multiply in it."""
     reference: Literal["rk4"] | None = None
-    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
-    substeps."""
+    """Measure against the reference solver in place of the scene's own: MuJoCo's RK4 at
+    four times its substeps."""
     unseen_terrain: bool = False
-    """Over grounds of kinds that no training data have, in place of the paper's."""
+    """On terrain of kinds that no training data have, in place of the paper's."""
     data: Path | None = None
     """Recorded trajectories (npz or CSV) in place of MuJoCo: every window of `states`."""
     split: str = "all"
@@ -66,71 +82,81 @@ class Eval(DeviceCommand):
     """No progress bar."""
 
     def run(self) -> dict[str, Any]:
-        """Print a table and return its rows.
+        """Print the tables and return their rows.
 
         Raises:
-            ValueError: fewer than 2 rows, or a robot that has no such terrain or model.
+            ValueError: fewer than 2 trajectories, or a robot that has no such terrain or
+                model.
         """
         if self.data is not None:
             return self.run_recorded(self.data)
         scene = load_scene(self.scene)
-        if self.rows < 2:
-            raise ValueError(f"expected at least 2 rows, got {self.rows}")
-        protocol = protocol_of(scene)
-        if self.unseen_terrain:
-            preset = PRESETS.get(self.scene)
-            if preset is None or preset.unseen_terrain is None:
-                known = ", ".join(n for n, p in PRESETS.items() if p.unseen_terrain)
-                raise ValueError(
-                    f"no unseen terrain for '{self.scene}', expected one of {known}"
-                )
-            protocol = preset.unseen_terrain()
-        model = self._load(self.model or self.scene, scene)
-        rows = []
-        header = f"{'case':<13}{'steps':>6} {'quantity':<20}{'mean':>9}{'+-':>9}"
-        print(f"{header}{'final':>9}{'p95':>9}  paper")
-        steps = 2 * max(protocol.horizons) * len(protocol.cases)  # learned and true
-        bar = tqdm(total=steps, desc=self.scene, leave=False, disable=self.quiet)
-        for case, source in protocol.cases.items():
-            place = scene_of(source)
-            here = model if place is scene else model.with_terrain(place)
-            errors = passive_errors(
-                source,
-                dynamics_of(here, inference=self.inference),
-                MujocoDynamics(place.reference if self.reference else place),
-                list(protocol.horizons),
-                self.rows,
-                self.seed,
-                self.device,
-                case in protocol.random_actions,
-                bar.update,
-            )
-            for horizon, by_name in errors.items():
-                for name, error in by_name.items():
-                    paper = protocol.published.get((case, horizon, name))
-                    row = {"case": case, "steps": horizon, "quantity": name}
-                    rows.append({**row, **asdict(error), "paper": paper})
-                    figures = (error.mean, error.interval, error.final, error.p95)
-                    line = f"{case:<13}{horizon:>6} {name:<17}{error.unit:<3}"
-                    line += "".join(f"{figure:>9.5f}" for figure in figures)
-                    bar.write(f"{line}  {paper if paper is not None else '-'}")
-        bar.close()
-        settings = {"rows": self.rows, "seed": self.seed}
-        settings |= {
-            "inference": self.inference,
-            "reference": self.reference,
-            "bf16": self.bf16,
-        }
-        return {"scene": self.scene, **settings, "errors": rows}
-
-    def _load(self, name: Path | str, scene: Scene) -> Model:
-        """The model as it was asked for."""
-        model = from_pretrained(name, scene).to(self.device)
-        return (
-            model.to(torch.bfloat16)
-            if self.bf16 and model.kind != "analytic"
-            else model
+        expect_at_least(2, num_trajectories=self.num_trajectories)
+        truth = mujoco_name(self.ground_truth(scene).scene)
+        solver = "the reference solver" if self.reference else "the scene's own solver"
+        print(
+            f"{self.scene}: {self.num_trajectories} trajectories per case. Ground truth: "
+            f"{truth}, {solver}. Every row, coarse MuJoCo included, is measured against it."
         )
+        rows = []
+        for part in self.measure(scene, self.protocol(scene)):
+            rows += part
+            title = f"{part[0].case}, {part[0].steps} steps"
+            tqdm.write(f"\n{title}\n{error_table(part)}")
+        return {
+            "scene": self.scene,
+            "num_trajectories": self.num_trajectories,
+            "ground_truth": truth,
+            "errors": [asdict(row) for row in rows],
+        }
+
+    def protocol(self, scene: Scene) -> EvaluationProtocol:
+        """The scene's own, or the one on unseen terrain."""
+        if not self.unseen_terrain:
+            return protocol_of(scene)
+        preset = PRESETS.get(self.scene)
+        if preset is None or preset.unseen_terrain is None:
+            known = ", ".join(n for n, p in PRESETS.items() if p.unseen_terrain)
+            raise ValueError(
+                f"no unseen terrain for '{self.scene}', expected one of {known}"
+            )
+        return preset.unseen_terrain()
+
+    def ground_truth(self, scene: Scene) -> MujocoDynamics:
+        """MuJoCo with the scene's own solver or the reference solver."""
+        return MujocoDynamics(scene.reference if self.reference else scene)
+
+    def measure(
+        self, scene: Scene, protocol: EvaluationProtocol
+    ) -> Iterator[list[ErrorRow]]:
+        """Rows of one case and horizon after the other."""
+        names = [] if self.model is None else [str(self.model)]
+        how = {
+            "inference": self.inference,
+            "dtype": torch.bfloat16 if self.bf16 else None,
+        }
+        learned = models(scene, names, self.device, **how)
+        candidates = [*simulators(scene), *learned]
+        cases, horizons = list(cases_of(protocol)), protocol.horizons
+        steps, truth = max(horizons), mujoco_name(self.ground_truth(scene).scene)
+        count = len(cases) * (1 + len(candidates))
+        bar = tqdm(total=count, desc=self.scene, leave=False, disable=self.quiet)
+        for case, source, is_driven in cases:
+            about = (self.num_trajectories, steps, self.seed, self.device)
+            chosen = evaluation_set(case, source, is_driven, self.ground_truth, *about)
+            bar.update()
+            errors = {}
+            for c in candidates:
+                if c.name == truth:
+                    errors[c.name, GROUND_TRUTH] = chosen.zeros
+                else:
+                    errors[c.name, c.kind] = chosen.errors(c.make(chosen.scene))
+                bar.update()
+            found = error_rows(chosen.scene, case, horizons, errors, protocol.published)
+            rows = list(found)
+            for horizon in horizons:
+                yield [row for row in rows if row.steps == horizon]
+        bar.close()
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
         """The same for recorded trajectories.
@@ -140,7 +166,9 @@ class Eval(DeviceCommand):
         """
         protocol = recorded_protocol(self.scene)
         scene = recorded_scene(self.scene)
-        model = self._load(self.model or protocol.model, scene)
+        model = from_pretrained(self.model or protocol.model, scene).to(self.device)
+        if self.bf16 and model.kind != "analytic":
+            model = model.to(torch.bfloat16)
         recording, split = load_recording(path, scene)
         if self.split != "all" and self.split not in split:
             expected = ", ".join(("all", *split))
@@ -152,9 +180,17 @@ class Eval(DeviceCommand):
                 f"expected a trajectory of at least {self.states} states in {path}, got "
                 "none"
             )
-        models = rivals(scene) if self.baselines else {}
-        models["model"] = dynamics_of(model, inference=self.inference)
-        table = compare(models, scene, recording, starts, self.states)
+        others = rivals(scene) if self.baselines else {}
+        others["model"] = dynamics_of(model, inference=self.inference)
+        table = compare(others, scene, recording, starts, self.states)
         print(errors_as_text(table, protocol.published, self.states))
         shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
         return {**shared, **table["model"], "others": table}
+
+    def keep(self, results: dict[str, Any]) -> None:
+        """As of every measurement; of recordings, each result at the top as well."""
+        if self.data is None or self.record is None:
+            return super().keep(results)
+        record = make_record(results, self.seed, self.command_line(), self.device)
+        about = {"configuration": self.configuration(), **results}
+        write_json(self.record, about | record)

@@ -7,7 +7,7 @@ from typing import Any
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli.command import DeviceCommand
+from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.stability.plot import plot_results
@@ -23,7 +23,7 @@ from torchrl_nerd.settings import SettingError
 
 
 @dataclass(frozen=True)
-class Stability(DeviceCommand):
+class Stability(MeasuringCommand):
     """Hard cases: conservation, contact, invariance, bad input, long runs, gradients.
 
     Every metric is graded against a tolerance. The exit status is 0 even where a case

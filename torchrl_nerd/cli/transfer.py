@@ -1,10 +1,10 @@
-"""``nerd transfer``: returns of a policy in a model and in MuJoCo."""
+"""``nerd transfer``: returns of a policy in learned dynamics and in the ground truth."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_nerd.cli.command import DeviceCommand
+from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
@@ -13,8 +13,8 @@ from torchrl_nerd.robots import make_task
 
 
 @dataclass(frozen=True)
-class Transfer(DeviceCommand):
-    """Returns of a policy in several dynamics, and the difference from MuJoCo.
+class Transfer(MeasuringCommand):
+    """Returns of a policy in several dynamics, and their difference to the ground truth.
 
     Example: nerd transfer ant/run --episodes 256
 
@@ -26,7 +26,8 @@ class Transfer(DeviceCommand):
     policy: Path | None = None
     """Folder of a policy, as examples/ppo.py writes it; by default the shipped one."""
     dynamics: tuple[str, ...] = ("nerd", "mujoco")
-    """Any of nerd, mujoco, dm_control, mujoco_warp, checkpoint folders."""
+    """Any of nerd, hybrid, analytic, mujoco, dm_control, mujoco_warp, names of shipped
+    models, checkpoint folders."""
     episodes: int = 2048
     """Episodes per dynamics."""
     seed: int = 500
@@ -44,7 +45,8 @@ class Transfer(DeviceCommand):
         if self.episodes < 2:
             raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
         task = make_task(self.task)
-        policy = load_policy(self.policy or shipped_policy(self.task), task)
+        folder = self.policy or shipped_policy(self.task)
+        policy = load_policy(folder, task)
         actor = make_actor(policy.to(self.device))
         summaries = transfer(
             self.task,
@@ -56,5 +58,9 @@ class Transfer(DeviceCommand):
             quiet=self.quiet,
         )
         print(transfer_table(summaries))
-        returns = {name: asdict(summary) for name, summary in summaries.items()}
-        return {"task": self.task, "seed": self.seed, "returns": returns}
+        rows = [{"dynamics": name, **asdict(s)} for name, s in summaries.items()]
+        return {
+            "task": self.task,
+            "policy": str(self.policy or "shipped"),
+            "returns": rows,
+        }

@@ -1,8 +1,8 @@
-"""Returns of a policy in several dynamics, from the same starts.
+"""Returns of a policy in several dynamics, from the same initial states.
 
 Protocol of the paper's table 1: whole episodes from the task's reset distribution, the
 policy's mean action, the undiscounted sum of rewards. The return difference is
-(mean - mean in MuJoCo) / mean in MuJoCo.
+(return - return in the ground truth) / |return in the ground truth|.
 """
 
 from collections.abc import Sequence
@@ -14,14 +14,21 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
+from torchrl_nerd.evaluation.bench.error_table import text_table
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
 GROUND_TRUTH = "mujoco"
 NORMAL_95 = 1.96  # half width of a 95% interval, in standard errors
+PAPER_NOTE = (
+    "The paper's returns are of another simulator (Warp) as ground truth: compare with "
+    "them only the return difference."
+)
 
 
 @dataclass(frozen=True)
@@ -30,13 +37,17 @@ class ReturnSummary:
 
     | field | meaning |
     |---|---|
+    | ``kind`` | of the dynamics: ground truth, learned, hybrid or analytic |
+    | ``model`` | its name |
     | ``episodes`` | how many |
     | ``mean``, ``std`` | of the returns over episodes |
     | ``interval`` | half width of the 95% interval of the mean |
-    | ``difference`` | relative to the mean in MuJoCo, over the same starts |
+    | ``difference`` | to the ground truth over the same initial states, a share |
     | ``difference_interval`` | half width of its 95% interval, from paired differences |
     """
 
+    kind: str
+    model: str
     episodes: int
     mean: float
     std: float
@@ -49,8 +60,8 @@ class ReturnSummary:
 def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
     """Undiscounted return of one whole episode per env, ``(num_envs,)``, float64.
 
-    Rewards after an early end do not count. Actions are the policy's mean; it gets as many
-    stacked observations as it was trained with.
+    An env that ends early earns nothing after its end. Actions are the policy's mean; the
+    env stacks as many observations as the policy takes.
     """
     env = stack_frames(env, frame_stack_of(actor))
     tensordict = env.reset()
@@ -66,33 +77,37 @@ def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
     return returns.squeeze(-1)
 
 
-def summarize(returns: Tensor, expected: Tensor) -> ReturnSummary:
-    """Mean, spread and difference from MuJoCo.
+def summarize(
+    returns: Tensor, ground_truth: Tensor, kind: str = "learned", model: str = ""
+) -> ReturnSummary:
+    """Mean, spread and return difference.
 
     Args:
         returns: ``(episodes,)``.
-        expected: ``(num_expected,)`` in MuJoCo; entry i of both began in the same state.
-            The difference is over the entries that both have.
+        ground_truth: ``(episodes,)`` in the ground truth; entry i of both began in the
+            same state. The difference is over the entries that both have.
+        kind: of the dynamics.
+        model: its name.
 
     Raises:
-        ValueError: fewer than two episodes, or a mean return of zero in MuJoCo.
+        ValueError: fewer than two episodes, or returns of zero, which have no difference.
     """
-    both = min(len(returns), len(expected))
+    both = min(len(returns), len(ground_truth))
     if both < 2:
         raise ValueError(f"expected at least 2 episodes for an interval, got {both}")
-    difference = returns[:both] - expected[:both]
-    mean = float(expected[:both].mean())
-    if mean == 0.0:
-        raise ValueError(
-            "expected a task with rewards: the mean return in MuJoCo is zero"
-        )
+    difference = returns[:both] - ground_truth[:both]
+    scale = abs(float(ground_truth[:both].mean()))
+    if scale == 0.0:
+        raise ValueError("expected a task with rewards: the mean return is zero")
     return ReturnSummary(
+        kind=kind,
+        model=model,
         episodes=len(returns),
         mean=float(returns.mean()),
         std=float(returns.std()),
         interval=_interval(returns),
-        difference=float(difference.mean()) / mean,
-        difference_interval=_interval(difference) / abs(mean),
+        difference=float(difference.mean()) / scale,
+        difference_interval=_interval(difference) / scale,
     )
 
 
@@ -110,15 +125,15 @@ def transfer(
     device: torch.device | str = "cpu",
     quiet: bool = True,
 ) -> dict[str, ReturnSummary]:
-    """The same policy from the same starts in each dynamics.
+    """The same policy from the same initial states in each dynamics.
 
     Args:
         task: a task, or its id.
         actor: any TorchRL policy, on ``device``.
-        dynamics: what `make_env` takes; MuJoCo is added where it is missing.
+        dynamics: what `make_env` takes; MuJoCo, the ground truth, is added if missing.
         episodes: in each dynamics (paper, table 1: 2,048).
-        slow_episodes: the first so many of them on dm_control, which is slower.
-        seed: of the starts.
+        slow_episodes: the first so many of them in dm_control, which steps one by one.
+        seed: of the initial states.
         device: where all envs live.
         quiet: no progress bar, as by default.
 
@@ -128,14 +143,25 @@ def transfer(
     Raises:
         ValueError: see `summarize` and `make_env`.
     """
-    returns, names = {}, dict.fromkeys((*map(str, dynamics), GROUND_TRUTH))
+    returns, about = {}, {}
+    names = dict.fromkeys((*map(str, dynamics), GROUND_TRUTH))
     for name in tqdm(names, "dynamics", disable=quiet):
-        rows = min(episodes, slow_episodes) if name == "dm_control" else episodes
-        env = make_env(task, dynamics=name, num_envs=rows, seed=seed, device=device)
+        count = min(episodes, slow_episodes) if name == "dm_control" else episodes
+        env = make_env(task, dynamics=name, num_envs=count, seed=seed, device=device)
         returns[name] = policy_returns(env, actor)
+        about[name] = env.dynamics.kind, model_of(env.scene, name)
     return {
-        name: summarize(value, returns[GROUND_TRUTH]) for name, value in returns.items()
+        name: summarize(value, returns[GROUND_TRUTH], *about[name])
+        for name, value in returns.items()
     }
+
+
+def model_of(scene: Scene, name: str) -> str:
+    """The model that a name of dynamics stands for in a scene."""
+    if name == "nerd":
+        shipped = shipped_models(scene)
+        return scene.name if scene.name in shipped else f"{scene.name}-mlp"
+    return f"{scene.name}-hybrid" if name == "hybrid" else name
 
 
 def mean_returns(
@@ -145,20 +171,26 @@ def mean_returns(
     episodes: int,
     seed: int = 0,
 ) -> dict[str, float]:
-    """The means alone of `transfer`, by name of the dynamics."""
+    """Mean returns of `transfer`, by name of the dynamics."""
     summaries = transfer(task, actor, dynamics, episodes, seed=seed)
     return {name: summary.mean for name, summary in summaries.items()}
 
 
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     """Lines for the terminal: one dynamics each, with 95% intervals."""
-    width = max(12, *(len(name) + 1 for name in summaries))
-    heads = f"{'episodes':>9}{'return':>18}{'std':>9}{'against MuJoCo':>20}"
-    rows = [f"{'dynamics':<{width}}{heads}"]
+    head = [
+        "dynamics",
+        "kind",
+        "model",
+        "episodes",
+        "return",
+        "std",
+        "return difference",
+    ]
+    body = []
     for name, s in summaries.items():
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
         difference = f"{s.difference:+.3%} ± {s.difference_interval:.3%}"
-        rows.append(
-            f"{name:<{width}}{s.episodes:>9}{mean:>18}{s.std:>9.1f}{difference:>20}"
-        )
-    return "\n".join(rows)
+        about = [name, s.kind, s.model, str(s.episodes)]
+        body.append([*about, mean, f"{s.std:.1f}", difference])
+    return f"{text_table(head, body)}\n{PAPER_NOTE}"

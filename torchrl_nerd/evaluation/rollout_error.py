@@ -1,8 +1,8 @@
-"""Open-loop error: a model against MuJoCo from the same start, never corrected.
+"""Open-loop error: two dynamics from the same initial states, never corrected.
 
-Protocol of the paper's Fig. 3 and appendix C.2: starts from the task's reset
-distribution, the same actions in both (none: passive), errors of every step averaged over
-time and trajectories.
+Protocol of the paper's Fig. 3 and appendix C.2: initial states of the task's reset
+distribution, the same actions in both (zero: passive), the error averaged over time and
+trajectories.
 """
 
 from collections.abc import Callable
@@ -16,18 +16,15 @@ from torch import Generator, Tensor
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.tasks import Task
 
 Drive = Callable[[int, TensorDictBase], Tensor]
-"""``(step, state [rows]) -> joint torque (rows, num_actuated)``."""
-
-Source = Task | Scene
-"""Whose starts and controller a test has: a task's, or a scene's own sampling ranges."""
+"""``(step, state [n]) -> joint torque (n, num_actuated)``, N and N m."""
 
 
 def scene_of(source: Source) -> Scene:
-    """The robot and its ground."""
+    """The robot and its terrain."""
     return source if isinstance(source, Scene) else source.scene
 
 
@@ -51,25 +48,32 @@ class ErrorSummary:
     p95: float
 
 
-def initial_states(source: Source, rows: int, seed: int) -> TensorDict:
-    """Starts ``[rows]`` of a task's resets or a scene's ranges, from their own seed."""
+def initial_states(source: Source, num_trajectories: int, seed: int) -> TensorDict:
+    """Initial states ``[n]`` of a task's resets or a scene's sampling ranges."""
     generator = Generator().manual_seed(seed)
     if isinstance(source, Scene):
-        return TensorDict(source.sample_initial(rows, generator)[0], batch_size=[rows])
-    u = torch.rand(rows, source.num_uniforms, dtype=torch.float64, generator=generator)
-    return TensorDict(source.initial_state(u), batch_size=[rows])
+        values = source.sample_initial(num_trajectories, generator)[0]
+    else:
+        shape = (num_trajectories, source.num_uniforms)
+        u = torch.rand(shape, dtype=torch.float64, generator=generator)
+        values = source.initial_state(u)
+    return TensorDict(values, batch_size=[num_trajectories])
 
 
 def action_drive(
-    source: Source, rows: int, steps: int, seed: int, random_actions: bool = False
+    source: Source,
+    num_trajectories: int,
+    steps: int,
+    seed: int,
+    random_actions: bool = False,
 ) -> Drive:
     """The source's controller on actions that do not depend on the state.
 
-    Actions are zero, or uniform in [-1, 1] at every step. The controller sees the state
-    that the dynamics it drives has led to.
+    Actions are zero, or uniform in [-1, 1] at every step. The controller sees the state of
+    the dynamics that it drives.
     """
     generator = Generator().manual_seed(seed)
-    shape = (steps, rows, source.controller.num_actions)
+    shape = (steps, num_trajectories, source.controller.num_actions)
     draw = torch.rand(shape, dtype=torch.float64, generator=generator)
     actions = 2.0 * draw - 1.0 if random_actions else torch.zeros_like(draw)
 
@@ -85,45 +89,52 @@ def open_loop(
     start: TensorDict,
     steps: int,
     joint_torque: Tensor | Drive | None = None,
+    stop_at_nan: bool = False,
 ) -> Tensor:
-    """Positions after each step, ``(rows, steps, nq)``.
+    """Positions after each step, ``(n, steps, nq)``.
 
     Args:
-        dynamics: of any kind.
-        start: ``qpos``, ``qvel`` and, where the ground varies, ``terrain``.
-        steps: how many.
-        joint_torque: ``(rows, steps, num_actuated)``, or a function of step and state;
+        dynamics: any.
+        start: ``qpos``, ``qvel`` and, where the terrain varies, ``terrain``, ``[n]``.
+        steps: control steps.
+        joint_torque: ``(n, steps, num_actuated)``, or a function of step and state;
             None for none (passive motion).
+        stop_at_nan: stop once a trajectory is not finite; what is left is NaN. An engine
+            takes long over states that diverge.
     """
-    rows, terrain = start.batch_size[0], start.get(TERRAIN, None)
+    terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL)
-    zero = state.get(QPOS).new_zeros(rows, len(dynamics.scene.actuated))
+    count, like = len(start), {"dtype": start[QPOS].dtype, "device": start[QPOS].device}
+    idle = torch.zeros(count, len(dynamics.scene.actuated), **like)
     dynamics.reset(state)
-    positions = []
+    positions = torch.full((count, steps, start[QPOS].shape[1]), torch.nan, **like)
     for step in range(steps):
         if callable(joint_torque):
             torque = joint_torque(step, state)
         else:
-            torque = zero if joint_torque is None else joint_torque[:, step]
+            torque = idle if joint_torque is None else joint_torque[:, step]
         state = dynamics.step(state, torque, terrain)
-        positions.append(state[QPOS])
-    return torch.stack(positions, 1)
+        positions[:, step] = state[QPOS]
+        if stop_at_nan and not state[QPOS].isfinite().all():
+            break
+    return positions
 
 
 def position_errors(
-    scene: Scene, ground_truth: Tensor, learned: Tensor
+    scene: Scene, ground_truth: Tensor, other: Tensor
 ) -> dict[str, Tensor]:
-    """Error of every quantity at every step, ``(rows, steps)``.
+    """Error of every quantity at every step, ``(n, steps)``, from ``(n, steps, nq)``.
 
     A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
     over ``joints`` (rad); a fixed base gives one entry per joint, by name.
     """
     model, errors = scene.model, {}
+    both = ground_truth, other
     if scene.base.is_floating:
         q = scene.base.qpos_address
-        offset = ground_truth[..., q : q + 3] - learned[..., q : q + 3]
+        offset = ground_truth[..., q : q + 3] - other[..., q : q + 3]
         errors["base_position"] = torch.linalg.vector_norm(offset, dim=-1)
-        quats = (x[..., q + 3 : q + 7] for x in (ground_truth, learned))
+        quats = (x[..., q + 3 : q + 7] for x in both)
         errors["base_orientation"] = orientation_error(*quats)
     joints = {}
     for joint in range(model.njnt):
@@ -131,42 +142,42 @@ def position_errors(
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             continue
         if kind == mujoco.mjtJoint.mjJNT_BALL:
-            quats = (x[..., q : q + 4] for x in (ground_truth, learned))
+            quats = (x[..., q : q + 4] for x in both)
             joints[model.joint(joint).name] = orientation_error(*quats)
             continue
-        error = ground_truth[..., q] - learned[..., q]
+        error = ground_truth[..., q] - other[..., q]
         if kind == mujoco.mjtJoint.mjJNT_HINGE:
             error = wrap_angle(error)
         joints[model.joint(joint).name] = error.abs()
-    if scene.base.is_floating:
-        if joints:
-            errors["joints"] = torch.stack(list(joints.values())).mean(0)
-        return errors
-    return joints
+    if not scene.base.is_floating:
+        return joints
+    if joints:
+        errors["joints"] = torch.stack(list(joints.values())).mean(0)
+    return errors
 
 
 def open_loop_errors(
     ground_truth: Dynamics,
-    learned: Dynamics,
+    other: Dynamics,
     start: TensorDict,
     steps: int,
     joint_torque: Tensor | Drive | None = None,
 ) -> dict[str, Tensor]:
-    """`position_errors` of two rollouts from the same start, ``(rows, steps)`` by quantity.
+    """`position_errors` of two rollouts from the same states, ``(n, steps)`` each.
 
     Args:
-        ground_truth: MuJoCo.
-        learned: other dynamics of the same robot.
+        ground_truth: the dynamics that errors are measured against.
+        other: of the same robot.
         start: see `open_loop`, as ``steps`` and ``joint_torque``.
         steps: control steps.
         joint_torque: N or N m.
     """
-    paths = [open_loop(d, start, steps, joint_torque) for d in (ground_truth, learned)]
+    paths = [open_loop(d, start, steps, joint_torque) for d in (ground_truth, other)]
     return position_errors(ground_truth.scene, *paths)
 
 
 def unit_of(scene: Scene, quantity: str) -> str:
-    """M or rad."""
+    """Unit of a quantity of `position_errors`: m or rad."""
     if quantity == "base_position":
         return "m"
     if quantity in ("base_orientation", "joints"):
@@ -176,48 +187,42 @@ def unit_of(scene: Scene, quantity: str) -> str:
 
 
 def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary]:
-    """Summary of each quantity of `position_errors`, ``(rows, steps)``, m or rad.
+    """Summary of each quantity of `position_errors`, ``(n, steps)``, m or rad.
 
     Errors that are not finite stay visible.
     """
     summaries = {}
     for name, error in errors.items():
-        per_row = error.mean(1)
+        over_time = error.mean(1)
         summaries[name] = ErrorSummary(
             unit=unit_of(scene, name),
-            mean=float(per_row.mean()),
-            interval=float(1.96 * per_row.std() / len(per_row) ** 0.5),
+            mean=float(over_time.mean()),
+            interval=float(1.96 * over_time.std() / len(over_time) ** 0.5),
             final=float(error[:, -1].mean()),
-            p95=float(per_row.quantile(0.95)),
+            p95=float(over_time.quantile(0.95)),
         )
     return summaries
 
 
 def passive_errors(
     source: Source,
-    learned: Dynamics,
+    other: Dynamics,
     ground_truth: Dynamics,
     horizons: list[int],
-    rows: int,
+    num_trajectories: int,
     seed: int,
     device: torch.device | str = "cpu",
     random_actions: bool = False,
-    tick: Callable[[], object] = lambda: None,
 ) -> dict[int, dict[str, ErrorSummary]]:
     """Open-loop errors at every horizon, from one rollout of the longest.
 
     Passive where the source's controller makes no torque of a zero action; see
-    `action_drive`. ``tick`` is called before every step of either dynamics.
+    `action_drive`.
     """
-    start, scene = initial_states(source, rows, seed).to(device), scene_of(source)
+    start, scene = initial_states(source, num_trajectories, seed), scene_of(source)
     steps = max(horizons)
-    drive = action_drive(source, rows, steps, seed, random_actions)
-
-    def ticking_drive(step: int, state: TensorDictBase) -> Tensor:
-        tick()
-        return drive(step, state)
-
-    errors = open_loop_errors(ground_truth, learned, start, steps, ticking_drive)
+    drive = action_drive(source, num_trajectories, steps, seed, random_actions)
+    errors = open_loop_errors(ground_truth, other, start.to(device), steps, drive)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
         for horizon in horizons

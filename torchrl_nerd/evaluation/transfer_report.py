@@ -1,4 +1,4 @@
-"""What is measured of a policy once it has learned: a table and a JSON file."""
+"""What is measured of a trained policy: a table and a JSON file."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -25,7 +25,7 @@ def report_transfer(
         learned_in: the dynamics that the policy was trained in; measured beside the
             shipped model, MuJoCo and dm_control.
         episodes: in each, see `transfer`.
-        seed: of the starts.
+        seed: of the initial states.
         folder: gets ``returns.json``.
 
     Returns:
@@ -35,7 +35,7 @@ def report_transfer(
         ValueError: see `transfer`, or a folder that cannot be written.
     """
     scene = make_task(task).scene
-    learned = ("nerd",) if scene.name in shipped_models() else ()
+    learned = ("nerd",) if shipped_models(scene) else ()
     everywhere = (learned_in, *learned, "mujoco", "dm_control")
     returns = transfer(task, actor, everywhere, episodes, seed=seed)
     print(transfer_table(returns))

@@ -39,7 +39,7 @@ class Validation:
             NeRDDynamics(model),
             MujocoDynamics(model.scene),
             list(self.horizons),
-            rows=ROLLOUTS,
+            num_trajectories=ROLLOUTS,
             seed=SEED,
             device=device,
             random_actions=self.random_actions,

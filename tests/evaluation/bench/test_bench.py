@@ -1,4 +1,4 @@
-"""The race: a truth that is one, honest rows, a front that nobody beats."""
+"""The benchmark: a ground truth that is one, equal protocol, a front that nobody beats."""
 
 import json
 import math
@@ -9,33 +9,39 @@ import pytest
 import torch
 from helpers import slow_but
 
-from torchrl_nerd.checkpoint import (
-    make_card,
-    make_model,
-    save_checkpoint,
-    shipped_models,
-)
+from torchrl_nerd.checkpoint import make_card, save_checkpoint, shipped_models
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.bench import rates
-from torchrl_nerd.evaluation.bench.contenders import (
-    contenders,
-    mujoco_contenders,
-    truth,
+from torchrl_nerd.evaluation.bench.candidates import (
+    COARSE,
+    RIVALS,
+    NoMotion,
+    models,
+    mujoco_name,
+    simulators,
 )
-from torchrl_nerd.evaluation.bench.errors import (
-    PERTURBATIONS,
-    chaos_floor,
-    contender_errors,
-    courses,
+from torchrl_nerd.evaluation.bench.error_table import PAPER, error_rows, error_table
+from torchrl_nerd.evaluation.bench.evaluation_set import (
+    DRIVEN,
+    EvaluationSet,
+    cases_of,
+    evaluation_set,
 )
-from torchrl_nerd.evaluation.bench.pareto import best_within, pareto_front
-from torchrl_nerd.evaluation.bench.plot import plot_race
-from torchrl_nerd.evaluation.bench.rates import states_on_the_way
-from torchrl_nerd.evaluation.bench.report import BenchReport, bench
-from torchrl_nerd.evaluation.bench.table import bench_table
-from torchrl_nerd.evaluation.rollout_error import open_loop
+from torchrl_nerd.evaluation.bench.plot import plot_bench
+from torchrl_nerd.evaluation.bench.rates import mid_states
+from torchrl_nerd.evaluation.bench.report import (
+    PERTURBATION,
+    BenchReport,
+    bench,
+    bench_table,
+    pareto_front,
+    reference_of,
+)
+from torchrl_nerd.evaluation.rollout_error import open_loop, scene_of
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import PRESETS, load_scene
+from torchrl_nerd.robots import PRESETS, load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
 
 QUICK = ("cartpole", "franka", "cube")  # the fewest models, still one in contact
@@ -47,118 +53,188 @@ def name(request) -> str:
     return request.param
 
 
+def own(scene: Scene) -> MujocoDynamics:
+    return MujocoDynamics(scene, num_threads=1)
+
+
+def finest(scene: Scene) -> MujocoDynamics:
+    return MujocoDynamics(reference_of(scene), num_threads=1)
+
+
+def first_set(name: str, seed: int, make=own, count=8, steps=20) -> EvaluationSet:
+    case, source, is_driven = next(cases_of(protocol_of(load_scene(name))))
+    return evaluation_set(case, source, is_driven, make, count, steps, seed)
+
+
+def by_name(scene: Scene) -> dict:
+    return {c.name: c for c in simulators(scene, 1)}
+
+
+def test_the_simulators_are_those_that_are_promised(name):
+    """No motion; 1, 2, 4, ... and the scene's own substeps; rivals at 1 and 4."""
+    scene = load_scene(name)
+    found = simulators(scene, 1)
+    assert found[0].name == "no motion" and isinstance(found[0].make(scene), NoMotion)
+    made = [c.make(scene).scene for c in found[1:]]
+    settings = {(s.model.opt.integrator, s.substeps) for s in made}
+    assert len(settings) == len(found) - 1  # none twice
+    doubling = {2**k for k in range(9) if 2**k < scene.substeps} | {scene.substeps}
+    mine = scene.model.opt.integrator
+    assert settings == {(mine, n) for n in doubling} | {
+        (int(rival), n) for rival in RIVALS.values() for n in COARSE
+    }
+    assert mujoco_name(scene) in {c.name for c in found}
+    for candidate, there in zip(found[1:], made, strict=True):
+        assert there.control_step == pytest.approx(scene.control_step, rel=1e-12)
+        assert str(there.substeps) in candidate.name.split()
+
+
+def test_driven_beside_passive_where_there_are_actuators(name):
+    protocol = protocol_of(load_scene(name))
+    cases = list(cases_of(protocol))
+    has_motors = bool(scene_of(next(iter(protocol.cases.values()))).actuated)
+    assert [case for case, _, _ in cases][: len(protocol.cases)] == list(protocol.cases)
+    assert any(is_driven for _, _, is_driven in cases) == has_motors
+    extra = [case for case, _, _ in cases if case not in protocol.cases]
+    assert extra == [DRIVEN] * (has_motors and not protocol.random_actions)
+
+
 @pytest.mark.parametrize("name", slow_but(QUICK, PRESETS))
-def test_a_whole_race(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(rates, "VISIT", 0.01)  # speeds need not be exact here
+def test_a_whole_benchmark(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)  # speeds need not be exact here
     scene = load_scene(name)
     report = bench(
-        scene, (1, 3), rows=4, rounds=1, steps=3, is_compiling=False, threads=1
+        scene, (1, 3), num_trajectories=4, rounds=1, steps=3, variants=(), threads=1
     )
-    expected = {who.name for who in contenders(scene, 1, is_compiling=False)}
-    assert set(report.errors) == expected
-    shipped = [m for m in shipped_models() if m.split("-")[0] == name]
-    assert set(shipped) <= expected
-    for by_name in report.rates.values():
-        assert set(by_name) == expected
-        for rate in by_name.values():
-            assert min(rate.steps_per_s, rate.envs_per_s, rate.warm_up_s) > 0.0
-        for row, cost in report.costs.items():
-            share = by_name[row].matrix_share
-            assert cost.flop > 0.0 and share is not None and 0.0 < share < 1.0
-    assert set(report.costs) == {row for row in expected if "MuJoCo" not in row}
-    for errors in report.errors.values():
-        assert all(math.isfinite(error.mean) for error in errors.values())
+    expected = {c.name for c in [*simulators(scene, 1), *models(scene)]}
+    shown = {row.name for row in report.errors if row.kind != "sensitivity"} - {PAPER}
+    assert shown == expected and set(shipped_models(scene)) <= expected
+    for batch in report.batches:
+        speeds = report.speeds(batch)
+        assert set(speeds) == expected - {"no motion"}
+        assert min(speeds.values()) > 0.0
+    assert all(min(r.env_steps_per_s, r.warm_up_s) > 0.0 for r in report.rates)
     text = bench_table(report)
-    assert all(row in text for row in expected)
-    read = json.loads(json.dumps(report.figures()))
-    assert BenchReport.from_figures(read) == report
-    plot_race(report, tmp_path / "race.png")
-    assert (tmp_path / "race.png").read_bytes().startswith(b"\x89PNG")
-    for quantity in report.quantities:
-        assert report.front(3, quantity)
-        broken = report.errors["MuJoCo x1"]  # as a coarse step of the Ant's does
-        broken[quantity] = replace(broken[quantity], mean=math.nan)
-    plot_race(report, tmp_path / "broken.png")
+    assert report.ground_truth in text and all(row in text for row in expected)
+    read = json.loads(json.dumps(report.results()))
+    assert BenchReport.from_results(read) == report
+    plot_bench(report, tmp_path / "bench.png")
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    coarse = report.errors[len({row.quantity for row in report.errors})].name
+    broken = [  # as a coarse step of the Ant's does
+        replace(row, mean=math.nan) if row.name == coarse else row
+        for row in report.errors
+    ]
+    report = replace(report, errors=broken)
+    assert "diverges" in bench_table(report)
+    plot_bench(report, tmp_path / "broken.png")
     assert (tmp_path / "broken.png").exists()
 
 
-def brief_race(scene: Scene, **how) -> BenchReport:
-    """Of two rows and two steps, nothing compiled."""
-    sizes = {"rows": 2, "rounds": 1, "steps": 2, "threads": 1}
-    return bench(scene, (2,), is_compiling=False, **sizes, **how)
+def brief(scene: Scene, **how) -> BenchReport:
+    """Two trajectories, two steps, nothing compiled."""
+    sizes = {"num_trajectories": 2, "rounds": 1, "steps": 2, "threads": 1}
+    return bench(scene, (2,), **sizes, **{"variants": (), **how})
 
 
-def test_a_robot_of_the_suite_races_with_a_model_of_ones_own(tmp_path, monkeypatch):
+def test_a_third_party_robot_with_a_model_of_ones_own(tmp_path, monkeypatch):
     """An untrained one here: it is slow and wrong, and says so."""
-    monkeypatch.setattr(rates, "VISIT", 0.01)
+    monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)
     scene = load_scene("dm_control/hopper-stand")
-    model = make_model(scene, NETWORKS["mlp-1x32"]).eval()
+    model = NeRD(scene, FeatureConfig(), NETWORKS["mlp-1x32"]).eval()
     folder = save_checkpoint(model, tmp_path / "hopper", make_card(model))
-    words = "guarded", "bf16", "RK4", "implicitfast"
-    report = brief_race(scene, without=words, models=[str(folder)])
-    learned = {row for row in report.errors if not row.startswith("MuJoCo")}
-    assert learned == {str(folder)} == set(report.costs)
-    own = report.errors[f"MuJoCo x{scene.substeps}"]
-    for quantity, error in report.errors[str(folder)].items():
-        assert error.mean > own[quantity].mean
-    assert not report.published and report.rates[2][str(folder)].envs_per_s > 0.0
+    words = "RK4", "implicitfast", "discrete"
+    report = brief(scene, without=words, names=[str(folder)])
+    assert {row.name for row in report.errors if row.kind == "learned"} == {str(folder)}
+    means = {(row.name, row.quantity): row.mean for row in report.errors}
+    for row in report.errors:
+        if row.kind == "learned":
+            assert row.mean > means[mujoco_name(scene), row.quantity]
+    assert not report.published and report.speeds(2)[str(folder)] > 0.0
 
 
-def test_who_is_left_out_takes_no_part(monkeypatch):
-    monkeypatch.setattr(rates, "VISIT", 0.01)
-    words = "MuJoCo x", "guarded", "bf16", "fine", "micro"
-    scene = load_scene("cartpole")
-    report = brief_race(scene, without=words)
-    integrators = ("MuJoCo implicitfast", "MuJoCo RK4")
-    coarse = {f"{name} x{n}" for name in integrators for n in (1, 4)}
-    assert set(report.errors) == coarse | {"cartpole", "cartpole, window"}
-    assert set(report.rates[2]) == set(report.errors)
+def test_what_is_left_out_is_not_measured(monkeypatch):
+    monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)
+    words = "Euler", "fine", "micro", "mlp", "perturbed"
+    report = brief(load_scene("cartpole"), without=words, variants=("window",))
+    rivals = {f"MuJoCo {name}, 1 substep" for name in RIVALS}
+    rivals |= {f"MuJoCo {name}, 4 substeps" for name in RIVALS}
+    assert set(report.speeds(2)) >= rivals | {"cartpole", "cartpole, window"}
+    assert not any(word in name for name in report.speeds(2) for word in words)
 
 
-def test_another_number_of_substeps_is_the_same_control_step(name, generator):
+def test_another_number_of_substeps_is_the_same_control_step(name):
     scene = load_scene(name)
-    for substeps in (1, 3, 16):
-        other = scene.with_substeps(substeps)
-        assert other.control_step == pytest.approx(scene.control_step, rel=1e-12)
-        assert other.substeps == substeps
     same = scene.with_substeps(scene.substeps)
     task = next(iter(PRESETS[name].protocol().cases.values()))
-    start = states_on_the_way(task, 5, 1)
+    start = mid_states(task, 5, 1)
     paths = [open_loop(MujocoDynamics(s), start, 3) for s in (task.scene, same)]
     torch.testing.assert_close(paths[0], paths[1], rtol=0, atol=1e-9)
 
 
-def test_errors_shrink_with_the_substeps_and_the_truth_has_none(seed):
+def test_errors_shrink_with_the_substeps_and_the_ground_truth_has_none(seed):
     """Without contact Euler's error is of first order."""
-    ground = courses(PRESETS["cartpole"].protocol(), 16, seed, 1, steps=30)
-    rows = {who.name: who for who in mujoco_contenders(ground[0].scene, 1)}
+    chosen = first_set("cartpole", seed, finest, 16, 30)
+    rows = by_name(chosen.scene)
     coarse, fine = (
-        contender_errors(rows[f"MuJoCo x{n}"], ground)["hinge"].mean for n in (2, 8)
+        chosen.errors(rows[f"MuJoCo Euler, {n} substep{s}"].make(chosen.scene))
+        for n, s in ((1, ""), (4, "s"))
     )
-    assert 3.0 < coarse / fine < 6.0
-    again = ground[0].errors(truth(ground[0].scene, 1))
+    assert 3.0 < coarse["hinge"].mean() / fine["hinge"].mean() < 6.0
+    again = chosen.errors(finest(chosen.scene))
     assert all(not error.any() for error in again.values())
+    assert all(not error.any() for error in chosen.zeros.values())
+
+
+def test_no_motion_has_the_error_of_staying_where_one_is(name, seed):
+    chosen = first_set(name, seed, steps=5, count=3)
+    stays = chosen.start["qpos"][:, None].expand_as(chosen.ground_truth)
+    other = replace(chosen, ground_truth=stays).errors(own(chosen.scene))
+    found = chosen.errors(NoMotion(chosen.scene))
+    for quantity, error in found.items():
+        torch.testing.assert_close(error, other[quantity], atol=1e-9, rtol=0)
+    assert any(error.any() for error in found.values())
 
 
 @pytest.mark.parametrize("robot", ["cartpole", "franka"])
-def test_nothing_is_finer_than_a_truth_without_contact(robot, seed):
+def test_nothing_is_finer_than_the_reference_without_contact(robot, seed):
     """Of the error of the scene's own substeps, finer ones move it by a ten-thousandth."""
-    course = courses(PRESETS[robot].protocol(), 8, seed, 1, steps=20)[0]
+    chosen = first_set(robot, seed, finest)
     rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
     finer = MujocoDynamics(
-        course.scene.reference.with_substeps(16 * course.scene.substeps, rk4)
+        chosen.scene.reference.with_substeps(16 * chosen.scene.substeps, rk4)
     )
-    own = course.errors(MujocoDynamics(course.scene))
-    for name, error in course.errors(finer).items():
-        assert error.max() < 1e-4 * own[name].max()
+    coarse = chosen.errors(own(chosen.scene))
+    for quantity, error in chosen.errors(finer).items():
+        assert error.max() < 1e-4 * coarse[quantity].max()
 
 
-def test_the_chaos_floor_is_as_high_as_the_push(seed):
-    ground = courses(PRESETS["cartpole"].protocol(), 64, seed, 1, steps=2)
-    floors = chaos_floor(ground, 1, seed).values()
-    for size, errors in zip(PERTURBATIONS, floors, strict=True):
-        for error in errors.values():  # mean of |N(0, 1)| is 0.8
-            assert 0.4 * size < error.mean < 2.0 * size
+def test_a_perturbed_start_is_off_by_the_perturbation(seed):
+    chosen = first_set("cartpole", seed, count=64, steps=2)
+    start = chosen.perturbed(PERTURBATION, seed)
+    for error in chosen.errors(own(chosen.scene), start).values():
+        assert 0.4 < error.mean() / PERTURBATION < 2.0  # mean of |N(0, 1)| is 0.8
+
+
+def test_a_rollout_that_diverges_is_not_rolled_out_further(seed):
+    """An engine takes minutes over states that are not finite."""
+    chosen = first_set("cartpole", seed, count=3, steps=6)
+    steps = []
+
+    class Diverging(NoMotion):
+        def step(self, state, joint_torque, terrain=None):
+            steps.append(1)
+            state = super().step(state, joint_torque, terrain).clone()
+            if len(steps) == 3:
+                state["qpos"][1] = math.nan
+            return state
+
+    errors = chosen.errors(Diverging(chosen.scene))
+    assert len(steps) == 3
+    for error in errors.values():
+        assert error[:, :2].isfinite().all() and error[:, 3:].isnan().all()
+    rows = error_rows(chosen.scene, "passive", [6], {("x", "learned"): errors}, {})
+    assert "diverges" in error_table(list(rows))
 
 
 def test_nobody_beats_the_front(generator):
@@ -178,25 +254,17 @@ def test_nobody_beats_the_front(generator):
             assert name not in front
 
 
-def test_the_choice_is_the_fastest_within_the_budget():
-    errors = {"a": (1.0, 1.0), "b": (2.0, 1.0), "c": (0.5, 3.0)}
-    rates = {"a": 1.0, "b": 2.0, "c": 3.0}
-    assert best_within(errors, rates, (2.0, 2.0)) == "b"
-    assert best_within(errors, rates, (1.0, 9.0)) == "c"
-    assert best_within(errors, rates, (0.1, 0.1)) is None
-    with pytest.raises(ValueError, match="expected a budget of 2 numbers, got 1"):
-        best_within(errors, rates, (1.0,))
-
-
 def test_bad_requests_are_refused_in_a_sentence():
     scene = load_scene("cartpole")
     with pytest.raises(ValueError, match="rounds"):
         bench(scene, rounds=0)
     with pytest.raises(ValueError, match="batch 0"):
         bench(scene, (0,))
-    with pytest.raises(ValueError, match="none without MuJoCo, cartpole"):
-        bench(scene, without=("MuJoCo", "cartpole"))
+    with pytest.raises(ValueError, match="none without MuJoCo, cartpole, "):
+        bench(scene, without=("MuJoCo", "cartpole", "no motion", "analytic"))
     with pytest.raises(ValueError, match="robot with a task.*'gymnasium/Hopper-v5'"):
         bench(load_scene("gymnasium/Hopper-v5"))
-    with pytest.raises(ValueError, match="checkpoint folder, got 'nowhere'"):
-        bench(scene, models=["nowhere"])
+    with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
+        bench(scene, names=["nowhere"])
+    with pytest.raises(ValueError, match="variants among compiled, .*, got 'fast'"):
+        bench(scene, variants=("fast",))

@@ -3,7 +3,7 @@
 import pytest
 from bench_check import (
     LEAST_ROUNDS,
-    TRUTH,
+    MUJOCO,
     Options,
     Ratio,
     compare,
@@ -12,7 +12,7 @@ from bench_check import (
     summarize,
 )
 
-from torchrl_nerd.evaluation.bench.rates import Turn
+from torchrl_nerd.evaluation.bench.rates import Sample
 from torchrl_nerd.files import read_json
 
 SURE = {"a": Ratio(2.0, 0.0), "b": Ratio(0.5, 0.0)}
@@ -48,15 +48,15 @@ def test_a_ratio_is_the_median_and_its_spread_shrinks_with_the_rounds(rng):
 
 
 def test_ratios_are_of_one_round():
-    turns = {
-        TRUTH: Turn(100.0, 50.0),
-        "m": Turn(200.0, 150.0),
-        "m, compiled": Turn(300.0, 1.0),
-        "m, window": Turn(20.0, 1.0),
-        "n": Turn(50.0, 10.0),
-        "n, compiled": Turn(50.0, 10.0),
+    samples = {
+        MUJOCO: Sample(100.0, 50.0),
+        "m": Sample(200.0, 150.0),
+        "m, compiled": Sample(300.0, 1.0),
+        "m, window": Sample(20.0, 1.0),
+        "n": Sample(50.0, 10.0),
+        "n, compiled": Sample(50.0, 10.0),
     }
-    assert ratios(turns) == {
+    assert ratios(samples) == {
         "m / MuJoCo": 2.0,
         "m: env / dynamics": 0.75,
         "m: streaming / window": 10.0,
@@ -69,7 +69,7 @@ def test_ratios_are_of_one_round():
 
 @pytest.fixture
 def small(tmp_path) -> Options:
-    """The smallest race there is."""
+    """The smallest benchmark there is."""
     return Options(
         tasks=("cartpole/swingup",),
         rows=2,
@@ -79,7 +79,7 @@ def small(tmp_path) -> Options:
     )
 
 
-def test_a_small_race_agrees_with_the_baseline_it_wrote(small):
+def test_a_small_benchmark_agrees_with_the_baseline_it_wrote(small):
     small.write = True
     assert main(small) == []
     written = read_json(small.baseline)
@@ -90,7 +90,7 @@ def test_a_small_race_agrees_with_the_baseline_it_wrote(small):
     assert all("fell from" in sentence for sentence in said)
 
 
-def test_another_race_is_refused_in_a_sentence(small):
+def test_another_benchmark_is_refused_in_a_sentence(small):
     with pytest.raises(ValueError, match="found no file"):
         main(small)
     small.write = True

@@ -1,1 +1,1 @@
-"""Speed against error: who steps a scene how fast, and how far from the truth."""
+"""Error and speed of every way to step a scene, at equal protocol."""

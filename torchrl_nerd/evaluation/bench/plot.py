@@ -1,55 +1,59 @@
-"""The race as a picture: error to the right, speed upwards, best at the upper left."""
+"""The benchmark as a picture: error to the right, speed upwards, best at the upper left."""
 
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_nerd.evaluation.bench.report import BenchReport
+from torchrl_nerd.evaluation.bench.report import BenchReport, pareto_front
 from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
 
 if TYPE_CHECKING:  # matplotlib is an extra
     from matplotlib.axes import Axes
     from matplotlib.transforms import Bbox
 
-MOST_SHIFT = 14  # points that a name may stand lower than its row
+LARGEST_SHIFT = 14  # points that a name may stand lower than its point
+MARKERS = {"simulator": "o", "analytic": "s", "hybrid": "D", "learned": "^"}
+PANELS = 3  # most quantities that are drawn: of an arm, its first and its last joint
 
 
-def plot_race(report: BenchReport, path: Path, batch: int | None = None) -> None:
+def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> None:
     """One panel per quantity, the Pareto front as a line.
 
     Args:
         report: of `bench`.
         path: of the PNG.
-        batch: rows stepped together; 512 or the largest there is by default.
+        batch: trajectories stepped together; `BenchReport.batch` by default.
     """
-    batches = list(report.rates)
-    batch = batch or (512 if 512 in batches else max(batches))
-    figure, panels = make_figure(
-        len(report.quantities), height=4.0 * len(report.quantities), share_x=False
-    )
-    for axes, quantity in zip(panels, report.quantities, strict=True):
+    batch = batch or report.batch
+    units = {row.quantity: row.unit for row in report.errors}
+    shown = list(units) if len(units) <= PANELS else [list(units)[0], list(units)[-1]]
+    figure, panels = make_figure(len(shown), height=4.0 * len(shown), share_x=False)
+    kinds = {row.name: row.kind for row in report.rates}
+    for axes, quantity in zip(panels, shown, strict=True):
         points = {
-            name: (errors[quantity].mean, report.rates[batch][name].steps_per_s)
-            for name, errors in report.errors.items()
-            if isfinite(errors[quantity].mean)  # a coarse step may blow up
+            name: point
+            for name, point in report.points(batch, quantity).items()
+            if isfinite(point[0]) and point[0] > 0.0  # a coarse step may diverge
         }
-        for name, point in points.items():
-            color = COLORS[0] if name.startswith("MuJoCo") else COLORS[1]
-            axes.plot(*point, "o", color=color)
-        best = report.front(batch, quantity)
+        for number, (kind, marker) in enumerate(MARKERS.items()):
+            chosen = [p for name, p in points.items() if kinds[name] == kind]
+            if chosen:
+                xy = zip(*chosen, strict=True)
+                axes.plot(*xy, marker, ls="", color=COLORS[number], label=kind)
+        best = pareto_front(points)
         front = [points[name] for name in best]
-        axes.plot(*zip(*front, strict=True), "-", color=COLORS[2], label="Pareto front")
-        for number, (name, errors) in enumerate(report.floors.items()):
-            style = (":", "-.", "--")[number % 3]
-            axes.axvline(errors[quantity].mean, ls=style, color="0.6", label=name)
-        if quantity in report.published:
-            axes.axvline(report.published[quantity], color=COLORS[3], label="the paper")
-        unit = next(iter(report.errors.values()))[quantity].unit
+        axes.plot(*zip(*front, strict=True), "-", color="0.4", label="Pareto front")
+        for row in report.errors:
+            if row.quantity != quantity or row.kind not in ("sensitivity", "published"):
+                continue
+            style = ":" if row.kind == "sensitivity" else "--"
+            axes.axvline(row.mean, ls=style, color="0.6", label=row.name)
         axes.set(
+            title=f"{report.scene}: {quantity} (better: up and to the left)",
             xscale="log",
             yscale="log",
-            xlabel=f"{quantity}, mean error over {report.steps} steps ({unit})",
-            ylabel=f"control steps per second, {batch} rows",
+            xlabel=f"mean error over {report.steps} steps ({units[quantity]})",
+            ylabel=f"control steps/s, batch {batch}",
         )
         axes.tick_params(which="minor", labelsize=7)  # larger ones cover each other
         axes.legend(frameon=False, fontsize=7)
@@ -62,7 +66,7 @@ def _write_names(
 ) -> None:
     """Names beside their points, a little lower where they would cover each other.
 
-    Where there is no room that a name has none; the table has it.
+    A name for which there is no room is left out; the table has it.
     """
     written: list[Bbox] = []
     others = sorted(points.keys() - set(first), key=lambda name: -points[name][1])
@@ -70,7 +74,7 @@ def _write_names(
         text = axes.annotate(
             name, points[name], (6, -3), textcoords="offset points", fontsize=7
         )
-        for _ in range(MOST_SHIFT):
+        for _ in range(LARGEST_SHIFT):
             if not any(text.get_window_extent().overlaps(other) for other in written):
                 break
             x, y = text.get_position()

@@ -1,6 +1,6 @@
 """Whether a model errs the same far from the origin and whichever way it faces.
 
-    python benchmarks/anywhere.py ant
+    python experiments/anywhere.py ant
 
 The starts of the scene's protocol, and the same ones turned about the vertical and moved
 level, each in learned and in true dynamics; prints the largest relative difference of the
@@ -18,7 +18,7 @@ from torch import Tensor
 from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
@@ -66,7 +66,7 @@ def moved(scene: Scene, start: TensorDict, yaw: float, shift: Tensor) -> TensorD
 
 
 def error_curves(
-    source: Source, learned: NeRDDynamics, start: TensorDict, steps: int, random: bool
+    source: Source, learned: Dynamics, start: TensorDict, steps: int, random: bool
 ) -> dict[str, Tensor]:
     """Mean error over rows at every step, ``(steps,)``."""
     scene = scene_of(source)
@@ -81,7 +81,7 @@ def main(options: Options) -> dict[str, float]:
     ((case, source),) = protocol.cases.items()
     scene, steps = scene_of(source), max(protocol.horizons)
     model = from_pretrained(options.model or options.scene, scene)
-    learned = NeRDDynamics(model.double() if options.double else model)
+    learned = dynamics_of(model.double() if options.double else model)
     generator = torch.Generator().manual_seed(options.seed)
     yaw, way = (2.0 * math.pi * torch.rand(2, generator=generator)).tolist()
     shift = torch.tensor([math.cos(way), math.sin(way), 0.0]).double()

@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from torchrl_nerd.modules.features import SceneFeatures
 from torchrl_nerd.modules.gru import GRUConfig
 from torchrl_nerd.modules.mlp import MLPConfig
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, Config, NeRD, unit_stats
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, unit_stats
+from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.samples import stats_of
@@ -38,9 +39,9 @@ class Variant:
     """
 
     what: str
-    tokens: Callable[[Scene], SceneFeatures] = SceneFeatures
+    tokens: Callable[[Scene], SceneFeatures] = features.base
     target: Callable[[Scene], StateDelta] = StateDelta
-    network: Config = TransformerConfig()
+    network: NetworkConfig | LSTMConfig | MarkovConfig = TransformerConfig()
     raw: tuple[str, ...] = ()
     has_muon: bool = True
     window: int | None = None
@@ -52,7 +53,8 @@ class Variant:
         for name, size in ((TOKEN, tokens.size), (TARGET, target.size)):
             if name in self.raw:
                 stats[name] = unit_stats(size)
-        return NeRD(scene, self.network, stats, tokens, target)
+        network = cast(NetworkConfig, self.network)
+        return NeRD(scene, tokens.config, network, stats, tokens, target)
 
 
 COMMON = {
@@ -69,9 +71,9 @@ COMMON = {
     "no input normalisation": Variant("features in their own units", raw=(TOKEN,)),
     "no output normalisation": Variant("targets in their own units", raw=(TARGET,)),
     "full features": Variant("the paper's input, whole", tokens=features.PaperTokens),
-    "no foresight": Variant(
-        "no forces foreseen, depths to come at constant velocity",
-        tokens=features.straight,
+    "no predictions": Variant(
+        "no predicted forces, predicted penetration at constant velocity",
+        tokens=SceneFeatures,
     ),
 }
 

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate, wrap_angle
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
@@ -19,16 +20,25 @@ from .paper_input import BaseFrame, PaperInput
 WORLD_POSE = 9  # position, and two columns of the rotation, in place of gravity
 
 
-def straight(scene: Scene) -> SceneFeatures:
-    """What a scene's features are without foresight: no forces, velocities that stay."""
-    return SceneFeatures(scene.foreseeing(False, False))
+def predictions(scene: Scene) -> FeatureConfig:
+    """Which predictions of the contact law the base has.
+
+    The tip of the double pendulum moves by centimetres before it touches, so that its
+    contacts are predicted along unconstrained motion.
+    """
+    return FeatureConfig(True, unconstrained_motion=scene.name == "double_pendulum")
+
+
+def base(scene: Scene) -> SceneFeatures:
+    """The features of the base."""
+    return SceneFeatures(scene, predictions(scene))
 
 
 class DistanceTokens(SceneFeatures):
     """Of contacts no more than the paper sees: distances, and normals where they vary."""
 
     def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
+        super().__init__(scene, predictions(scene))
         derived = (CONTACT_VELOCITY, CONTACT_DEPTH, CONTACT_FORCE)
         sizes = self.contact.sizes
         self.kept = [number for number, key in enumerate(sizes) if key not in derived]
@@ -51,7 +61,7 @@ class PaperTokens(SceneFeatures):
     """
 
     def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
+        super().__init__(scene, predictions(scene))
         self.input = PaperInput(scene)
         self.size = self.input.size
 
@@ -68,7 +78,7 @@ class LinkTokens(SceneFeatures):
     """The paper's frame for a fixed base: its first link's, which turns with its joint."""
 
     def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
+        super().__init__(scene, predictions(scene))
         self.frame = BaseFrame(scene)
 
     def forward(
@@ -85,7 +95,7 @@ class EndToEndTokens(SceneFeatures):
     """State in world axes and torque: the paper's end to end, which sees no contact."""
 
     def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
+        super().__init__(scene, predictions(scene))
         joints = self.robot.joints
         self.num_parts = 4 + len(
             joints.balls
@@ -107,7 +117,7 @@ class WorldTokens(SceneFeatures):
     """The scene's features in world axes, and where the robot stands: NeRD eq. 1."""
 
     def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
+        super().__init__(scene, predictions(scene))
         if scene.base.is_floating:
             self.size += WORLD_POSE - 3
 

@@ -1,6 +1,6 @@
 """Would a small ensemble's spread foretell large errors better than the trust gate does?
 
-    python benchmarks/ensemble_trust.py double_pendulum double_pendulum-mlp ...
+    python experiments/ensemble_trust.py double_pendulum double_pendulum-mlp ...
 
 The first model is the one that is judged, all of them are the ensemble: networks of other
 kinds and seeds, trained on the same motion. Its spread is the deviation of their next
@@ -53,7 +53,7 @@ def spread(models: list[NeRD], data: TensorDict) -> Tensor:
 def main(options: Options) -> None:
     """Print the areas under the ROC curve."""
     scene = load_scene(options.scene)
-    models = [from_pretrained(name, scene) for name in options.models]
+    models = [cast(NeRD, from_pretrained(name, scene)) for name in options.models]
     generator = Generator().manual_seed(options.seed)
     inside, _, outside = inputs(scene, generator)
     data = cast(TensorDict, torch.cat((inside, outside)))

@@ -1,6 +1,6 @@
 """Which training data make the better model: strategies of `data/strategies.py` compared.
 
-    python benchmarks/sampling_study.py --scene cartpole --json docs/figures/sampling.json
+    python experiments/sampling_study.py --scene cartpole --json results/sampling.json
 
 Each strategy draws as many transitions, the same network gets as many updates, and each
 model meets the same tests: open-loop error, passive and under random actions, and the
@@ -22,7 +22,7 @@ from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data.generate import CARD, Draw, generate, load_data
 from torchrl_nerd.data.strategies import strategies
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
@@ -128,7 +128,7 @@ class Study:
         card = read_json(model.parents[1] / "data" / CARD)
         figures |= {"trajectories": card["trajectories"], "dropped": card["dropped"]}
         for test, is_random in (("passive", False), ("random", True)):
-            learned = NeRDDynamics(load_checkpoint(model, task.scene))
+            learned = dynamics_of(load_checkpoint(model, task.scene))
             truth = MujocoDynamics(task.scene)
             sizes = ([options.horizon], options.rows, TEST_SEED)
             errors = passive_errors(
@@ -190,17 +190,23 @@ def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: one line for each model, ``mean / final / p95`` of each quantity."""
     tests = [(t, q) for t in ("passive", "random") for q in rows[0][t]]
     heads = [f"{t}, {q}, {rows[0][t][q]['unit']}" for t, q in tests]
-    heads = ["strategy", "seed", *heads, "transfer gap", "learned there, true return"]
+    heads = [
+        "strategy",
+        "seed",
+        *heads,
+        "return difference",
+        "learned there, true return",
+    ]
     lines = [" | ".join(heads), " | ".join(["---"] * len(heads))]
     for row in rows:
         cells = [row["strategy"], str(row["seed"])]
         for test, quantity in tests:
             errors = (row[test][quantity][key] for key in ("mean", "final", "p95"))
             cells.append(" / ".join(_number(error) for error in errors))
-        gap, own = row.get("transfer"), row.get("learned_there")
+        found, own = row.get("transfer"), row.get("learned_there")
         cells.append(
-            f"{gap['difference']:+.3%} ± {gap['difference_interval']:.3%}"
-            if gap
+            f"{found['difference']:+.3%} ± {found['difference_interval']:.3%}"
+            if found
             else "-"
         )
         cells.append(f"{own['true_mean']:.0f}" if own else "not measured")

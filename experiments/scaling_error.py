@@ -1,6 +1,6 @@
 """Open-loop error against data, updates and the size of the model, Cartpole by default.
 
-    python benchmarks/scaling_error.py
+    python experiments/scaling_error.py
 
 Trains one network on every size of data and by every number of updates, then all others on
 most data by most updates; what is finished is read, so that a run that was cut short goes
@@ -23,6 +23,7 @@ from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, preset_of, source_of
 from torchrl_nerd.training.trainer import Trainer
 
@@ -75,7 +76,7 @@ def measure(
     some = cast(TensorDict, data[:trajectories])
     source, horizons = source_of(scene), options.horizons
     Trainer(scene, some, source, config, folder, horizons=horizons).run()
-    model = load_checkpoint(folder / "last", scene)
+    model = cast(NeRD, load_checkpoint(folder / "last", scene))
     errors = passive_errors(
         source,
         NeRDDynamics(model),

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torchrl_nerd.modules.baselines import NoMemory
 
+from torchrl_nerd.modules.mlp import NoMemory
 from torchrl_nerd.modules.transformer import (
     CausalTransformer,
     FullLinear,

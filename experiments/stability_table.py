@@ -1,17 +1,18 @@
 """The tables of docs/stability.md from what `nerd stability SCENE --json` wrote.
 
-    python benchmarks/stability_table.py
+    python experiments/stability_table.py
 
 One metric per row: the model's, MuJoCo's in brackets where it differs, bold where it fails.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
-FIGURES = Path(__file__).parents[1] / "docs" / "figures"
+from torchrl_nerd.evaluation.results import read_results
+
+RESULTS = Path(__file__).parents[1] / "results"
 SCENES = {
     "ant": "Ant",
     "anymal": "ANYmal",
@@ -53,13 +54,13 @@ Results = dict[str, dict]
 class Options:
     """Where the results are."""
 
-    folder: Path = FIGURES
+    folder: Path = RESULTS
 
 
 def read(folder: Path) -> Results:
     """The results of every scene that has some."""
     paths = {name: folder / f"stability_{name}.json" for name in SCENES}
-    return {name: json.loads(p.read_text()) for name, p in paths.items() if p.exists()}
+    return {n: read_results(p)["results"] for n, p in paths.items() if p.exists()}
 
 
 def graded(found: Results) -> str:

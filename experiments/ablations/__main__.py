@@ -1,6 +1,6 @@
 """The ablations of the paper, and of this project's own choices, as a table.
 
-    python -m benchmarks.ablations
+    python -m experiments.ablations
 
 All variants of one seed on every scene come before those of the next; what is finished is
 read, so that a run that was cut short goes on. Tables, figures and a picture of each scene

@@ -3,10 +3,11 @@
 import pytest
 import torch
 from dynamics_helpers import random_model
+from step_cost import step_cost
 from tensordict import TensorDict
 
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.bench.cost import step_cost
 from torchrl_nerd.modules.gru import GRUConfig
 from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
@@ -43,7 +44,7 @@ def test_counted_arithmetic_is_the_closed_form(name, network, generator):
     model = random_model(scene, generator, network)
     rows = int(torch.randint(1, 9, (), generator=generator))
     cost = step_cost(NeRDDynamics(model), state_of(scene, rows, generator))
-    expected = closed_form(network, model.tokens.size, model.state_delta.size)
+    expected = closed_form(network, model.scene_features.size, model.state_delta.size)
     assert cost is not None and cost.flop == expected
 
 
@@ -62,12 +63,12 @@ def test_compiled_and_window_steps_are_counted_and_true_ones_are_not(generator):
     width, layers = model.config.width, model.config.layers
     seen = 4 * (size**2 - size * (model.config.band - 1)) * width * layers
     streamed = closed_form(
-        "transformer-2x64", model.tokens.size, model.state_delta.size
+        "transformer-2x64", model.scene_features.size, model.state_delta.size
     )
     assert flop(inference="window", window=size) == size * streamed + seen
     guarded = step_cost(GuardedDynamics(NeRDDynamics(model)), state)
     assert guarded is not None
-    assert guarded.flop == flop() + 2 * model.tokens.size**2  # its spread
+    assert guarded.flop == flop() + 2 * model.scene_features.size**2  # its spread
     assert step_cost(MujocoDynamics(scene, num_threads=1), state) is None
 
 
@@ -77,18 +78,19 @@ def test_memory_is_what_a_row_holds(name, generator):
     state = state_of(scene, 2, generator)
     window = int(torch.randint(1, 12, (), generator=generator))
     age = 8  # bytes of a counter
-    for network in ("mlp-4x64", "gru", "small"):
-        model = NeRD(scene, NETWORKS[network])
+    for network in ("mlp-4x64", "gru", "transformer-4x128"):
+        model = NeRD(scene, NO_PREDICTIONS, NETWORKS[network])
         held = {
             "mlp-4x64": 0,
             "gru": 4 * 128,
-            "small": age + 4 * (4 * 2 * 9 * 128),  # layers, keys and values, tokens
+            "transformer-4x128": age
+            + 4 * (4 * 2 * 9 * 128),  # layers, keys and values, tokens
         }[network]
         streaming = step_cost(NeRDDynamics(model), state)
         recomputing = NeRDDynamics(model, inference="window", window=window)
         recomputed = step_cost(recomputing, state)
         assert streaming is not None and recomputed is not None
         assert streaming.memory_bytes == held
-        assert recomputed.memory_bytes == age + 4 * window * model.tokens.size
+        assert recomputed.memory_bytes == age + 4 * window * model.scene_features.size
         numbers = scene.model.nq + scene.model.nv
         assert streaming.state_bytes == recomputed.state_bytes == 8 * numbers

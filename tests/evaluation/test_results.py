@@ -1,0 +1,67 @@
+"""Files of results: one schema, kept by every file that is committed."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from torchrl_nerd.evaluation.results import (
+    KEYS,
+    check_record,
+    commit,
+    make_record,
+    read_results,
+    write_results,
+)
+
+RESULTS = Path(__file__).parents[2] / "results"
+FILES = sorted(RESULTS.rglob("*.json"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_every_committed_file_keeps_the_schema(path):
+    record = read_results(path)
+    assert set(record) >= set(KEYS) and record["results"]
+    assert record["command"].split()[0] in ("nerd", "python", "make"), path.name
+    assert "/tmp" not in record["command"] and len(record["commit"]) >= 5
+
+
+def test_there_is_nothing_but_results():
+    assert {path.suffix for path in RESULTS.rglob("*") if path.is_file()} <= {".json"}
+
+
+def test_what_is_written_is_read(tmp_path):
+    path = tmp_path / "new" / "some.json"
+    results = {"errors": [{"mean": 0.5}]}
+    write_results(path, results, seed=3, command="nerd eval cartpole")
+    record = read_results(path)
+    assert record["results"] == results and record["seed"] == 3
+    assert record["command"] == "nerd eval cartpole" and record["commit"] == commit()
+    assert record["machine"]["threads"] >= 1 and record["machine"]["mujoco"]
+
+
+def test_a_script_names_its_own_command(monkeypatch):
+    words = [
+        "/some/where/experiments/try.py",
+        "ant",
+        "--json",
+        "/tmp/x.json",
+        "--rows",
+        "3",
+    ]
+    monkeypatch.setattr("sys.argv", words)
+    assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_what_is_missing_or_of_another_type_is_named(key, tmp_path):
+    record = make_record({"errors": []}, 3, "nerd eval cartpole")
+    missing = {k: v for k, v in record.items() if k != key}
+    with pytest.raises(ValueError, match=f"found no '{key}'"):
+        check_record(missing)
+    with pytest.raises(ValueError, match=f"expected '{key}' of type"):
+        check_record(record | {key: 0.5})
+    path = tmp_path / "y.json"
+    path.write_text(json.dumps(missing))
+    with pytest.raises(ValueError, match=f"y.json: .* no '{key}'"):
+        read_results(path)

@@ -1,0 +1,192 @@
+"""Ways to step a scene: no motion, MuJoCo at many settings, analytic, hybrid, learned."""
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.analytic import make_step
+from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.dynamics import (
+    Dynamics,
+    GuardedDynamics,
+    Model,
+    MujocoDynamics,
+    dynamics_of,
+)
+from torchrl_nerd.envs.resolve import resolve_model
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.transformer import CausalTransformer
+from torchrl_nerd.scenes import Scene
+
+KINDS = ("baseline", "simulator", "analytic", "hybrid", "learned")
+"""In the order of the table."""
+VARIANTS = ("compiled", "guarded", "window", "bf16", "bf16 compiled")
+"""Other ways to run one model than eager streaming in float32."""
+RIVALS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,  # made for large steps
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+COARSE = (1, 4)  # substeps of the rivals
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to step a scene.
+
+    | field | meaning |
+    |---|---|
+    | ``name`` | of its row in the table |
+    | ``kind`` | one of `KINDS` |
+    | ``make`` | its dynamics, for the scene or the same robot on another terrain |
+    """
+
+    name: str
+    kind: str
+    make: Callable[[Scene], Dynamics]
+
+
+class NoMotion:
+    """Dynamics in which every state stays as it is: the error of predicting nothing.
+
+    Args:
+        scene: the robot.
+    """
+
+    kind = "baseline"
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """See `Dynamics.reset`; there is no past."""
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """The same state."""
+        return state.select(QPOS, QVEL)
+
+
+def mujoco_name(scene: Scene) -> str:
+    """Integrator and substeps of a scene's MuJoCo, as its row is called."""
+    integrator = mujoco.mjtIntegrator(scene.model.opt.integrator).name
+    name = {"EULER": "Euler", "IMPLICITFAST": "implicitfast"}.get(integrator[6:])
+    name = name or {"IMPLICIT": "implicit", "DISCRETE": "discrete"}.get(integrator[6:])
+    plural = "" if scene.substeps == 1 else "s"
+    return f"MuJoCo {name or 'RK4'}, {scene.substeps} substep{plural}"
+
+
+def simulators(scene: Scene, threads: int | None = None) -> list[Candidate]:
+    """No motion; MuJoCo at 1, 2, 4, ... of the scene's substeps, and other integrators.
+
+    Args:
+        scene: the robot; its own integrator and number of substeps are among them.
+        threads: of MuJoCo's pool; see `MujocoDynamics`.
+    """
+    settings: list[tuple[int, int | None]] = []
+    substeps = 1
+    while substeps < scene.substeps:
+        settings.append((substeps, None))
+        substeps *= 2
+    settings.append((scene.substeps, None))
+    settings += [(n, int(rival)) for rival in RIVALS.values() for n in COARSE]
+
+    def candidate(substeps: int, integrator: int | None) -> Candidate:
+        def make(here: Scene) -> Dynamics:
+            return MujocoDynamics(here.with_substeps(substeps, integrator), threads)
+
+        name = mujoco_name(scene.with_substeps(substeps, integrator))
+        return Candidate(name, "simulator", make)
+
+    found = [candidate(*setting) for setting in settings]
+    by_name = {
+        c.name: c for c in [Candidate("no motion", "baseline", NoMotion), *found]
+    }
+    return list(by_name.values())
+
+
+def models(
+    scene: Scene,
+    names: Sequence[str] = (),
+    device: torch.device | str = "cpu",
+    variants: Sequence[str] = (),
+    inference: str = "streaming",
+    dtype: torch.dtype | None = None,
+) -> list[Candidate]:
+    """Models of a scene: the analytic step first, then hybrid ones, then learned ones.
+
+    Args:
+        scene: the robot.
+        names: shipped models or checkpoint folders; all that are shipped by default.
+        device: where they compute.
+        variants: which of `VARIANTS` to add to each.
+        inference: of learned and hybrid models, see `NeRDDynamics`.
+        dtype: of the networks; float32 by default.
+
+    Raises:
+        ValueError: an unknown variant; see `resolve_model`.
+    """
+    for variant in variants:
+        if variant not in VARIANTS:
+            known = ", ".join(VARIANTS)
+            raise ValueError(f"expected variants among {known}, got '{variant}'")
+    found: list[Candidate] = []
+    own = ["analytic"] if _has_step(scene) else []
+    for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
+        model = resolve_model(name, scene).to(device)
+        if dtype is not None and isinstance(model, NeRD):
+            model = model.to(dtype)
+        found.append(_candidate(name, model, inference=inference))
+        found += _variants(name, model, variants)
+    return sorted(found, key=lambda c: KINDS.index(c.kind))
+
+
+def _has_step(scene: Scene) -> bool:
+    """Whether the package knows the contact law of a scene."""
+    try:
+        make_step(scene)
+    except ValueError:
+        return False
+    return True
+
+
+def _variants(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidate]:
+    """Other ways to run a model; an analytic step has no network and no history."""
+    for variant in variants:
+        label = f"{name}, {variant}"
+        if variant == "compiled":
+            yield _candidate(label, model, compile=True)
+        elif not isinstance(model, NeRD):
+            continue
+        elif variant == "guarded":
+            yield _candidate(label, model, GuardedDynamics)
+        elif variant == "window":
+            if isinstance(model.network, CausalTransformer):
+                yield _candidate(label, model, inference="window")
+        else:
+            half = copy.deepcopy(model).to(torch.bfloat16)
+            yield _candidate(label, half, compile=variant.endswith("compiled"))
+
+
+def _candidate(
+    name: str,
+    model: Model,
+    wrap: Callable[[Any], Dynamics] = lambda dynamics: dynamics,
+    **how: Any,
+) -> Candidate:
+    def make(scene: Scene) -> Dynamics:
+        here = model if scene is model.scene else model.with_terrain(scene)
+        return wrap(dynamics_of(here, **how))
+
+    return Candidate(name, model.kind, make)

@@ -1,0 +1,134 @@
+"""Errors of all candidates as rows of one table, the paper's beside them."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+from torch import Tensor
+
+from torchrl_nerd.evaluation.rollout_error import ErrorSummary, summarize, unit_of
+from torchrl_nerd.scenes import Scene
+
+PAPER = "paper (NeRD)"
+QUANTITIES = 3  # side by side: more do not fit on a line
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """One candidate, one case, one horizon, one quantity.
+
+    | field | meaning |
+    |---|---|
+    | ``case``, ``steps`` | what was rolled out, how long |
+    | ``name``, ``kind`` | of the candidate |
+    | ``quantity``, ``unit`` | what is measured, in m or rad |
+    | ``mean``, ``interval``, ``final``, ``p95`` | see `ErrorSummary`; None: not published |
+    """
+
+    case: str
+    steps: int
+    name: str
+    kind: str
+    quantity: str
+    unit: str
+    mean: float
+    interval: float | None
+    final: float | None
+    p95: float | None
+
+
+Published = Mapping[tuple[str, int, str], float]
+"""(case, horizon, quantity) -> mean error, m or rad."""
+
+
+def error_rows(
+    scene: Scene,
+    case: str,
+    horizons: Sequence[int],
+    errors: Mapping[tuple[str, str], Mapping[str, Tensor]],
+    published: Published,
+) -> Iterator[ErrorRow]:
+    """Rows of one case: every horizon, every candidate in its order, the paper's last.
+
+    Args:
+        scene: the robot.
+        case: its name.
+        horizons: control steps over which errors are averaged.
+        errors: (name, kind) -> quantity -> error at every step, ``(n, steps)``.
+        published: the paper's mean errors.
+    """
+    for horizon in horizons:
+        quantities: Iterable[str] = ()
+        for (name, kind), by_name in errors.items():
+            quantities = by_name.keys()
+            part = {k: e[:, :horizon] for k, e in by_name.items()}
+            for quantity, error in summarize(scene, part).items():
+                yield _row(case, horizon, name, kind, quantity, error)
+        for quantity in quantities:
+            mean = published.get((case, horizon, quantity))
+            if mean is not None:
+                about = (quantity, unit_of(scene, quantity))
+                yield ErrorRow(
+                    case, horizon, PAPER, "published", *about, mean, None, None, None
+                )
+
+
+def _row(
+    case: str, steps: int, name: str, kind: str, quantity: str, error: ErrorSummary
+) -> ErrorRow:
+    return ErrorRow(case, steps, name, kind, quantity, **vars(error))
+
+
+def error_table(
+    rows: Sequence[ErrorRow], rates: Mapping[str, float] | None = None
+) -> str:
+    """Text of the rows of one case and horizon: a line for every candidate.
+
+    Args:
+        rows: see `error_rows`.
+        rates: name -> control steps per second, for a last column.
+    """
+    lines = []
+    quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
+    for first in range(0, len(quantities), QUANTITIES):
+        shown = quantities[first : first + QUANTITIES]
+        columns = [
+            f"{quantity} ({unit}) mean" if column == "mean" else column
+            for quantity, unit in shown
+            for column in ("mean", "final", "p95")
+        ]
+        head = ["name", "kind", *columns, *(["steps/s"] if rates is not None else [])]
+        cells: dict[tuple[str, str], dict[str, ErrorRow]] = {}
+        for row in rows:
+            cells.setdefault((row.name, row.kind), {})[row.quantity] = row
+        body = []
+        for (name, kind), by_quantity in cells.items():
+            line = [name, kind]
+            for quantity, _ in shown:
+                row = by_quantity.get(quantity)
+                found = (row.mean, row.final, row.p95) if row else (None,) * 3
+                line += [shown_error(value) for value in found]
+            if rates is not None:
+                line.append(f"{rates[name]:,.0f}" if name in rates else "-")
+            body.append(line)
+        lines.append(text_table(head, body))
+    return "\n\n".join(lines)
+
+
+def shown_error(value: float | None) -> str:
+    """Three digits; an error that is not finite is of a rollout that diverges."""
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isfinite(value) else "diverges"
+
+
+def text_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Lines with aligned columns, the first two to the left."""
+    widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if number < 2 else cell.rjust(width)
+            for number, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in (head, *body)
+    )

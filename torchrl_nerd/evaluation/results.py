@@ -1,0 +1,150 @@
+"""The one schema of files in ``results/``: how numbers were made, and the numbers.
+
+``{"command", "commit", "machine", "seed", "results"}``: the command line that makes the
+file again, the commit of the code, processor and versions, the seed or seeds, and what
+was measured.
+"""
+
+import platform
+import shlex
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_nerd import __version__
+from torchrl_nerd.files import read_json, write_json
+
+KEYS = {
+    "command": str,
+    "commit": str,
+    "machine": dict,
+    "seed": int | list | None,
+    "results": dict | list,
+}
+PACKAGES = ("torch", "torchrl", "mujoco")
+
+
+Results = dict[str, Any] | list[dict[str, Any]]
+
+
+def make_record(
+    results: Results,
+    seed: int | list[int] | None = None,
+    command: str | None = None,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Results with their command line, commit, machine and seed.
+
+    Args:
+        results: what was measured.
+        seed: one or several; None where nothing is random.
+        command: that makes them again; the running script's by default.
+        device: of the models.
+    """
+    return {
+        "command": command or script_command(),
+        "commit": commit(),
+        "machine": machine(device),
+        "seed": seed,
+        "results": results,
+    }
+
+
+def write_results(
+    path: Path, results: Results, seed: int | list[int] | None = None, **about: Any
+) -> None:
+    """Write the record of `make_record` as JSON.
+
+    Args:
+        path: of the file.
+        results: what was measured.
+        seed: one or several; None where nothing is random.
+        about: ``command`` and ``device``, see `make_record`.
+
+    Raises:
+        ValueError: a part of another type, or a file that cannot be written.
+    """
+    record = make_record(results, seed, **about)
+    check_record(record)
+    write_json(path, record)
+
+
+def script_command() -> str:
+    """The command line of the running script, from the repository's root."""
+    script, words = Path(sys.argv[0]), list(sys.argv[1:])
+    if "--json" in words:
+        at = words.index("--json")
+        del words[at : at + 2]
+    return shlex.join(["python", f"{script.parent.name}/{script.name}", *words])
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """The record in a file.
+
+    Raises:
+        ValueError: no JSON there, or no record (what is wrong is named).
+    """
+    record = read_json(path)
+    try:
+        check_record(record)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return record
+
+
+def check_record(record: dict[str, Any]) -> None:
+    """Refuse what is not a record.
+
+    Raises:
+        ValueError: in one sentence, a key that is missing or of another type.
+    """
+    for key, kind in KEYS.items():
+        if key not in record:
+            raise ValueError(f"expected keys {', '.join(KEYS)}, found no '{key}'")
+        if not isinstance(record[key], kind):
+            found = type(record[key]).__name__
+            raise ValueError(f"expected '{key}' of type {kind}, got {found}")
+
+
+def commit() -> str:
+    """Commit of the code, with ``-dirty`` where files differ; else its version."""
+    folder = Path(__file__).parent
+    words = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    except OSError:  # no git here
+        return __version__
+    return done.stdout.strip() if done.returncode == 0 else __version__
+
+
+def machine(device: str = "cpu") -> dict[str, Any]:
+    """Processor, threads, device and versions."""
+    where = torch.device(device)
+    is_gpu = where.type == "cuda"
+    return {
+        "processor": _processor(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(where) if is_gpu else where.type,
+        "python": platform.python_version(),
+        **{name: _version(name) for name in PACKAGES},
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
