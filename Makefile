@@ -14,8 +14,8 @@ WORKERS ?= 2
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip install -qq --disable-pip-version-check --no-input
-TORCH := $(shell sed -n 's/^ *"\(torch==[^";]*\).*/\1/p' pyproject.toml)
-DM_CONTROL := $(shell sed -n 's/^ *"\(dm-control==[^";]*\).*/\1/p' pyproject.toml)
+TORCH := $(or $(shell grep '^torch==' $(CONSTRAINTS)),torch)
+DM_CONTROL := $(or $(shell grep '^dm_control==' $(CONSTRAINTS)),dm-control)
 MADE_FROM := $(shell { pwd; cat pyproject.toml $(CONSTRAINTS); } | cksum | cut -d' ' -f1)
 STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli

@@ -131,7 +131,7 @@ def gymnasium_file(env_id: str) -> tuple[Path, int]:
         from gymnasium.envs.registration import registry
     except ImportError:
         raise ValueError(
-            "expected Gymnasium to read its robots: `pip install torchrl-nerd[gymnasium]`"
+            "expected Gymnasium to read its robots: `pip install gymnasium`"
         ) from None
     if env_id not in registry:
         raise ValueError(f"unknown environment '{env_id}' of Gymnasium")
