@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import tables as tables_hook
 import torch
 from tensordict import TensorDict
 
@@ -302,6 +303,43 @@ def test_readme_s_results_are_what_was_measured(row):
     assert unit == errors[model]["unit"] and errors[model]["kind"] == "learned"
     card = torchrl_nerd.checkpoint.shipped_card(model)
     assert card["network"]["kind"] == network.lower()
+
+
+def test_tables_of_the_site_are_rendered_from_results(tmp_path):
+    entry = {"case": "passive", "steps": 100, "kind": "learned", "unit": "m"}
+    errors = [
+        {**entry, "name": name, "quantity": quantity, "mean": mean}
+        for name, mean in (("a", 0.12345), ("b", float("inf")))
+        for quantity in ("x", "y", "z", "w")
+    ]
+    machine = {"processor": "CPU", "threads": 1, "mujoco": "3.17.0"}
+    record = {
+        "command": "nerd eval r",
+        "commit": "0" * 40,
+        "seed": 1,
+        "machine": machine,
+    }
+    rate = {"name": "a", "batch": 512, "steps_per_s": 12345.6}
+    for name, results in (
+        ("eval", {"errors": errors}),
+        ("bench", {"errors": errors, "rates": [rate], "steps": 100}),
+        ("stability", {"drop": {"passes": False}}),
+    ):
+        path = tmp_path / f"{name}_robot.json"
+        path.write_text(json.dumps({**record, "results": results}))
+    page = "\n".join(f"<!-- table: {name} -->" for name in tables_hook.TABLES)
+    shown = tables_hook.render(page, tmp_path)
+    assert "| a | learned | 0.12 | 0.12 | 0.12 |" in shown
+    assert "| b | learned | diverges | diverges | diverges |" in shown
+    assert "| a | learned | 0.12 | 0.12 | 0.12 | 12,346 |" in shown
+    assert "| drop | **fail** |" in shown
+    assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
+
+
+@each(PAGES)
+def test_a_page_asks_for_tables_that_exist(page):
+    asked = re.findall("<!-- table: (.*) -->", page.read_text())
+    assert set(asked) <= tables_hook.TABLES.keys()
 
 
 # -- reference -----------------------------------------------------------------------------

@@ -1,0 +1,138 @@
+"""Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
+
+A page asks for one by a comment: ``<!-- table: eval -->``, ``bench`` or ``stability``.
+"""
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parents[1] / "results"
+MARKER = re.compile(r"^<!-- table: (\w+) -->$", re.M)
+QUANTITIES = 3  # side by side: more do not fit on the page
+BATCH = 512
+
+
+def read(name: str, folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
+    """Robot -> record of every ``NAME_ROBOT.json``."""
+    paths = sorted(folder.glob(f"{name}_*.json"))
+    return {p.stem.removeprefix(f"{name}_"): json.loads(p.read_text()) for p in paths}
+
+
+def rows(cells: Iterable[Iterable[str]]) -> str:
+    """A table of Markdown, header first."""
+    header, *body = [list(row) for row in cells]
+    lines = [header, ["---"] * len(header), *body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def number(value: float | None) -> str:
+    """Two digits; what is not finite diverges."""
+    if value is None:
+        return "-"
+    return f"{value:.2g}" if abs(value) < float("inf") else "diverges"
+
+
+def made_by(record: dict[str, Any]) -> str:
+    """The line under a table: how to make it again."""
+    machine = record["machine"]
+    return (
+        f"`{record['command']}`, commit {record['commit'][:7]}, seed {record['seed']}, "
+        f"{machine['processor']}, {machine['threads']} threads, MuJoCo {machine['mujoco']}."
+    )
+
+
+def error_table(entries: list[dict[str, Any]], rates: dict[str, float]) -> str:
+    """Rows of one case and horizon: mean of up to three quantities, and the rate."""
+    names = dict.fromkeys((entry["name"], entry["kind"]) for entry in entries)
+    quantities = dict.fromkeys((e["quantity"], e["unit"]) for e in entries)
+    shown = list(quantities)[:QUANTITIES]
+    mean = {(e["name"], e["quantity"]): e["mean"] for e in entries}
+    head = [f"{quantity} ({unit})" for quantity, unit in shown]
+    table = [["name", "kind", *head, *(["steps/s"] if rates else [])]]
+    for name, kind in names:
+        line = [
+            name,
+            kind,
+            *(number(mean.get((name, quantity))) for quantity, _ in shown),
+        ]
+        table.append(
+            line + ([f"{rates[name]:,.0f}" if name in rates else "-"] if rates else [])
+        )
+    return rows(table)
+
+
+def eval_tables(folder: Path = RESULTS) -> str:
+    """Every robot: its cases at their longest horizon."""
+    parts = []
+    for robot, record in read("eval", folder).items():
+        entries = record["results"]["errors"]
+        parts.append(f"### {robot}")
+        for case in dict.fromkeys(entry["case"] for entry in entries):
+            own = [entry for entry in entries if entry["case"] == case]
+            steps = max(entry["steps"] for entry in own)
+            longest = [entry for entry in own if entry["steps"] == steps]
+            parts += [
+                f"Case {case}, {steps} steps, mean error:",
+                error_table(longest, {}),
+            ]
+        parts.append(made_by(record))
+    return "\n\n".join(parts)
+
+
+def bench_tables(folder: Path = RESULTS) -> str:
+    """Every robot: error and control steps per second."""
+    parts = []
+    for robot, record in read("bench", folder).items():
+        results = record["results"]
+        batches = {row["batch"] for row in results["rates"]}
+        batch = BATCH if BATCH in batches else max(batches)
+        rates = {
+            r["name"]: r["steps_per_s"] for r in results["rates"] if r["batch"] == batch
+        }
+        about = f"Batch {batch}, {results['steps']} steps, mean error:"
+        parts += [f"### {robot}", about, error_table(results["errors"], rates)]
+        parts.append(made_by(record))
+    return "\n\n".join(parts)
+
+
+def stability_tables(folder: Path = RESULTS) -> str:
+    """One row per case, one column per robot: pass or fail."""
+    found = {
+        robot: {
+            k: v for k, v in record.get("results", record).items() if "passes" in str(v)
+        }
+        for robot, record in read("stability", folder).items()
+    }
+    if not found:
+        return ""
+    cases = dict.fromkeys(case for results in found.values() for case in results)
+    words = {True: "pass", False: "**fail**", None: "-"}
+    table = [["case", *found]]
+    for case in cases:
+        verdicts = [results.get(case, {}).get("passes") for results in found.values()]
+        table.append([case, *(words[verdict] for verdict in verdicts)])
+    return rows(table)
+
+
+TABLES = {"eval": eval_tables, "bench": bench_tables, "stability": stability_tables}
+
+
+def render(markdown: str, folder: Path = RESULTS) -> str:
+    """A page with its tables; without results it says so."""
+
+    def table(found: re.Match[str]) -> str:
+        name = found[1]
+        missing = (
+            f"`not measured` yet: `nerd {name} ROBOT --json results/{name}_ROBOT.json`."
+        )
+        return TABLES[name](folder) or missing
+
+    return MARKER.sub(table, markdown)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Called by MkDocs for every page."""
+    return render(markdown)
