@@ -43,7 +43,7 @@ class Play(DeviceCommand):
     steps: int | None = None
     """Of the env; 5 s or the task's horizon by default."""
     out: Path | None = None
-    """Video, .gif or .mp4, or .png for a sheet of six frames; runs/TASK.gif by default."""
+    """Video, .gif or .mp4, or .png for a figure of six frames; runs/TASK.gif by default."""
     width: int = 720
     """Of the video, pixels."""
     slowdown: float = 1.0

@@ -80,8 +80,8 @@ def test_a_video_has_its_frames_and_speed(pair, suffix, tmp_path):
         assert Image.open(path).info["duration"] == 40
 
 
-def test_a_sheet_has_six_frames(pair, tmp_path):
+def test_a_figure_has_six_frames(pair, tmp_path):
     assert write_video(pair, tmp_path / "a.png", WIDTH, quiet=True) == 6
-    sheet = np.asarray(Image.open(tmp_path / "a.png"))
+    figure = np.asarray(Image.open(tmp_path / "a.png"))
     frames = list(make_frames(pair, range(6), WIDTH))
-    np.testing.assert_array_equal(sheet, np.vstack(frames))
+    np.testing.assert_array_equal(figure, np.vstack(frames))

@@ -1,4 +1,4 @@
-"""Side-by-side rollouts as GIF or MP4 video, or as a PNG sheet of frames."""
+"""Side-by-side rollouts as GIF or MP4 video, or as a PNG figure of frames."""
 
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
@@ -14,7 +14,7 @@ from torchrl_nerd.evaluation.render.side_by_side import SideBySide
 from torchrl_nerd.files import write_atomically
 
 FRAMES_PER_SECOND = 25  # a GIF counts in hundredths of a second
-SHEET_FRAMES = 6
+FIGURE_FRAMES = 6
 GIF_COLORS = 64
 INK, GRAY = (30, 30, 30), (110, 110, 110)
 
@@ -46,7 +46,7 @@ def write_video(
 
     Args:
         pair: the two rollouts.
-        path: .gif or .mp4, or .png for a sheet of `SHEET_FRAMES` frames.
+        path: .gif or .mp4, or .png for a figure of `FIGURE_FRAMES` frames.
         width: of a frame with both robots, pixels.
         slowdown: 2 plays at half speed.
         quiet: no progress bar.
@@ -60,7 +60,7 @@ def write_video(
 
     count = max(2, round(pair.seconds * slowdown * FRAMES_PER_SECOND) + 1)
     if path.suffix == ".png":
-        count = SHEET_FRAMES
+        count = FIGURE_FRAMES
     steps = torch.linspace(0, len(pair.paths[0]) - 1, count).round().long().tolist()
     bar = tqdm(steps, "video", unit=" frames", disable=quiet)
     frames = make_frames(pair, bar, width)
