@@ -179,7 +179,7 @@ def test_a_training_log_that_is_none(text, tmp_path):
     if not text:
         assert TrainingLog(tmp_path, 0).rows == []
         return
-    with pytest.raises(ValueError, match="table of figures by 'step'"):
+    with pytest.raises(ValueError, match="table of metrics by 'step'"):
         TrainingLog(tmp_path, 0)
 
 

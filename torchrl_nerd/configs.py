@@ -85,7 +85,7 @@ class TrainConfig:
     network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width
     step: str | None = None  # analytic step that a hybrid corrects; None: learned model
     predicted_force: bool = False  # feature: contact forces by the penalty law
-    # feature: contacts along the contact-free motion in place of constant velocity
+    # feature: contacts along the unconstrained motion in place of constant velocity
     unconstrained_motion: bool = False
     steps: int = 20_000  # updates on one-step targets
     rollout_steps: int = 2_000  # further updates on the model's own rollouts

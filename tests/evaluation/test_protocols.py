@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from torchrl_nerd.checkpoint import make_model
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.robots import (
     PRESETS,
@@ -62,8 +63,11 @@ def test_protocols_fit_their_scene(scene):
 def test_recipes_fit_their_scene(name):
     preset = PRESETS[name]
     assert preset.task in TASKS and make_task(preset.task).scene is load_scene(name)
-    assert make_model(load_scene(name), network_config(preset.train.network))
-    assert preset.data.steps >= max(preset.train.length, preset.train.rollout_length)
+    network = network_config(preset.train.network)
+    assert NeRD(load_scene(name), NO_PREDICTIONS, network).token_size > 0
+    assert preset.data.steps >= max(
+        preset.train.sequence_length, preset.train.rollout_length
+    )
 
 
 def test_published_figures_of_the_cartpole():

@@ -214,7 +214,7 @@ def test_bad_terrain_is_refused_in_one_sentence(dynamics, generator):
             physics.step(state, torque, wrong)
     terrain[1, 5] = torch.nan
     with pytest.raises(
-        ValueError, match="finite terrain, got NaN or infinity in row 1"
+        ValueError, match="finite terrain, got NaN or infinity in env 1"
     ):
         physics.step(state, torque, terrain)
     with pytest.raises(ValueError, match="finite terrain"):

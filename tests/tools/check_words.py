@@ -33,9 +33,9 @@ WORDS = {
     r"networks? alone": "learned model",
     r"free motion": "unconstrained motion",
     r"free (step|ne ?rd|network)": "UnconstrainedStep, HybridNeRD",
-    r"ground(ed)? (step|ne ?rd|config)": "PenaltyContactStep, HybridNeRD",
+    r"ground step|grounded (step|ne ?rd|config)|grounded": "PenaltyContactStep, HybridNeRD",
     r"(along|on) (its |the |their |a robot s )?springs": "penalty-contact step",
-    r"(contact|limits?|ground s) springs": "spring-damper forces",
+    r"(contact|limit) springs": "spring-damper forces",
     r"(num|one|two|three|pair of|last) looks?|glances?": "stages, dynamics evaluations",
     r"march(es|ed|ing)?": "integrate substeps",
     r"halves": "outer steps",
@@ -44,12 +44,12 @@ WORDS = {
     r"doubts?|half gate": "velocity defect, gate",
     r"joint stops?|ends of joints": "joint limits",
     r"foresees?|foreseen|foresight|foreseeing|coming depth": "predicted",
-    r"(?<!the )(fly|flies)|flight bypass": "contact-free bypass",
+    r"flight bypass|flight shortcut": "contact-free bypass",
     r"untold( pushes)?|expect none": "unsupported forces, check_supported",
-    r"set down|the mount|mounted": "place_on_terrain, base frame",
+    r"set down|the mount": "place_on_terrain, base frame",
     r"has simulator": "kind",
     # data and training
-    r"nudged?|nudges|fallen": "perturbed, settled",
+    r"nudged?|nudges": "perturbed, settled",
     r"(passive|quiet|single|short|bf ?\d* ?) ?share": "fraction",
     r"least scale": "min_torque_scale",
     r"lr other|rollout lr(?! ratio)|rollout rounds|softening": "training settings",
@@ -78,7 +78,11 @@ WORDS = {
 }
 """Left column of the glossary as a regular expression, and what to write instead."""
 
+RAW = {r"ground [1-6]"}
+"""Words that are looked for in the line as it is, with its punctuation."""
+
 ALLOWED = {
+    r"limbs": ("torchrl_nerd/geometry/spd.py",),
     r"figures(?! \d)": (
         "README.md",
         "docs/*",
@@ -87,7 +91,6 @@ ALLOWED = {
         "tests/test_docs.py",
     ),
     r"(not )?met": ("*.json",),
-    r"springs": ("torchrl_nerd/scenes/support.py",),
 }
 """Files in which a word is used in another meaning."""
 
@@ -119,7 +122,7 @@ def hits(path: str, text: str) -> Iterator[Hit]:
         for word, pattern in PATTERNS.items():
             if any(fnmatch(path, allowed) for allowed in ALLOWED.get(word, ())):
                 continue
-            for _ in pattern.finditer(plain):
+            for _ in pattern.finditer(line if word in RAW else plain):
                 yield Hit(word, path, number, line.strip())
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.constants import keep_constants
 from torchrl_nerd.geometry.joint_axes import JointAxes
 from torchrl_nerd.geometry.penalty import friction_force, limit_forces, normal_force
-from torchrl_nerd.scenes.penalty_law import PenaltyLaw, limit_springs
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw, limit_stiffness
 from torchrl_nerd.scenes.scene import Scene
 
 MIN_SLIP = 1e-6  # m/s: keeps the direction of slip defined at rest
@@ -99,7 +99,7 @@ class PenaltyLimitForce(nn.Module):
         self.joints = np.flatnonzero(is_limited).tolist()
         ids = [axes.joints[index] for index in self.joints]
         low, high = model.jnt_range[ids].T
-        springs = limit_springs(model, ids) if ids else (low, low)
+        springs = limit_stiffness(model, ids) if ids else (low, low)
         keep_constants(self, law=np.stack((*springs, low, high))[..., None])
 
     def forward(self, position: Tensor, velocity: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ def policy_data(
     generator: Generator,
     noise: float = 0.5,
 ) -> TensorDict:
-    """Trajectories ``[rows, steps]`` of a policy in true dynamics, broken ones included.
+    """Trajectories ``[rows, steps]`` of a policy in MuJoCo, diverged ones included.
 
     They start as episodes do and go on where an episode would end: a fallen robot is as
     good a sample as a walking one. Actions are the policy's mean plus normal noise, whose

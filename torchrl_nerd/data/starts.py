@@ -1,4 +1,4 @@
-"""Starts for training beside those of the scene's ranges: standing, fallen, nudged."""
+"""Training starts beside the ranges: task resets, settled and perturbed states."""
 
 from dataclasses import dataclass
 from typing import cast

@@ -16,7 +16,7 @@ from torchrl_nerd.robots import make_task, preset_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
-LEAST_SCALE = 0.01  # of the largest torque
+MIN_TORQUE_SCALE = 0.01  # of the largest torque
 LONGEST = 1.0  # s that a torque keeps; the shortest is one control step
 PASSIVE = 0.1  # share of trajectories without torque
 
@@ -70,7 +70,7 @@ def strategies(
         explorer: the policy that explores.
     """
     calm = {
-        "min_torque_scale": LEAST_SCALE,
+        "min_torque_scale": MIN_TORQUE_SCALE,
         "zero_torque_fraction": PASSIVE,
         "low_torque_fraction": 0.0,
     }

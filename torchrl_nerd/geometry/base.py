@@ -16,7 +16,7 @@ from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
 class Base:
     """The body whose pose defines B_t.
 
-    A floating base is the body of the free joint. A fixed base is the mount: the pose,
+    A floating base is the body of the free joint. A fixed base is the pose,
     constant in the world, of the first moving body's frame before its joints move.
     """
 

@@ -199,7 +199,7 @@ class NeRD(nn.Module):
         return model.to(self.device).train(self.training)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
-        """Move everything, but cast the network alone: constants stay float64."""
+        """Move everything, but cast only the network: constants stay float64."""
         for part in (part for part in self.children() if part is not self.network):
             for module in part.modules():
                 for name, buffer in module._buffers.items():

@@ -62,7 +62,7 @@ def set_penalty_limit(
 
 @dataclass(frozen=True)
 class PenaltyLaw:
-    """What each contact pushes with, read from a compiled model.
+    """Penalty law of each contact, read from a compiled model.
 
     | field | meaning |
     |---|---|
@@ -85,12 +85,12 @@ class PenaltyLaw:
         """
         geoms = [int(np.flatnonzero(model.geom_bodyid == body)[0]) for body in bodies]
         weight = model.body_invweight0[bodies, 0]
-        stiffness, damping = _springs(model.geom_solref[geoms], weight, "contacts")
+        stiffness, damping = _stiffness(model.geom_solref[geoms], weight, "contacts")
         slip = damping * model.opt.impratio
         return cls(stiffness, damping, slip, model.geom_friction[geoms, 0])
 
 
-def limit_springs(
+def limit_stiffness(
     model: mujoco.MjModel, joints: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping of the joints' limits, the inverse of `set_penalty_limit`.
@@ -101,10 +101,10 @@ def limit_springs(
         ValueError: a joint whose limit follows another law.
     """
     weight = model.dof_invweight0[model.jnt_dofadr[joints]]
-    return _springs(model.jnt_solref[joints], weight, "limits")
+    return _stiffness(model.jnt_solref[joints], weight, "limits")
 
 
-def _springs(
+def _stiffness(
     solref: np.ndarray, weight: np.ndarray, what: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping of MuJoCo's direct format."""

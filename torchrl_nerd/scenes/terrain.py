@@ -153,20 +153,20 @@ class Terrain:
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
         """Raise ValueError where a row's parameters are of another shape or not finite.
 
-        On an accelerator the numbers are not looked at: that would wait for it; nor in
-        compiled code, which cannot stop at them.
+        On an accelerator the numbers are not read, since that would synchronise it; nor in
+        compiled code, which cannot raise on them.
         """
         if tuple(terrain.shape) != shape:
             raise ValueError(
                 f"expected terrain of shape {shape}, got {tuple(terrain.shape)}"
             )
         is_read = terrain.device.type == "cpu" and not torch.compiler.is_compiling()
-        if not is_read or math.isfinite(terrain.sum()):  # one look at all, at first
+        if not is_read or math.isfinite(terrain.sum()):
             return
         rows = (~terrain.isfinite()).any(-1).reshape(-1).nonzero()
         if len(rows):
             raise ValueError(
-                f"expected finite terrain, got NaN or infinity in row {int(rows[0])}"
+                f"expected finite terrain, got NaN or infinity in env {int(rows[0])}"
             )
 
 

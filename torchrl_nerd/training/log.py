@@ -1,4 +1,4 @@
-"""Figures of a training run: a table always, and one of TorchRL's loggers."""
+"""Metrics of a training run: a table always, and one of TorchRL's loggers."""
 
 import csv
 from pathlib import Path
@@ -10,12 +10,12 @@ from torchrl_nerd.training.loggers import close
 
 
 class TrainingLog:
-    """Appends one row of figures per validation to ``log.csv``.
+    """Appends one row of metrics per validation to ``log.csv``.
 
     Args:
         folder: of the run.
         step: rows after it, left by a run that was killed, are dropped.
-        logger: takes the same figures; see `open_logger`.
+        logger: takes the same metrics; see `open_logger`.
     """
 
     def __init__(self, folder: Path, step: int, logger: Logger | None = None) -> None:
@@ -35,7 +35,7 @@ class TrainingLog:
                     raise ValueError
         except (ValueError, KeyError, csv.Error):
             raise ValueError(
-                f"expected a table of figures by 'step' in {self.path}, got another"
+                f"expected a table of metrics by 'step' in {self.path}, got another"
             ) from None
         return rows
 
@@ -45,13 +45,13 @@ class TrainingLog:
             writer.writeheader()
             writer.writerows(self.rows)
 
-    def write(self, figures: dict[str, float]) -> None:
+    def write(self, metrics: dict[str, float]) -> None:
         """Add a row; the file is whole after every call."""
-        self.rows.append({key: repr(value) for key, value in figures.items()})
+        self.rows.append({key: repr(value) for key, value in metrics.items()})
         write_atomically(self.path, self._write_rows)
         if self.logger is not None:
-            step = int(figures["step"])
-            rest = {key: value for key, value in figures.items() if key != "step"}
+            step = int(metrics["step"])
+            rest = {key: value for key, value in metrics.items() if key != "step"}
             self.logger.log_metrics(rest, step=step)
 
     def close(self) -> None:

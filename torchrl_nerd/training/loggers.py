@@ -1,4 +1,4 @@
-"""Where figures of a training run go beside its table: one of TorchRL's loggers."""
+"""Where metrics of a training run go beside its table: one of TorchRL's loggers."""
 
 import os
 from importlib.util import find_spec
@@ -31,7 +31,7 @@ def open_logger(
 ) -> Logger | None:
     """The logger of a run in ``folder`` that goes on at ``step``.
 
-    | name | where figures go |
+    | name | where metrics go |
     |---|---|
     | ``tensorboard`` | ``tensorboard`` in the folder, if it is installed |
     | ``wandb`` | Weights & Biases; with ``WANDB_MODE=offline``, ``wandb`` in the folder |

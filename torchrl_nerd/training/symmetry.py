@@ -3,7 +3,7 @@
 An ant turned by a quarter is the same ant with its legs renumbered; its mirror image moves
 as its mirrored motors say. Each training sample is as good as all of its images. Such
 isometries are searched among the 48 that map the axes of the base frame to themselves, by
-where they put joints and contact points, and kept if the true solver agrees.
+where they put joints and contact points, and kept if MuJoCo agrees.
 """
 
 from collections.abc import Iterator
@@ -240,7 +240,7 @@ def _solver_agrees(isometry: Isometry) -> bool:
 
 
 def states_in_contact(scene: Scene, rows: int, deepest: float) -> TensorDict:
-    """States and torques, floating bases set down into the ground, ``[rows]``.
+    """States and torques, floating bases lowered into the ground, ``[rows]``.
 
     Args:
         scene: the robot.

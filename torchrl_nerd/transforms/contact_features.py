@@ -123,7 +123,7 @@ class ContactFeatures(FeatureTransform):
         self.count, self.num_known = count, count + self.num_places
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         self.pose = BasePose(scene.base, scene.fixed_base_pose)
-        self.coming_depth = PredictedPenetration(scene, self.ground, self.pose)
+        self.predicted_penetration = PredictedPenetration(scene, self.ground, self.pose)
         keep_constants(self, radii=points.radii, margins=points.margins)
 
     def contact_features(
@@ -162,7 +162,9 @@ class ContactFeatures(FeatureTransform):
             gain = self.rigid_body(qpos, qvel, joint_torque, *where, self.step_size)
             gain = self.step_size * gain
         depth = self.radii - distance
-        depth = gate * self.coming_depth(qpos, qvel, terrain, gain, depth, speed)
+        depth = gate * self.predicted_penetration(
+            qpos, qvel, terrain, gain, depth, speed
+        )
         features = [beyond.clamp_max(0.0)]
         features.append((gate * torch.cat((speed[..., None], sliding), -1)).flatten(-2))
         features.append(depth.flatten(-2))

@@ -16,7 +16,7 @@ from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.geometry.penalty import limit_forces
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
-from torchrl_nerd.scenes.penalty_law import limit_springs
+from torchrl_nerd.scenes.penalty_law import limit_stiffness
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
@@ -147,7 +147,7 @@ class _JointFeatures:
                 fastest = float(speed[v - model.nv])
                 margin = LIMIT_STEPS * scene.control_step * fastest
                 if features.predicted_force:
-                    stiffness, damping = limit_springs(model, [joint])
+                    stiffness, damping = limit_stiffness(model, [joint])
                     found.predicted.append(v)
                     found.springs.append((stiffness.item(), damping.item()))
                 found.limited.append(q)
