@@ -1,4 +1,4 @@
-"""Ways to cover the states that a robot meets, by name; see docs/sampling.md."""
+"""Ways to cover the states that a robot meets, by name; see docs/training.md."""
 
 from dataclasses import replace
 from functools import partial

@@ -138,7 +138,8 @@ class FeedForward(nn.Module):
     """GELU MLP of four times the width, added to its input.
 
     Without a layer norm: the state is a magnitude, and dividing by a token's own size
-    takes it away. Measured in docs/studies.md: a third to a half of the rollout error.
+    takes it away. Measured in experiments/first_edition/studies.md: a third to a half of
+    the rollout error.
     """
 
     def __init__(self, width: int) -> None:
