@@ -158,3 +158,9 @@ def test_other_robots_and_contacts_are_refused(real_cube):
     model.geom_solref[:] = (0.02, 1.0)
     with pytest.raises(ValueError, match="contacts that are springs and dampers"):
         FreeBodyPenaltyStep(replace(real_cube, model=model))
+
+
+def test_fitted_parameters_stay_over_another_ground(real_cube):
+    step = FreeBodyPenaltyStep(real_cube)
+    step.set_values({"friction": 0.3, "centre_z": 0.004})
+    assert step.with_terrain(real_cube).values() == step.values()

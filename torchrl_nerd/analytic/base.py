@@ -44,10 +44,10 @@ class AnalyticStep(nn.Module, ABC):
 
     def with_terrain(self, scene: Scene) -> "AnalyticStep":
         """The same step for the same robot over another ground."""
-        make = cast(
-            Any, type(self)
-        )  # whose arguments are the fields of its configuration
-        return make(scene, **asdict(self.config)).to(self.device)
+        make = cast(Any, type(self))  # takes the fields of its configuration
+        step = make(scene, **asdict(self.config)).to(self.device)
+        step.load_state_dict(self.state_dict())  # fitted parameters, where it has any
+        return step
 
     @property
     def device(self) -> torch.device:
