@@ -32,7 +32,7 @@ class Options:
     rounds: int = 7
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 class Stepper:
@@ -80,17 +80,17 @@ def main(options: Options) -> None:
     tasks = options.tasks or [t for t in TASKS if make_task(t).scene.name in shipped]
     print(f"{options.rows} rows, one thread, us of an action of one row")
     print(f"{'task':<30}{'eager':>8}{'compiled':>10}{'ratio':>7}{'compiling, s':>14}")
-    figures = {}
+    results = {}
     for task in tasks:
         row = compare(task, options.rows, options.rounds, options.seed)
-        figures[task] = row
+        results[task] = row
         rates = (
             f"{row['eager_us']:>8.1f}{row['compiled_us']:>10.1f}{row['ratio']:>7.2f}"
         )
         print(f"{task:<30}{rates}{row['compile_s']:>14.1f}", flush=True)
     if options.json is not None:
         about = {"rows": options.rows, "seed": options.seed, "torch": torch.__version__}
-        write_json(options.json, {**about, "tasks": figures})
+        write_json(options.json, {**about, "tasks": results})
 
 
 if __name__ == "__main__":

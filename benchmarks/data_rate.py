@@ -39,7 +39,7 @@ class Options:
     """The first is not counted."""
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def seconds_of_rollout(
@@ -92,8 +92,8 @@ def main(options: Options) -> float:
     )
     if options.json is not None:
         names = ("rollout_per_s", "data_per_s", "ratio")
-        figures = dict(zip(names, (*rates, ratio), strict=True))
-        write_json(options.json, {"scene": scene.name, "threads": threads, **figures})
+        results = dict(zip(names, (*rates, ratio), strict=True))
+        write_json(options.json, {"scene": scene.name, "threads": threads, **results})
     return ratio
 
 

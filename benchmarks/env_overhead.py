@@ -34,7 +34,7 @@ class Options:
     steps: int = 200
     threads: int | None = None
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def timed(owner: object, name: str) -> list[float]:
@@ -92,7 +92,7 @@ def main(options: Options) -> None:
         name: NeRD(scene, NO_PREDICTIONS, NETWORKS[name])
         for name in ("transformer-2x64", "transformer-4x128", "paper")
     }
-    figures = {}
+    results = {}
     print(f"{options.task}, {options.rows} rows, {torch.get_num_threads()} threads")
     print(
         f"{'model':<10}{'step ms':>9}{'dynamics ms':>13}{'TorchRL':>9}{'task':>7}"
@@ -100,14 +100,14 @@ def main(options: Options) -> None:
     )
     for name, model in models.items():
         row = step_times(options.task, model, options.rows, options.steps)
-        figures[name] = row
+        results[name] = row
         rate = options.rows / row["step_s"]
         line = f"{name:<10}{1e3 * row['step_s']:>9.2f}{1e3 * row['dynamics_s']:>13.2f}"
         shares = f"{row['torchrl_share']:>9.1%}{row['task_share']:>7.1%}"
         print(f"{line}{shares}{rate:>10.0f}{row['contact_share']:>9.1%}")
     if options.json is not None:
         machine = {"processor": platform.machine(), "threads": torch.get_num_threads()}
-        write_json(options.json, {"rows": options.rows, **machine, "models": figures})
+        write_json(options.json, {"rows": options.rows, **machine, "models": results})
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.settings import expect_at_least
 
-TRUTH = "MuJoCo"
+MUJOCO = "MuJoCo"
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Options:
     """Have a compiled row."""
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def speeds(task: str, options: Options) -> dict[str, Speed]:
     if options.rows is not None:
         cfg = replace(cfg, num_envs=options.rows)
     true = replace(cfg, dynamics="mujoco")
-    learners = {TRUTH: Learner(true), "NeRD": Learner(cfg)}
+    learners = {MUJOCO: Learner(true), "NeRD": Learner(cfg)}
     if options.compile:
         learners["NeRD, compiled"] = Learner(cfg, compile=True)
     for learner in learners.values():
@@ -125,7 +125,7 @@ def speeds(task: str, options: Options) -> dict[str, Speed]:
         name: Speed(
             frames / median(sum(seconds[name]) for seconds in rounds),
             frames / median(seconds[name][0] for seconds in rounds),
-            median(sum(seconds[TRUTH]) / sum(seconds[name]) for seconds in rounds),
+            median(sum(seconds[MUJOCO]) / sum(seconds[name]) for seconds in rounds),
         )
         for name in learners
     }
@@ -154,11 +154,11 @@ def main(options: Options) -> dict[str, dict[str, Speed]]:
             rates = f"{speed.frames_per_s:>10,.0f}{speed.collected_per_s:>13,.0f}"
             print(f"{task:<22}{name:<16}{rates}{speed.ratio:>7.2f}", flush=True)
     if options.json is not None:
-        figures = {
+        results = {
             task: {name: asdict(speed) for name, speed in by_name.items()}
             for task, by_name in found.items()
         }
-        write_json(options.json, {"threads": 1, "tasks": figures})
+        write_json(options.json, {"threads": 1, "tasks": results})
     return found
 
 

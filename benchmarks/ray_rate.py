@@ -38,7 +38,7 @@ class Options:
     """The first is not counted: workers start in it."""
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def seconds_of(mapper: Mapper, scene: Scene, options: Options, index: int) -> float:
@@ -78,9 +78,9 @@ def main(options: Options) -> None:
         f"the first round took {times['ray'][0]:.1f} s"
     )
     if options.json is not None:
-        figures = {"one_process_per_s": here, "ray_per_s": there, "start_s": start}
-        figures |= {"first_s": times["ray"][0], "worker_mib": max(memory.values())}
-        write_json(options.json, {"scene": scene.name, "workers": count, **figures})
+        results = {"one_process_per_s": here, "ray_per_s": there, "start_s": start}
+        results |= {"first_s": times["ray"][0], "worker_mib": max(memory.values())}
+        write_json(options.json, {"scene": scene.name, "workers": count, **results})
 
 
 if __name__ == "__main__":

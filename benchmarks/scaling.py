@@ -51,7 +51,7 @@ class Options:
     rounds: int = 5
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,10 @@ def main(options: Options) -> list[Point]:
         "history of a row, bytes: " + ", ".join(f"{k} {v}" for k, v in memory.items())
     )
     if options.json is not None:
-        figures: dict[str, Any] = {"points": [asdict(p) for p in points]}
+        results: dict[str, Any] = {"points": [asdict(p) for p in points]}
         asked = {"network": options.network, "compiled": options.compile}
         asked |= {"threads": 1, "memory_bytes": memory}
-        write_json(options.json, asked | figures)
+        write_json(options.json, asked | results)
     return points
 
 

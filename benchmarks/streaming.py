@@ -39,7 +39,7 @@ class Options:
     threads: int = 2
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 @dataclass(frozen=True)

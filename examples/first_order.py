@@ -122,7 +122,7 @@ def keep(cfg: Config, policy: Policy) -> None:
 def step_back(policy: Policy, best: Policy, optimizer: Adam) -> None:
     """Continue from the best policy at half the step size.
 
-    Near chaos gradients say little, and a policy that they made worse meets more of it.
+    Where motion is nearly chaotic gradients say little, and a worse policy moves so more.
     """
     policy.load_state_dict(best.state_dict())
     optimizer.state.clear()
@@ -156,7 +156,7 @@ def window_reward(
 def bound_rows(gradient: Tensor, times: float = 4.0) -> Tensor:
     """Gradients ``(num_envs, num_actions)``, no row longer than ``times`` the median one.
 
-    Where an arm is near chaos its gradient grows with every step that it goes back
+    Where motion is nearly chaotic its gradient grows with every step that it goes back
     through, and one such row would point the whole batch its way. What is no number
     counts nothing.
     """

@@ -4,7 +4,7 @@
     python examples/gymnasium_skrl.py --env TorchrlNerd/AntRun-v0 --dynamics mujoco
 
 skrl takes the batched env as it takes any `gymnasium.vector.VectorEnv`: one call of the
-dynamics steps all of its rows. The policy is then measured in true physics.
+dynamics steps all of its rows. The policy is then measured in MuJoCo.
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,10 @@
-"""Learn a task in learned dynamics, then measure the policy in true physics.
+"""Learn a task in learned dynamics, then measure the policy in MuJoCo.
 
     python examples/ppo.py                       # swing up a cart-pole in NeRD
     python examples/ppo.py --dynamics mujoco     # the same in MuJoCo: nothing else changes
     python examples/ppo.py --task ant/run        # any task; its settings: tasks/ppo.py
 
-True physics is measured, never learned from. Policy and figures are written to `--out`.
+MuJoCo only measures. Policy, numbers and pictures are written to `--out`.
 """
 
 import logging
@@ -48,7 +48,7 @@ class Run(PPOConfig):
     seed: int = 0  # of weights, exploration and starts
     evaluate_every: int = 20  # updates between two points of the learning curve
     episodes: int = 2048  # of the final evaluation
-    out: Path = Path("runs/ppo")  # folder for policy, numbers and figures
+    out: Path = Path("runs/ppo")  # folder for policy, numbers, pictures
 
 
 def parse(kind: type[Run] = Run) -> Run:
@@ -59,7 +59,7 @@ def parse(kind: type[Run] = Run) -> Run:
 
 
 def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperator]:
-    """Both see observations standardised by all that were met, by random actions first."""
+    """Both see observations standardised by all seen so far, at first by random actions."""
     policy = Policy.for_env(env, cfg.horizon, cfg.widths, cfg.std, cfg.frame_stack)
     critic = nn.Sequential(policy.standardize, mlp((policy.sizes[0], *cfg.widths, 1)))
     return policy, ValueOperator(critic)
@@ -113,7 +113,7 @@ def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:
 def train(
     cfg: Run, task: str | Task | None = None, collect: Callable = collect
 ) -> tuple[Policy, list[dict[str, float]]]:
-    """A policy that met ``cfg.dynamics`` alone, and its returns there and in truth."""
+    """A policy that learned in ``cfg.dynamics`` alone, its returns there and in MuJoCo."""
     task = task or cfg.task
     env = make_env(task, cfg.dynamics, cfg.num_envs, seed=cfg.seed, compile=cfg.compile)
     env = stack_frames(env, cfg.frame_stack)

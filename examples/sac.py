@@ -1,4 +1,4 @@
-"""Soft actor-critic from one replay buffer that learned and true dynamics fill together.
+"""Soft actor-critic from one replay buffer that learned dynamics and MuJoCo fill together.
 
     python examples/sac.py                     # a quarter of the transitions are MuJoCo's
     python examples/sac.py --true-share 0      # all of them NeRD's; 1: all MuJoCo's

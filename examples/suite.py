@@ -38,7 +38,7 @@ class Config:
     updates: int = 3000  # of the model
     frames: int = 600_000  # actions of the policy
     num_envs: int = 256  # rows that it learns from together
-    hold: int = 4  # control steps per action
+    hold: int = 4  # control steps that an action is held
     episodes: int = 64  # of the report, in each dynamics
     seed: int = 0
     out: Path = Path("runs/suite")
@@ -63,7 +63,7 @@ def make_model(scene: Scene, cfg: Config, folder: Path) -> Path:
 
 
 def make_policy(task: SuiteTask, model: Path, cfg: Config) -> Policy:
-    """PPO in learned dynamics; true ones are never met."""
+    """PPO in learned dynamics alone."""
     how = ppo.Run(
         dynamics=str(model),
         total_frames=cfg.frames,
@@ -137,9 +137,9 @@ def main(cfg: Config) -> None:
         print(f"dm_control itself, {played} episodes, {who} actions: {spread}")
     seconds = time.monotonic() - began
     print(f"{seconds:.0f} s in all")
-    figures = {name: asdict(summary) for name, summary in report.items()}
+    returns = {name: asdict(summary) for name, summary in report.items()}
     about = {"configuration": asdict(cfg), "suite": suite, "seconds": seconds}
-    write_json(folder / "report.json", {**about, "returns": figures})
+    write_json(folder / "report.json", {**about, "returns": returns})
 
 
 if __name__ == "__main__":

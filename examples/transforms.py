@@ -6,7 +6,7 @@
 No dynamics of this package takes part: TorchRL's `DMControlEnv` is stepped, one small
 transform adds MuJoCo's own state, and a replay buffer turns transitions into what NeRD
 sees and predicts. A plain network then learns the change of state from that, once with the
-contacts and once without: of the change's variance 11.2% and 13.1% are not foreseen.
+contacts and once without: of the change's variance 11.2% and 13.1% are not explained.
 """
 
 import logging
@@ -134,7 +134,7 @@ def fit(buffer: ReplayBuffer, keys: Sequence[NestedKey], cfg: Config) -> nn.Modu
 def unexplained(
     network: nn.Module, batch: TensorDictBase, keys: Sequence[NestedKey]
 ) -> Tensor:
-    """Squared error of the normalised change: the share of its variance not foreseen."""
+    """Squared error of the normalised change: the share of its variance not explained."""
     inputs = torch.cat([batch[key] for key in keys], -1).float()
     return (network(inputs) - batch[STATE_DELTA].float()).square().mean()
 
@@ -160,7 +160,7 @@ def main(cfg: Config) -> dict[str, float]:
         network = fit(buffer, inputs, cfg)
         with torch.no_grad():
             errors[name] = float(unexplained(network, test, inputs))
-        print(f"{name:<20} {errors[name]:.1%} of the change not foreseen")
+        print(f"{name:<20} {errors[name]:.1%} of the change not explained")
     return errors
 
 

@@ -88,6 +88,7 @@ ALLOWED = {
         "docs/*",
         "mkdocs.yml",
         "*plot*",
+        "benchmarks/draw_benchmarks.py",
         "tests/test_docs.py",
     ),
     r"(not )?met": ("*.json",),

@@ -92,11 +92,12 @@ class Eval(MeasuringCommand):
             return self.run_recorded(self.data)
         scene = load_scene(self.scene)
         expect_at_least(2, num_trajectories=self.num_trajectories)
-        truth = mujoco_name(self.ground_truth(scene).scene)
+        solver_name = mujoco_name(self.ground_truth(scene).scene)
         solver = "the reference solver" if self.reference else "the scene's own solver"
         print(
             f"{self.scene}: {self.num_trajectories} trajectories per case. Ground truth: "
-            f"{truth}, {solver}. Every row, coarse MuJoCo included, is measured against it."
+            f"{solver_name}, {solver}. "
+            "Every row, coarse MuJoCo included, is measured against it."
         )
         rows = []
         for part in self.measure(scene, self.protocol(scene)):
@@ -106,7 +107,7 @@ class Eval(MeasuringCommand):
         return {
             "scene": self.scene,
             "num_trajectories": self.num_trajectories,
-            "ground_truth": truth,
+            "ground_truth": solver_name,
             "errors": [asdict(row) for row in rows],
         }
 
@@ -138,7 +139,8 @@ class Eval(MeasuringCommand):
         learned = models(scene, names, self.device, **how)
         candidates = [*simulators(scene), *learned]
         cases, horizons = list(cases_of(protocol)), protocol.horizons
-        steps, truth = max(horizons), mujoco_name(self.ground_truth(scene).scene)
+        steps = max(horizons)
+        solver_name = mujoco_name(self.ground_truth(scene).scene)
         count = len(cases) * (1 + len(candidates))
         bar = tqdm(total=count, desc=self.scene, leave=False, disable=self.quiet)
         for case, source, is_driven in cases:
@@ -147,7 +149,7 @@ class Eval(MeasuringCommand):
             bar.update()
             errors = {}
             for c in candidates:
-                if c.name == truth:
+                if c.name == solver_name:
                     errors[c.name, GROUND_TRUTH] = chosen.zeros
                 else:
                     errors[c.name, c.kind] = chosen.errors(c.make(chosen.scene))
