@@ -3,9 +3,10 @@
     python examples/collect.py
 
 `Collector`, `MultiSyncCollector`, `MultiAsyncCollector` and `ParallelEnv` take every
-dynamics alike, and in the last rows two at once: one worker steps NeRD, the other MuJoCo. Rows of one env share each call of the dynamics, so on one device a single
-env of many rows is the simple way; on one busy core none is much faster than another:
-3,000 to 7,000 frames/s each. More processes on more cores are not measured.
+dynamics alike, and in the last rows two at once: one worker steps NeRD, the other MuJoCo.
+Envs that step together share each call of the dynamics, so on one device a single env of
+many is the simple way; on one busy core none is much faster than another: 3,000 to 7,000
+frames/s each. More processes on more cores are not measured.
 """
 
 import logging
