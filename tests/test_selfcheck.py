@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 import torch
-from dynamics_helpers import random_model
+from dynamics_helpers import model_of_kind, random_model
 from safetensors.torch import load_file, save_file
 
 from torchrl_nerd.checkpoint import (
@@ -33,14 +33,15 @@ def test_shipped_models_repeat_their_steps_and_know_their_data(name):
         assert model.training_range.is_fitted
 
 
-def test_a_saved_model_repeats_its_steps(scene, generator, tmp_path):
-    model = random_model(scene, generator)
+@pytest.mark.parametrize("kind", ["streaming", "hybrid", "analytic"])
+def test_a_saved_model_repeats_its_steps(kind, scene, generator, tmp_path):
+    model = model_of_kind(kind, scene, generator)
     save_checkpoint(model, tmp_path, make_card(model))
     check = read_checkpoint(tmp_path, scene)[1]
-    assert check is not None and check.true == 0.0 and check.learned < 1e-5
+    assert check is not None and check.mujoco == 0.0 and check.model < 1e-5
 
 
-@pytest.mark.parametrize(("kind", "word"), [("true", "MuJoCo"), ("learned", "model")])
+@pytest.mark.parametrize(("kind", "word"), [("mujoco", "MuJoCo"), ("model", "model")])
 def test_other_steps_are_warned_of_with_the_number(
     scene, kind, word, generator, tmp_path
 ):

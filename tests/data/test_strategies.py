@@ -7,20 +7,21 @@ from functools import partial
 
 import pytest
 import torch
+from helpers import slow_but
 from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.checkpoint import make_card
-from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.configs import NO_PREDICTIONS, DataConfig
 from torchrl_nerd.data.generate import (
     CARD,
-    SEGMENT,
     generate,
     is_sound,
     load_data,
     simulate,
 )
 from torchrl_nerd.data.policy_data import policy_data
+from torchrl_nerd.data.simulate import SEGMENT
 from torchrl_nerd.data.starts import PerturbedRestStates, SettledStates, TaskResets
 from torchrl_nerd.data.strategies import mix, resample, strategies
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -30,12 +31,15 @@ from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import PRESETS, load_scene, make_task
+from torchrl_nerd.robots import PRESETS, SCENES, load_scene, make_task
 from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tasks import Task
 
 STATE = ("qpos", "qvel")
+BY_TORQUES = [s for s in map(load_scene, SCENES) if s.sampling.drive is None]
+each_by_torques = pytest.mark.parametrize("scene", BY_TORQUES, ids=lambda s: s.name)
+"""Scenes whose data are drawn by random torques, not by random actions."""
 
 
 class Linear:
@@ -66,10 +70,9 @@ def assert_equal(data: TensorDict, expected: TensorDict) -> None:
         assert torch.equal(data[key], expected[key]), key
 
 
+@each_by_torques
 def test_the_default_draws_are_those_of_shipped_models(scene, seed):
     """Independent uniform torques, segment by segment, after the starts."""
-    if scene.sampling.drive is not None:
-        return
     rows, steps = 5, 2 * SEGMENT + 3
     data, generator = simulate(scene, rows, steps, seeded(seed)), seeded(seed)
     start, scale = scene.sample_initial(rows, generator)
@@ -80,7 +83,9 @@ def test_the_default_draws_are_those_of_shipped_models(scene, seed):
         assert torch.equal(data[key][:, 0], value)
 
 
-def test_every_strategy_gives_sound_data_of_the_same_layout(scene, seed):
+@pytest.mark.parametrize("name", slow_but(("cartpole", "anymal"), SCENES))
+def test_every_strategy_gives_sound_data_of_the_same_layout(name, seed):
+    scene = load_scene(name)
     task, expected = task_of(scene), simulate(scene, 7, 5, seeded(seed))
     found = strategies(scene, task, Linear(task, seed))
     assert set(found) >= {"uniform", "shares", "scales", "starts", "policy", "mixed"}
@@ -101,10 +106,11 @@ def test_every_strategy_gives_sound_data_of_the_same_layout(scene, seed):
         assert one.batch_size == (1, 1)
 
 
+@pytest.mark.parametrize(
+    "scene", [s for s in BY_TORQUES if s.actuated], ids=lambda s: s.name
+)
 def test_torques_keep_as_long_as_asked_and_stay_uniform(scene, generator):
     """The process before its distribution function has correlation exp(-t / tau)."""
-    if scene.sampling.drive is not None or not scene.actuated:
-        return
     dt, rows, steps = scene.control_step, 1500, 60
     tau = dt * float(torch.empty(()).uniform_(2.0, 12.0, generator=generator))
     sampling = replace(scene.sampling, correlation_time=(tau, tau))
@@ -265,7 +271,7 @@ def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
     config, ranges = DataConfig(3, 2, seed), scene.sampling.ranges()
     generate(scene, config, tmp_path, quiet=True)
     card, expected = read_json(tmp_path / CARD), json.loads(json.dumps(ranges))
-    model = make_card(NeRD(scene, NETWORKS["mlp-4x64"]))
+    model = make_card(NeRD(scene, NO_PREDICTIONS, NETWORKS["mlp-4x64"]))
     assert (
         card["ranges"] == json.loads(json.dumps(model["training_ranges"])) == expected
     )

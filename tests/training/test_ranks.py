@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from torchrl_nerd.cli import main
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data.generate import generate
 from torchrl_nerd.robots import load_scene
@@ -33,19 +34,20 @@ BRIEF = (
 )
 
 
-def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str, str]:
-    """What ``nerd train`` says in so many processes, on its two streams."""
-    command = [sys.executable, "-m", "torchrl_nerd.cli"]
-    if count > 1:
-        command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-        command += ["--nproc-per-node", str(count), "-m", "torchrl_nerd.cli"]
-    command += ["train", name, "--data", str(data), "--out", str(out), *BRIEF, *more]
+def arguments(name: str, folder: Path, out: str, *more: str) -> list[str]:
+    """Of ``nerd train``, brief, on the data in a folder."""
+    places = "--data", str(folder / "data"), "--out", str(folder / out)
+    return ["train", name, *places, *BRIEF, *more]
+
+
+def train_in_two(*given: str) -> subprocess.CompletedProcess[str]:
+    """``nerd`` in two processes."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    command += ["--nproc-per-node", "2", "-m", "torchrl_nerd.cli", *given]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
+    return subprocess.run(
         command, capture_output=True, text=True, env=environment, timeout=300
     )
-    assert done.returncode == 0 or "expected" in done.stderr, done.stderr[-2000:]
-    return done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -59,13 +61,15 @@ def train(name: str, data: Path, out: Path, count: int, *more: str) -> tuple[str
         ),
     ],
 )
-def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
+def test_two_ranks_make_the_model_of_one(name, more, tmp_path, capsys):
     generate(load_scene(name), DataConfig(60, 8), tmp_path / "data", quiet=True)
-    states, losses = [], []
-    for count in (1, 2):
-        out = tmp_path / f"run_{count}"
-        said, _ = train(name, tmp_path / "data", out, count, *more)
+    assert main(arguments(name, tmp_path, "one", *more)) == 0
+    done = train_in_two(*arguments(name, tmp_path, "two", *more))
+    assert done.returncode == 0, done.stderr[-2000:]
+    for said in (capsys.readouterr().out, done.stdout):
         assert said.count("checkpoint in") == said.count("\n") == 1
+    states, losses = [], []
+    for out in (tmp_path / "one", tmp_path / "two"):
         states.append(load_file(out / "state.safetensors"))
         with open(out / "log.csv", newline="") as file:
             losses.append([float(row["loss"]) for row in csv.DictReader(file)])
@@ -77,11 +81,13 @@ def test_two_ranks_make_the_model_of_one(name, more, tmp_path):
     torch.testing.assert_close(*map(torch.tensor, losses), atol=0.0, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_shares_that_are_not_equal_are_refused(tmp_path):
     name = "cartpole"
     generate(load_scene(name), DataConfig(20, 8), tmp_path / "data", quiet=True)
-    _, said = train(name, tmp_path / "data", tmp_path / "run", 2, "--batch-size", "9")
-    assert "expected batch_size to be a multiple of the 2 ranks, got 9" in said
+    done = train_in_two(*arguments(name, tmp_path, "run", "--batch-size", "9"))
+    assert done.returncode != 0
+    assert "expected batch_size to be a multiple of the 2 ranks, got 9" in done.stderr
 
 
 def test_alone_nothing_changes(generator):
