@@ -1,26 +1,21 @@
-"""A training that begins from a checkpoint: nothing lost, nothing reinterpreted."""
+"""A training that continues another model: nothing lost, nothing reinterpreted."""
+
+from dataclasses import replace
 
 import pytest
 import torch
-from dynamics_helpers import little_data, random_drive, random_model
+from dynamics_helpers import hybrid_model, little_data, random_drive, random_model
 from torch import Generator
-from torchrl_nerd.modules.correction import ResidualConfig
-from torchrl_nerd.modules.residual import ResidualNeRD
 
-from torchrl_nerd.checkpoint import (
-    from_pretrained,
-    load_checkpoint,
-    make_card,
-    save_checkpoint,
-)
+from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
 from torchrl_nerd.cli import main
-from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.configs import NO_PREDICTIONS, TrainConfig
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training import validation
 from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.samples import cover, data_stats
@@ -38,8 +33,13 @@ CONFIG = TrainConfig(
     save_every=4,
     validate_every=8,
 )
+MLP = replace(CONFIG, network="mlp-1x16")
 HOW = {"horizons": (2, 3), "quiet": True, "logger": "csv"}
 CARTPOLE = load_scene("cartpole")
+
+two_scenes = pytest.mark.parametrize(
+    "scene", [CARTPOLE, load_scene("cube")], ids=lambda scene: scene.name
+)
 
 
 def path(model, drive):
@@ -54,133 +54,88 @@ def path(model, drive):
     return torch.stack(states)
 
 
-def other_data(scene, seed):
-    data = simulate(scene, 40, 4, Generator().manual_seed(seed))
-    return data[is_sound(data)]
-
-
-def test_without_an_update_nothing_is_other_than_at_the_start(
-    scene, tmp_path, generator
-):
-    start, drive = random_model(scene, generator), random_drive(scene, 4, 6, generator)
-    before = fingerprint(start)
-    trainer = Trainer(
-        scene, little_data(scene), scene, CONFIG, tmp_path, **HOW, init_from=start
+@two_scenes
+def test_without_an_update_the_model_is_the_initial_one(scene, tmp_path, generator):
+    initial, drive = (
+        random_model(scene, generator),
+        random_drive(scene, 4, 6, generator),
     )
-    begun = trainer.averaged_model()
-    assert torch.equal(path(begun, drive), path(start, drive))
-    assert fingerprint(start) == before
+    before, data = fingerprint(initial), little_data(scene)
+    trainer = Trainer(scene, data, scene, CONFIG, tmp_path, **HOW, init_from=initial)
+    assert torch.equal(path(trainer.averaged_model(), drive), path(initial, drive))
+    assert fingerprint(initial) == before
 
 
+@two_scenes
 def test_statistics_are_frozen_and_bounds_do_not_shrink(
     scene, tmp_path, generator, seed
 ):
-    start = random_model(scene, generator)
-    data = other_data(scene, seed)
-    trained = Trainer(
-        scene, data, scene, CONFIG, tmp_path, **HOW, init_from=start
-    ).run()
-    old, new = start.state_dict(), load_checkpoint(tmp_path / "last").state_dict()
+    initial = random_model(scene, generator)
+    data = simulate(scene, 40, 4, Generator().manual_seed(seed))
+    data = data[is_sound(data)]
+    trainer = Trainer(scene, data, scene, CONFIG, tmp_path, **HOW, init_from=initial)
+    trained = trainer.run()
+    old, new = initial.state_dict(), load_checkpoint(tmp_path / "last").state_dict()
     assert all(torch.equal(new[k], v) for k, v in trained.state_dict().items())
     for key, value in old.items():
         if key.startswith("normalize."):
             assert torch.equal(new[key], value)
-        elif key.startswith("coverage.") and key.endswith("_low"):
+        elif key.startswith("training_range.") and key.endswith("_low"):
             assert (new[key] <= value).all()
-        elif key.startswith("coverage.") and key.endswith(("_high", "speed")):
+        elif key.startswith("training_range.") and key.endswith(("_high", "speed")):
             assert (new[key] >= value).all()
-    moved = [k for k in old if k.startswith("network.") and not old[k].equal(new[k])]
-    assert moved
-    own = NeRD(scene, start.config)
+    assert any(not old[k].equal(new[k]) for k in old if k.startswith("network."))
+    own = NeRD(scene, NO_PREDICTIONS, initial.config)
     own.load_state_dict(old)
     cover(own, data)
-    assert torch.equal(new["coverage.center"], own.coverage.center)
+    scores = [k for k in old if k.startswith("ood.")]
+    assert scores and all(torch.equal(new[k], own.state_dict()[k]) for k in scores)
     card = read_json(tmp_path / "last" / "card.json")
-    assert card["training"]["init_from"] == fingerprint(start)
+    assert card["training"]["init_from"] == fingerprint(initial)
 
 
-@pytest.mark.parametrize("name", [n for n in SCENES if load_scene(n).foresees_forces])
-def test_features_of_another_width_are_refused_in_a_sentence(name, generator):
-    scene = load_scene(name)
-    start = random_model(scene.foreseeing(False), generator)
-    begin_from(start, start.scene, "transformer-2x64")
-    sizes = start.tokens.size, NeRD(scene, start.config).tokens.size
-    if sizes[0] != sizes[1]:
-        with pytest.raises(ValueError, match=f"{sizes[1]} features.*got {sizes[0]}"):
-            begin_from(start, scene, "transformer-2x64")
+def test_features_of_another_width_are_refused_in_a_sentence(generator):
+    scene = load_scene("ant")
+    initial = random_model(scene, generator, "mlp-1x16")
+    assert begin_from(initial, scene, MLP).token_size == initial.token_size
+    with pytest.raises(ValueError, match=f"inputs and .*got {initial.token_size} and"):
+        begin_from(initial, scene, replace(MLP, predicted_force=True))
 
 
-@pytest.mark.parametrize("name", [n for n in SCENES if load_scene(n).terrain])
-def test_the_scene_is_used_as_it_is_given(name, tmp_path, generator):
-    """Features of other values but the same widths: weights and statistics are kept."""
-    known = load_scene(name)
-    known, scene = (known.foreseeing(known.foresees_forces, x) for x in (False, True))
-    start = random_model(known, generator)
-    save_checkpoint(start, tmp_path, make_card(start))
-    start = from_pretrained(tmp_path, scene)
-    assert not start.scene.foresees_free_motion
-    model = begin_from(start, scene, "transformer-2x64")
-    assert model.scene is scene and scene.foresees_free_motion
-    for part in ("network", "normalize"):
-        mine, theirs = (getattr(m, part).state_dict() for m in (model, start))
-        assert all(torch.equal(mine[k], v) for k, v in theirs.items())
-    assert not model.coverage.is_fitted
+def test_other_networks_and_kinds_are_refused(generator):
+    initial = random_model(CARTPOLE, generator, "mlp-4x64")
+    with pytest.raises(ValueError, match="start from, mlp-4x64, got transformer-2x64"):
+        begin_from(initial, CARTPOLE, CONFIG)
+    with pytest.raises(ValueError, match="expected a hybrid model.*got a learned one"):
+        step = replace(CONFIG, network="mlp-4x64", step="unconstrained")
+        begin_from(initial, CARTPOLE, step)
+    hybrid = hybrid_model(CARTPOLE, None, generator)
+    name = next(name for name, config in NETWORKS.items() if config == hybrid.config)
+    with pytest.raises(ValueError, match="expected a learned model.*got a hybrid one"):
+        begin_from(hybrid, CARTPOLE, replace(CONFIG, network=name))
 
 
-def test_other_networks_are_refused(generator):
-    start = random_model(CARTPOLE, generator, "mlp-4x64")
-    with pytest.raises(
-        ValueError, match="network.*start from, mlp-4x64, got transformer-2x64"
-    ):
-        begin_from(start, CARTPOLE, "transformer-2x64")
-    cube = load_scene("cube_real")
-    residual = ResidualNeRD(cube, ResidualConfig())
-    with pytest.raises(ValueError, match="start from, ResidualConfig.*got mlp-4x64"):
-        begin_from(residual, cube, "mlp-4x64")
-
-
-def test_images_need_statistics_that_they_share(generator):
-    scene, config = load_scene("ant"), NETWORKS["mlp-1x16"]
+def test_symmetry_needs_statistics_that_images_share(generator):
+    scene, network = load_scene("ant"), NETWORKS["mlp-1x16"]
     data = simulate(scene, 64, 4, generator)
     data = data[is_sound(data)]
     symmetry, stats = Symmetry.of(scene, data), data_stats(scene, data)
-    shared = NeRD(scene, config, symmetry.complete(stats))
-    begin_from(shared, scene, "mlp-1x16", symmetry)
-    alone = NeRD(scene, config, stats)
-    begin_from(alone, scene, "mlp-1x16")
+    shared = NeRD(scene, NO_PREDICTIONS, network, symmetry.complete(stats))
+    begin_from(shared, scene, MLP, symmetry)
+    alone = NeRD(scene, NO_PREDICTIONS, network, stats)
+    begin_from(alone, scene, MLP)
     with pytest.raises(ValueError, match="trained on symmetry images"):
-        begin_from(alone, scene, "mlp-1x16", symmetry)
+        begin_from(alone, scene, MLP, symmetry)
 
 
-def test_the_shipped_ant_can_be_shown_images(generator):
-    scene = load_scene("ant")
-    model, data = from_pretrained("ant-mlp", scene), simulate(scene, 16, 4, generator)
-    begin_from(model, model.scene, "mlp-4x160", Symmetry.of(model.scene, data))
+ARGS = (
+    "train cartpole --quiet --batch-size 4 --rollout-batch-size 4 --steps 3 "
+    "--rollout-steps 1 --sequence-length 2 --rollout-length 2 --validate-every 4 "
+    "--logger csv"
+).split()
 
 
-ARGS = [
-    "train",
-    "cartpole",
-    "--quiet",
-    "--batch-size",
-    "4",
-    "--rollout-batch-size",
-    "4",
-]
-ARGS += [
-    "--steps",
-    "3",
-    "--rollout-steps",
-    "1",
-    "--sequence-length",
-    "2",
-    "--logger",
-    "csv",
-]
-ARGS += ["--rollout-length", "2", "--validate-every", "4"]
-
-
-def test_the_command_learns_on_from_several_sets(tmp_path, monkeypatch, capsys):
+def test_the_command_continues_from_several_data_sets(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(validation, "ROLLOUTS", 2)
     for out, seed in (("a", "1"), ("b", "2")):

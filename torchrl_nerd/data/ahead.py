@@ -1,4 +1,4 @@
-"""``map`` that is one call ahead of whoever takes its results."""
+"""``map`` that computes the next result in a thread."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,11 +11,10 @@ Result = TypeVar("Result")
 def ahead(
     function: Callable[[Item], Result], items: Iterable[Item]
 ) -> Iterator[Result]:
-    """What ``map`` gives, in its order: a thread makes the next result meanwhile.
+    """Results of ``map`` in its order; a thread computes the next one meanwhile.
 
-    Calls follow one another in that thread. A result waits at most until the one after it
-    is made, so that memory holds two. What a call raises is raised where its result would
-    have been taken.
+    Memory holds two results at most. What a call raises is raised where its result is
+    taken.
 
     Examples:
         >>> list(ahead(abs, [-1, 2, -3]))

@@ -1,4 +1,4 @@
-"""Training data along the way of a policy that explores."""
+"""Training data from trajectories of an exploring policy."""
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -24,17 +24,16 @@ def policy_data(
 ) -> TensorDict:
     """Trajectories ``[rows, steps]`` of a policy in MuJoCo, diverged ones included.
 
-    They start as episodes do and go on where an episode would end: a fallen robot is as
-    good a sample as a walking one. Actions are the policy's mean plus normal noise, whose
-    standard deviation is U(0, ``noise``) for each row, clipped to [-1, 1]: some rows show
-    what the policy does, others what lies beside it.
+    They start with the task's resets and continue where an episode would end. Actions are
+    the policy's mean plus normal noise, clipped to [-1, 1]; the noise of each trajectory
+    has a standard deviation from U(0, ``noise``).
 
     Args:
-        task: its starts, observations and controller.
+        task: its resets, observations and controller.
         actor: any TorchRL policy.
         rows: trajectories.
         steps: control steps of each.
-        generator: of starts and noise.
+        generator: of initial states and noise.
         noise: largest standard deviation of the noise, in units of the action.
     """
     scene, controller = task.scene, task.controller

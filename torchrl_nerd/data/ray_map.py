@@ -1,4 +1,4 @@
-"""``map`` over the workers of a Ray cluster, where a lost worker costs only time."""
+"""``map`` on the workers of a Ray cluster that survives the loss of workers."""
 
 import logging
 import os
@@ -16,22 +16,21 @@ RETRIES = 10  # of one call, each on another worker
 def ray_map(
     function: Callable[[Item], Result], items: Iterable[Item], address: str = "local"
 ) -> Iterator[Result]:
-    """What ``map`` gives, in its order; each call runs on one processor of the cluster.
+    """Results of ``map`` in its order; each call runs on one processor of the cluster.
 
-    A call whose worker or node is lost is made again elsewhere: its result is the same if
-    it depends on its item alone. At most one call more than the cluster has processors is
-    under way or waits to be taken, so that memory stays bounded.
+    A call whose worker or node is lost is repeated on another one. At most one call more
+    than the cluster has processors is running or finished, so memory stays bounded.
 
     Args:
-        function: what travels to the workers, by cloudpickle.
-        items: its arguments, one a call.
+        function: sent to the workers by cloudpickle; its result depends on its item alone.
+        items: its arguments, one per call.
         address: ``HOST:PORT`` of a cluster, ``auto`` to find it, or ``local`` for a new one
-            on this machine. A connection that is open already is used as it is.
+            on this machine. An open connection is used as it is.
 
     Raises:
         ModuleNotFoundError: no Ray.
         ConnectionError: no cluster at that address.
-        RuntimeError: a call lost every worker that tried it.
+        RuntimeError: every worker that tried a call was lost.
     """
     if find_spec("ray") is None:
         raise ModuleNotFoundError(
@@ -65,7 +64,7 @@ def _results(
 
 
 def _call(function: Callable[[Item], Result], item: Item) -> Result:
-    os.environ.setdefault("NERD_THREADS", "1")  # the other processors have other calls
+    os.environ.setdefault("NERD_THREADS", "1")  # other processors run other calls
     return function(item)
 
 
@@ -76,6 +75,6 @@ def _take(ray: Any, reference: Any) -> Any:
         raise error.cause from None
     except ray.exceptions.RayError as error:
         raise RuntimeError(
-            f"Ray lost every worker that tried, {RETRIES + 1} in all: "
-            f"{type(error).__name__}; what was drawn before is kept"
+            f"Ray lost all {RETRIES + 1} workers that tried a chunk "
+            f"({type(error).__name__}); earlier chunks are kept"
         ) from None

@@ -1,4 +1,4 @@
-"""Training starts beside the ranges: task resets, settled and perturbed states."""
+"""Initial states of training data: task resets, settled and perturbed rest states."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -17,10 +17,10 @@ from torchrl_nerd.tasks import Task
 
 @dataclass(frozen=True)
 class TaskResets:
-    """Starts of a task's episodes: on their feet, where there are any.
+    """Initial states of a task's episodes.
 
-    Without the task's grounds, which may be those that a model is tested on: where the
-    ground varies, the scene's sampling draws it.
+    The task's terrain is not used, since models may be tested on it: where the terrain
+    varies, the scene's sampling draws it.
     """
 
     task: Task
@@ -35,19 +35,19 @@ class TaskResets:
 
 @dataclass(frozen=True)
 class SettledStates:
-    """Where a robot left alone comes to rest: the ends of passive trajectories.
+    """States in which the robot has come to rest: the ends of passive trajectories.
 
     | field | meaning |
     |---|---|
-    | ``scene`` | the robot; its sampling says where the trajectories start |
-    | ``seconds`` | how long they are |
+    | ``scene`` | the robot, whose sampling gives the initial states |
+    | ``seconds`` | length of the trajectories |
     """
 
     scene: Scene
     seconds: float = 3.0
 
     def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
-        """See `Starts`; rows that the solver gives up on keep their first state."""
+        """See `Starts`; a trajectory that diverges gives its initial state."""
         start, _ = self.scene.sample_initial(rows, generator)
         terrain = start.pop(TERRAIN, None)
         first = TensorDict(start, [rows])
@@ -64,27 +64,27 @@ class SettledStates:
 
 @dataclass(frozen=True)
 class PerturbedRestStates:
-    """Fallen robots, stopped and pushed a little: what a model must know to come to rest.
+    """Settled states with small random velocities and displacements.
 
-    Without them nothing near rest is in the data but rest itself, and whatever small
-    error a model makes there may grow. Stopped, since what lies on a steep slope slides on
-    and on: how it begins to would not be in the data. Sizes are log-uniform over four
-    decades, that of the velocity and that of the displacement each by itself: a cube that
-    slides fast lies as deep in the ground as one at rest.
+    With them the data cover states near rest, where a model's small errors may otherwise
+    grow. Velocities of the settled states are dropped, so that the data show how sliding
+    begins on a steep slope. Sizes of velocity and displacement are log-uniform over four
+    decades, independent of each other: a sliding cube lies as deep in the ground as a
+    resting one.
 
     | field | meaning |
     |---|---|
-    | ``settled`` | where they lie |
-    | ``least`` | smallest push as a share of the largest: 1 m/s, 3 rad/s, 1 cm, 0.03 rad |
+    | ``settled`` | the rest states |
+    | ``min_scale`` | smallest over largest size, which is 1 m/s, 3 rad/s, 1 cm, 0.03 rad |
     """
 
     settled: SettledStates
-    least: float = 1e-4
+    min_scale: float = 1e-4
 
     def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
         """See `Starts`."""
         start, scene = self.settled(rows, generator), self.settled.scene
-        size = log_uniform(self.least, 1.0, 2 * rows, generator).reshape(2, rows, 1)
+        size = log_uniform(self.min_scale, 1.0, 2 * rows, generator).reshape(2, rows, 1)
         shape = (2, rows, scene.model.nv)
         push = size * torch.randn(shape, dtype=torch.float64, generator=generator)
         unit = torch.full((scene.model.nv,), 3.0, dtype=torch.float64)

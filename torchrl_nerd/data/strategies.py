@@ -1,4 +1,4 @@
-"""Ways to cover the states that a robot meets, by name; see docs/training.md."""
+"""Sampling strategies of training data, by name; see docs/training.md."""
 
 from dataclasses import replace
 from functools import partial
@@ -17,8 +17,8 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
 MIN_TORQUE_SCALE = 0.01  # of the largest torque
-LONGEST = 1.0  # s that a torque keeps; the shortest is one control step
-PASSIVE = 0.1  # share of trajectories without torque
+MAX_CORRELATION_TIME = 1.0  # s; the shortest is one control step
+ZERO_TORQUE_FRACTION = 0.1
 
 
 def resample(scene: Scene, **ranges: Any) -> Scene:
@@ -27,7 +27,7 @@ def resample(scene: Scene, **ranges: Any) -> Scene:
 
 
 def mix(*draws: Draw) -> Draw:
-    """Equal shares of each, as nearly as rows can be shared out."""
+    """Equal shares of each, as nearly as the number of trajectories allows."""
 
     def draw(rows: int, steps: int, generator: Generator) -> TensorDict:
         ends = [rows * (i + 1) // len(draws) for i in range(len(draws))]
@@ -45,40 +45,39 @@ def mix(*draws: Draw) -> Draw:
 def strategies(
     scene: Scene, task: Task, explorer: Actor | None = None
 ) -> dict[str, Draw]:
-    """What can be done with a scene, by name.
+    """The sampling strategies of a scene, by name.
 
-    | name | what |
+    | name | initial states and torques |
     |---|---|
-    | ``uniform`` | the ranges alone: every row in full motion, torques anew each step |
-    | ``shares`` | the scene's own sampling, with passive and quiet rows |
+    | ``uniform`` | uniform in the ranges, new torques in every step |
+    | ``shares`` | the scene's own sampling, with zero-torque and low-torque trajectories |
     | ``scales`` | torque scales log-uniform over two decades |
-    | ``correlated`` | torques that keep for one control step to a second |
-    | ``starts`` | equal parts of ``shares``, standing and fallen starts |
-    | ``level`` | two parts of ``shares``, one of it over grounds that are hit head-on |
-    | ``resting`` | two parts of ``shares``, one of the fallen, stopped and pushed |
-    | ``policy`` | the way of an exploring policy |
-    | ``mixed`` | equal parts of ranges, standing, fallen and policy |
+    | ``correlated`` | correlated torques, from one control step to a second |
+    | ``starts`` | equal parts of ``shares``, task resets and settled states |
+    | ``level`` | two parts of ``shares``, one of it over ground that is hit vertically |
+    | ``resting`` | two parts of ``shares``, one of perturbed rest states |
+    | ``policy`` | trajectories of an exploring policy |
+    | ``mixed`` | equal parts of ranges, task resets, settled states and policy |
 
-    All but the policy's part of ``mixed`` have scales and correlation.
-    Scenes without such grounds have no ``level``.
-    Scenes whose torques follow the state have no correlation; without an explorer there is
-    no ``policy``, nor a part of it in ``mixed``.
+    All parts of ``mixed`` but the policy's have torque scales and correlation. Scenes
+    without such ground have no ``level``. Scenes whose torques follow the state have no
+    correlation. Without an explorer there is no ``policy`` and no part of it in ``mixed``.
 
     Args:
         scene: the robot.
-        task: of the same scene; says what standing is.
+        task: of the same scene; its resets are among the initial states.
         explorer: the policy that explores.
     """
-    calm = {
+    scaled = {
         "min_torque_scale": MIN_TORQUE_SCALE,
-        "zero_torque_fraction": PASSIVE,
+        "zero_torque_fraction": ZERO_TORQUE_FRACTION,
         "low_torque_fraction": 0.0,
     }
-    held = {"correlation_time": (scene.control_step, LONGEST)}
+    held = {"correlation_time": (scene.control_step, MAX_CORRELATION_TIME)}
     can_hold = scene.sampling.drive is None
-    standing, fallen = {"starts": TaskResets(task)}, {"starts": SettledStates(scene)}
+    resets, settled = {"starts": TaskResets(task)}, {"starts": SettledStates(scene)}
     perturbed = PerturbedRestStates(SettledStates(scene))
-    both = calm | held if can_hold else calm
+    both = scaled | held if can_hold else scaled
 
     def along(**ranges: Any) -> Draw:
         return partial(simulate, resample(scene, **ranges))
@@ -87,13 +86,13 @@ def strategies(
     found = {
         "uniform": along(zero_torque_fraction=0.0, low_torque_fraction=0.0),
         "shares": along(),
-        "scales": along(**calm),
+        "scales": along(**scaled),
         "correlated": along(**held) if can_hold else None,
-        "starts": mix(along(), along(**standing), along(**fallen)),
+        "starts": mix(along(), along(**resets), along(**settled)),
         "level": mix(along(), along(), along(ground=level)) if level else None,
         "resting": mix(along(), along(), along(starts=perturbed)),
     }
-    mixed = [along(**both), along(**both, **standing), along(**both, **fallen)]
+    mixed = [along(**both), along(**both, **resets), along(**both, **settled)]
     if explorer is not None:
         found["policy"] = partial(policy_data, task, explorer)
         mixed.append(found["policy"])

@@ -10,12 +10,12 @@ from torchrl_nerd.training.loggers import close
 
 
 class TrainingLog:
-    """Appends one row of metrics per validation to ``log.csv``.
+    """Appends the metrics of each validation to ``log.csv``, which is never cut.
 
     Args:
         folder: of the run.
-        step: rows after it, left by a run that was killed, are dropped.
-        logger: takes the same metrics; see `open_logger`.
+        step: rows after this update, written by a run that was killed, are dropped.
+        logger: gets the same metrics; see `open_logger`.
     """
 
     def __init__(self, folder: Path, step: int, logger: Logger | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Where metrics of a training run go beside its table: one of TorchRL's loggers."""
+"""Loggers of a training besides its table: TorchRL's, so that a resumed run continues."""
 
 import os
 from importlib.util import find_spec
@@ -13,8 +13,8 @@ LoggerName = Literal["tensorboard", "wandb", "mlflow", "csv"]
 PROJECT = "torchrl_nerd"
 
 
-class Board(TensorboardLogger):
-    """TensorBoard files that forget what a killed run wrote after ``step``."""
+class ResumableTensorboardLogger(TensorboardLogger):
+    """TorchRL's logger, which drops what a killed run wrote from ``step`` on."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.step = step
@@ -29,7 +29,7 @@ class Board(TensorboardLogger):
 def open_logger(
     name: LoggerName, folder: Path, step: int, settings: dict[str, Any]
 ) -> Logger | None:
-    """The logger of a run in ``folder`` that goes on at ``step``.
+    """The logger of a run; None for the table alone.
 
     | name | where metrics go |
     |---|---|
@@ -38,11 +38,17 @@ def open_logger(
     | ``mlflow`` | ``MLFLOW_TRACKING_URI``; without it, ``mlflow.db`` in the folder |
     | ``csv`` | nowhere else |
 
-    Weights & Biases and MLflow begin another run where training goes on.
+    Weights & Biases and MLflow begin another run where training resumes.
+
+    Args:
+        name: of the logger.
+        folder: of the run.
+        step: update at which the run begins or resumes.
+        settings: of the training, which Weights & Biases and MLflow show.
 
     Raises:
         ModuleNotFoundError: Weights & Biases or MLflow is not installed.
-        RuntimeError: Weights & Biases does not know who you are.
+        RuntimeError: Weights & Biases has no key.
     """
     if name == "csv" or (name == "tensorboard" and find_spec("tensorboard") is None):
         return None
@@ -52,41 +58,33 @@ def open_logger(
             f"pip install 'torchrl-nerd[{name}]'"
         )
     if name == "tensorboard":
-        return Board(folder, step)
-    run = folder.resolve().name
-    if name == "wandb":
-        return _open_wandb(run, folder, settings)
-    return _open_mlflow(run, folder.resolve(), settings)
+        return ResumableTensorboardLogger(folder, step)
+    return (_open_wandb if name == "wandb" else _open_mlflow)(
+        folder.resolve(), settings
+    )
 
 
-def _open_wandb(run: str, folder: Path, settings: dict[str, Any]) -> WandbLogger:
+def _open_wandb(folder: Path, settings: dict[str, Any]) -> WandbLogger:
     from wandb.errors import UsageError
 
+    how = {"project": PROJECT, "config": settings, "log_env_packages": False}
     try:
-        return WandbLogger(
-            run,
-            save_dir=str(folder),
-            project=PROJECT,
-            config=settings,
-            log_env_packages=False,
-        )
+        return WandbLogger(folder.name, save_dir=str(folder), **how)
     except UsageError as error:
         raise RuntimeError(
             f"Weights & Biases: {error} WANDB_MODE=offline needs no key."
         ) from None
 
 
-def _open_mlflow(run: str, folder: Path, settings: dict[str, Any]) -> MLFlowLogger:
+def _open_mlflow(folder: Path, settings: dict[str, Any]) -> MLFlowLogger:
     import mlflow
 
     store = os.environ.get("MLFLOW_TRACKING_URI")
-    logger = MLFlowLogger(
-        PROJECT,
-        store or f"sqlite:///{folder}/mlflow.db",
-        artifact_location=None if store else (folder / "mlflow").as_uri(),
-    )
-    mlflow.set_tag("mlflow.runName", run)
-    mlflow.log_params(settings)  # the logger's own way needs omegaconf
+    place = None if store else (folder / "mlflow").as_uri()
+    store = store or f"sqlite:///{folder}/mlflow.db"
+    logger = MLFlowLogger(PROJECT, store, artifact_location=place)
+    mlflow.set_tag("mlflow.runName", folder.name)
+    mlflow.log_params(settings)  # the logger's own method needs omegaconf
     return logger
 
 

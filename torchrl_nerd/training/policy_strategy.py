@@ -1,4 +1,4 @@
-"""Training data along the way of a policy that was saved."""
+"""Training data from trajectories of a saved policy."""
 
 import hashlib
 from functools import partial
@@ -19,7 +19,7 @@ from torchrl_nerd.settings import expect_at_least
 def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, Draw]:
     """A saved policy as a strategy for `generate`: its name, and what it draws.
 
-    The name tells weights and noise, so that no data set mixes two policies.
+    The name contains a hash of the weights and the noise: no data set mixes two policies.
 
     Args:
         scene: the robot.

@@ -1,8 +1,8 @@
-"""Several processes that train one model: every rank does its share of each batch.
+"""Data-parallel training: every rank computes its share of each batch.
 
-All ranks draw the same batch, each computes on every n-th row of it, and gradients are
-averaged, so that the result is that of one process up to rounding. Statistics come from
-shares of the data, too, and are merged exactly. Outside `torchrun` there is one rank.
+All ranks draw the same batch, each takes every n-th sample of it, and gradients are
+averaged, so the result is that of one process up to rounding. Statistics of the data are
+computed in shares, too, and merged exactly. Without `torchrun` there is one rank.
 """
 
 import os
@@ -15,7 +15,7 @@ from torchrl_nerd.transforms import Stats
 
 
 def join(device: torch.device) -> None:
-    """Meet the other processes that `torchrun` started; nothing to do without it."""
+    """Connect the processes that `torchrun` started; does nothing without it."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not distributed.is_initialized():
         backend = "nccl" if device.type == "cuda" else "gloo"
         if backend == "nccl":
@@ -24,40 +24,40 @@ def join(device: torch.device) -> None:
 
 
 def leave() -> None:
-    """Wait for the others, then part."""
+    """Wait for all ranks, then disconnect."""
     if distributed.is_initialized():
         distributed.barrier()
         distributed.destroy_process_group()
 
 
 def rank() -> int:
-    """Number of this process, from 0; 0 writes files."""
+    """Number of this process, from 0; rank 0 writes files."""
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
 def world() -> int:
-    """How many processes there are."""
+    """Number of processes."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
 def wait() -> None:
-    """Until all ranks are here."""
+    """Wait until all ranks call this."""
     if distributed.is_initialized():
         distributed.barrier()
 
 
 def share(x: Tensor) -> Tensor:
-    """This rank's rows of a batch ``(rows, ...)``."""
+    """This rank's samples of a batch ``(n, ...)``."""
     return x[rank() :: world()]
 
 
-def expect_shares(**rows: int) -> None:
-    """Refuse batches that the ranks cannot share equally.
+def expect_shares(**sizes: int) -> None:
+    """Refuse batch sizes that the ranks cannot share equally.
 
     Raises:
-        ValueError: naming the number of rows.
+        ValueError: naming the batch size.
     """
-    for name, count in rows.items():
+    for name, count in sizes.items():
         if count % world():
             raise ValueError(
                 f"expected {name} to be a multiple of the {world()} ranks, got {count}"

@@ -1,9 +1,8 @@
-"""The robot's own symmetries: what it does here, its image does there.
+"""Symmetries of a robot: isometries under which its motion is equivariant.
 
-An ant turned by a quarter is the same ant with its legs renumbered; its mirror image moves
-as its mirrored motors say. Each training sample is as good as all of its images. Such
-isometries are searched among the 48 that map the axes of the base frame to themselves, by
-where they put joints and contact points, and kept if MuJoCo agrees.
+An ant turned by 90 degrees is the same ant with its legs renumbered. Candidates are the 48
+isometries that map the axes of the base frame to themselves. One is kept if it maps joints
+to joints and MuJoCo's step of the image is the image of its step.
 """
 
 from collections.abc import Iterator
@@ -31,16 +30,16 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
 
-SAME_PLACE = 1e-6  # m, and share of a unit vector
-SAME_STEP = 1e-6  # relative: the solver's own tolerance is 1e-8
+PLACE_TOL = 1e-6  # m, and of a unit vector
+STEP_RTOL = 1e-6  # the solver's own tolerance is 1e-8
 TRIALS = 32
-DEEPEST = 0.01  # m that the trials reach into the ground
+MAX_DEPTH = 0.01  # m that the trials reach into the ground
 MIRROR = np.diag((1.0, -1.0, 1.0))  # of the world, where the base is mirrored
 
 
 @dataclass(frozen=True, eq=False)
 class Isometry:
-    """A map of states, torques and grounds onto others that move just so.
+    """A map of states, torques and terrain that commutes with the dynamics.
 
     | field | meaning |
     |---|---|
@@ -67,7 +66,7 @@ class Isometry:
         return bool(torch.equal(self.body, torch.eye(3).to(self.body)))
 
     def moves_like(self, other: "Isometry") -> bool:
-        """True where both map the robot's states alike, as across a plane it moves in."""
+        """Whether both map the robot's states alike, as across the plane it moves in."""
         same = torch.equal(self.sources, other.sources)
         same = same and torch.equal(self.signs, other.signs)
         return same and (
@@ -213,8 +212,8 @@ def _match_joints(
             along = float(axis @ data.xaxis[other])
             if (
                 model.jnt_type[other] == model.jnt_type[joint]
-                and np.linalg.norm(anchor - data.xanchor[other]) < SAME_PLACE
-                and abs(abs(along) - 1.0) < SAME_PLACE
+                and np.linalg.norm(anchor - data.xanchor[other]) < PLACE_TOL
+                and abs(abs(along) - 1.0) < PLACE_TOL
             ):
                 dof = model.jnt_dofadr[other]
                 sources[dof], signs[dof] = model.jnt_dofadr[joint], np.sign(along)
@@ -227,7 +226,7 @@ def _match_joints(
 def _solver_agrees(isometry: Isometry) -> bool:
     """Whether the step of the image is the image of the step, on the ground too."""
     scene = isometry.scene
-    here = states_in_contact(scene, TRIALS, DEEPEST)
+    here = states_in_contact(scene, TRIALS, MAX_DEPTH)
     there = isometry(here)
     dynamics = MujocoDynamics(scene, num_threads=1)
     ends = []
@@ -236,20 +235,20 @@ def _solver_agrees(isometry: Isometry) -> bool:
         ends.append(dynamics.step(start, start[JOINT_TORQUE], start.get(TERRAIN, None)))
     expected, found = isometry.qvel(ends[0][QVEL]), ends[1][QVEL]
     change = (expected - there[QVEL]).abs().amax()
-    return bool((expected - found).abs().amax() <= SAME_STEP * (1.0 + change))
+    return bool((expected - found).abs().amax() <= STEP_RTOL * (1.0 + change))
 
 
-def states_in_contact(scene: Scene, rows: int, deepest: float) -> TensorDict:
-    """States and torques, floating bases lowered into the ground, ``[rows]``.
+def states_in_contact(scene: Scene, rows: int, max_depth: float) -> TensorDict:
+    """States and torques ``[rows]``, floating bases placed in the ground.
 
     Args:
         scene: the robot.
         rows: how many.
-        deepest: m that the lowest contact point may reach below the ground.
+        max_depth: m that the lowest contact point may reach below the ground.
     """
     generator = Generator().manual_seed(0)
     state, scale = scene.sample_initial(rows, generator)
     draw = torch.rand(rows, dtype=torch.float64, generator=generator)
-    scene.place_on_terrain(state, -deepest * draw)
+    scene.place_on_terrain(state, -max_depth * draw)
     torque = sample_torque(scene.sampling, scale, 1, generator)
     return TensorDict(state, [rows]).set(JOINT_TORQUE, torque[:, 0])
