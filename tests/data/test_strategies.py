@@ -27,7 +27,7 @@ from torchrl_nerd.data.strategies import mix, resample, strategies
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import GroundTruthEnv
 from torchrl_nerd.envs.frame_stack import append_frame
-from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.files import read_json
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
@@ -267,7 +267,7 @@ def test_a_folder_holds_one_strategy(tmp_path, seed):
     generate(scene, config, tmp_path, quiet=True, strategy=("calm", calm))
 
 
-def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
+def test_cards_say_what_is_set(scene, tmp_path, seed):
     config, ranges = DataConfig(3, 2, seed), scene.sampling.ranges()
     generate(scene, config, tmp_path, quiet=True)
     card, expected = read_json(tmp_path / CARD), json.loads(json.dumps(ranges))
@@ -277,14 +277,6 @@ def test_cards_say_what_is_set_and_older_ones_still_do(scene, tmp_path, seed):
     )
     assert {"torque", "zero_torque_fraction"} <= set(ranges)
     assert not {"ground", "drive", "starts"} & set(ranges)
-    card["ranges"] |= {
-        "ground": None,
-        "drive": None,
-        "clearance": ranges.get("clearance"),
-    }
-    del card["strategy"]
-    write_json(tmp_path / CARD, card)
-    generate(scene, config, tmp_path, quiet=True)  # as it was written by older versions
 
 
 def test_nudged_robots_are_stopped_where_they_fell_and_pushed(scene, generator):

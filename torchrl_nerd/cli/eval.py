@@ -112,7 +112,11 @@ class Eval(MeasuringCommand):
         }
 
     def protocol(self, scene: Scene) -> EvaluationProtocol:
-        """The scene's own, or the one on unseen terrain."""
+        """The scene's own, or the one on unseen terrain.
+
+        Raises:
+            ValueError: unseen terrain of a robot that has none.
+        """
         if not self.unseen_terrain:
             return protocol_of(scene)
         preset = PRESETS.get(self.scene)

@@ -57,7 +57,11 @@ class Play(DeviceCommand):
         return self.out or Path("runs") / f"{folder_name(self.task)}.gif"
 
     def run(self) -> dict[str, Any]:
-        """Roll out, write the video and return what happened."""
+        """Roll out, write the video and return what happened.
+
+        Raises:
+            ValueError: in one sentence, an option out of range or no such task or model.
+        """
         task, out = make_task(self.task), self.figure
         check_video(out)
         if not 0.0 < self.slowdown < float("inf"):
