@@ -64,8 +64,7 @@ class Trainer:
             `begin_from`. The training range covers its data and these.
 
     Raises:
-        ValueError: the folder cannot be written or holds a run of another configuration,
-            trajectories are too short, or ``init_from`` does not fit.
+        ValueError: a folder of another run, short trajectories, or a misfit ``init_from``.
     """
 
     def __init__(
