@@ -44,19 +44,20 @@ $(STAMP):
 	$(PIP) --no-deps "$(DM_CONTROL)"
 	@rm -f $(VENV)/.installed-* && touch $@
 
-# Threads that soon fall asleep: beside other work the longer wait of GNU's OpenMP takes
+# Threads that soon fall asleep: on a loaded machine the longer wait of GNU's OpenMP takes
 # up to thirty times as long, see docs/howto/machine.md.
-demo: $(STAMP) ## learn a swing-up in learned dynamics, check it in true physics
+demo: $(STAMP) ## learn a swing-up in learned dynamics, check it in MuJoCo
 	GOMP_SPINCOUNT=1000 $(PY) examples/ppo.py
 
 test: check ## lint, types and the test suite
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(ARGS)
 
-check: $(STAMP) ## lint, format, types, imports and docstrings alone
+check: $(STAMP) ## lint, format, types, imports, docstrings and words
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m basedpyright
 	$(PY) tests/tools/check_source.py
+	$(PY) tests/tools/check_words.py
 
 size: $(STAMP) ## lines and comments of the package, and files that are too long
 	$(PY) tests/tools/size.py

@@ -1,9 +1,9 @@
-"""Whether a model errs the same far from the origin and whichever way it faces.
+"""Whether a model is equally accurate far from the origin and whichever way it faces.
 
     python experiments/anywhere.py ant
 
 The starts of the scene's protocol, and the same ones turned about the vertical and moved
-level, each in learned and in true dynamics; prints the largest relative difference of the
+level, each in learned and in MuJoCo; prints the largest relative difference of the
 two error curves (mean over rows, step by step).
 """
 
@@ -48,7 +48,7 @@ class Options:
     rows: int = 256
     seed: int = 500
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def moved(scene: Scene, start: TensorDict, yaw: float, shift: Tensor) -> TensorDict:
@@ -89,14 +89,14 @@ def main(options: Options) -> dict[str, float]:
     there = moved(scene, start, yaw, options.distance * shift)
     random = case in protocol.random_actions
     curves = [error_curves(source, learned, x, steps, random) for x in (start, there)]
-    figures = {}
+    results = {}
     for name, here in curves[0].items():
         apart = (curves[1][name] - here).abs() / here.clamp_min(FLOOR)
-        figures[name] = float(apart.max())
-        print(f"{name:<18}{steps} steps: {figures[name]:.1e} relative")
+        results[name] = float(apart.max())
+        print(f"{name:<18}{steps} steps: {results[name]:.1e} relative")
     if options.json is not None:
-        write_json(options.json, {"scene": scene.name, "relative": figures})
-    return figures
+        write_json(options.json, {"scene": scene.name, "relative": results})
+    return results
 
 
 if __name__ == "__main__":

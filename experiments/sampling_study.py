@@ -70,7 +70,7 @@ class Options:
     """Of torch; its own choice by default."""
     out: Path = Path("runs/sampling_study")
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def learned_policy(
@@ -124,33 +124,35 @@ class Study:
     def measure(self, model: Path, name: str, seed: int) -> dict[str, Any]:
         """Errors by test, and returns."""
         options, task = self.options, make_task(self.task_id)
-        figures: dict[str, Any] = {"strategy": name, "seed": seed}
+        results: dict[str, Any] = {"strategy": name, "seed": seed}
         card = read_json(model.parents[1] / "data" / CARD)
-        figures |= {"trajectories": card["trajectories"], "dropped": card["dropped"]}
+        results |= {"trajectories": card["trajectories"], "dropped": card["dropped"]}
         for test, is_random in (("passive", False), ("random", True)):
             learned = dynamics_of(load_checkpoint(model, task.scene))
-            truth = MujocoDynamics(task.scene)
+            ground_truth = MujocoDynamics(task.scene)
             sizes = ([options.horizon], options.rows, TEST_SEED)
             errors = passive_errors(
-                task, learned, truth, *sizes, random_actions=is_random
+                task, learned, ground_truth, *sizes, random_actions=is_random
             )[options.horizon]
-            figures[test] = {k: asdict(v) for k, v in errors.items()}
+            results[test] = {k: asdict(v) for k, v in errors.items()}
         if self.policy is not None:
-            truth = self.returns(self.policy, "mujoco")
-            transfer = summarize(self.returns(self.policy, model), truth)
-            figures["transfer"] = asdict(transfer)
+            ground_truth = self.returns(self.policy, "mujoco")
+            transfer = summarize(self.returns(self.policy, model), ground_truth)
+            results["transfer"] = asdict(transfer)
         if options.learn_frames:
             where = (self.task_id, str(model), seed, options.learn_frames)
             learned_there = learned_policy(model.parent / "policy", *where)
-            there, truth = (self.returns(learned_there, d) for d in (model, "mujoco"))
-            figures["learned_there"] = asdict(summarize(there, truth)) | {
-                "true_mean": float(truth.mean())
+            there, ground_truth = (
+                self.returns(learned_there, d) for d in (model, "mujoco")
+            )
+            results["learned_there"] = asdict(summarize(there, ground_truth)) | {
+                "mujoco_mean": float(ground_truth.mean())
             }
-        return figures
+        return results
 
 
 def run(options: Options) -> Iterator[dict[str, Any]]:
-    """Figures of every strategy and seed; those already measured are read."""
+    """Results of every strategy and seed; those already measured are read."""
     if options.scene not in PRESETS:
         known = ", ".join(PRESETS)
         raise ValueError(f"expected a scene of {known}, got '{options.scene}'")
@@ -170,17 +172,17 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
     study = Study(options, folder, task_id, policy)
     for name in options.only or known:
         for seed in options.seeds:
-            path = folder / name / str(seed) / "figures.json"
+            path = folder / name / str(seed) / "results.json"
             settings = _settings(replace(options, policy=policy, explorer=explorer))
             if not path.exists() or read_json(path)["settings"] != settings:
                 model = study.model(name, known[name], seed)
-                figures = study.measure(model, name, seed)
-                write_json(path, figures | {"settings": settings})
+                results = study.measure(model, name, seed)
+                write_json(path, results | {"settings": settings})
             yield {k: v for k, v in read_json(path).items() if k != "settings"}
 
 
 def _settings(options: Options) -> dict[str, Any]:
-    """What figures depend on, as JSON knows it."""
+    """What results depend on, as JSON knows it."""
     aside = ("only", "seeds", "threads", "out", "json")
     found = {k: v for k, v in asdict(options).items() if k not in aside}
     return {k: str(v) if isinstance(v, Path) else v for k, v in found.items()}
@@ -219,12 +221,12 @@ def _number(error: float | None) -> str:
 
 
 def main(options: Options) -> None:
-    """Print a table and write the figures."""
+    """Print a table and write the results."""
     if options.threads:
         torch.set_num_threads(options.threads)
     rows = []
-    for figures in run(options):
-        rows.append(figures)
+    for results in run(options):
+        rows.append(results)
         if options.json is not None:
             machine = {"processor": platform.machine(), **_settings(options)}
             write_json(options.json, {"options": machine, "models": rows})

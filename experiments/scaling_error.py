@@ -50,17 +50,17 @@ class Options:
     seed: int = 0
     out: Path = Path("runs/scaling_error")
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def measure(
     data: TensorDict, network: str, trajectories: int, updates: int, options: Options
 ) -> dict[str, Any]:
-    """Figures of one training, made as far as they are not there."""
+    """Results of one training, made as far as they are not there."""
     name = f"{network}_{trajectories}_{updates}_{options.seed}"
     folder = options.out / options.scene / name
     settings = {"rows": options.rows, "horizons": list(options.horizons)}
-    path = folder / "figures.json"
+    path = folder / "results.json"
     if path.exists() and read_json(path)["settings"] == settings:
         return read_json(path)
     scene, preset = load_scene(options.scene), preset_of(options.scene)
@@ -85,7 +85,7 @@ def measure(
         options.rows,
         TEST_SEED,
     )
-    figures = {
+    results = {
         "network": network,
         "parameters": sum(w.numel() for w in model.network.parameters()),
         "transitions": some.numel(),
@@ -97,12 +97,12 @@ def measure(
         },
         "settings": settings,
     }
-    write_json(path, figures)
-    return figures
+    write_json(path, results)
+    return results
 
 
 def run(options: Options) -> Iterator[dict[str, Any]]:
-    """Figures of every size of data, every number of updates, every network."""
+    """Results of every size of data, every number of updates, every network."""
     largest, longest = max(options.trajectories), max(options.updates)
     generator = Generator().manual_seed(options.seed)
     data = simulate(load_scene(options.scene), largest, STEPS, generator)
@@ -116,20 +116,20 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def main(options: Options) -> list[dict[str, Any]]:
-    """Print and return the figures."""
+    """Print and return the results."""
     found = []
-    for figures in run(options):
-        found.append(figures)
+    for results in run(options):
+        found.append(results)
         errors = "  ".join(
             f"{name} {e['mean']:.4f} {e['unit']} at {horizon}"
-            for horizon, by_name in figures["errors"].items()
+            for horizon, by_name in results["errors"].items()
             for name, e in by_name.items()
         )
         sizes = (
-            f"{figures['parameters']:>9,} weights {figures['transitions']:>9,} steps "
-            f"{figures['updates']:>6,} updates {figures['seconds']:>5.0f} s"
+            f"{results['parameters']:>9,} weights {results['transitions']:>9,} steps "
+            f"{results['updates']:>6,} updates {results['seconds']:>5.0f} s"
         )
-        print(f"{figures['network']:<16}{sizes}  {errors}", flush=True)
+        print(f"{results['network']:<16}{sizes}  {errors}", flush=True)
         if options.json is not None:
             threads = torch.get_num_threads()
             write_json(options.json, {"threads": threads, "models": found})

@@ -123,7 +123,7 @@ def enliven(network: nn.Module, generator: Generator) -> nn.Module:
 
 @cache
 def little_data(scene: Scene) -> TensorDict:
-    """A little true motion of the scene."""
+    """A little MuJoCo motion of the scene."""
     data = simulate(scene, 64, 4, Generator().manual_seed(0))
     return data[is_sound(data)]
 

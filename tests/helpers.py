@@ -112,7 +112,7 @@ def random_transitions(scene: Scene, rows: int, generator: Generator) -> TensorD
         start = dict(zip((QPOS, QVEL), states, strict=True))
         scale = torch.ones(rows, 1, dtype=torch.float64)
     torque = sample_torque(scene.sampling, scale, 1, generator)[:, 0]
-    return true_step(scene, TensorDict(start, batch_size=[rows]), torque)
+    return mujoco_step(scene, TensorDict(start, batch_size=[rows]), torque)
 
 
 def with_points_in_order(scene: Scene, order: Tensor) -> Scene:
@@ -143,7 +143,7 @@ def in_ground(scene: Scene, rows: int, generator: Generator) -> TensorDict:
     return drawn
 
 
-def true_step(scene: Scene, state: TensorDict, torque: Tensor) -> TensorDict:
+def mujoco_step(scene: Scene, state: TensorDict, torque: Tensor) -> TensorDict:
     """``state`` with MuJoCo's next state and the torque under ``next``."""
     dynamics = MujocoDynamics(scene, num_threads=1)
     after = dynamics.step(state.select(QPOS, QVEL), torque, state.get(TERRAIN, None))
@@ -251,7 +251,7 @@ def random_tree(
 def simulated(
     scene: Scene, generator: Generator, trajectories: int = 6, states: int = 20
 ) -> Recording:
-    """A log of true motion under random torques."""
+    """A log of MuJoCo motion under random torques."""
     state, scale = scene.sample_initial(trajectories, generator)
     torque = sample_torque(scene.sampling, scale, states - 1, generator)
     start, dynamics = TensorDict(state, [trajectories]), MujocoDynamics(scene)

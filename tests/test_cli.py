@@ -1,4 +1,4 @@
-"""The ``nerd`` command: data to figures, and bad input in one sentence."""
+"""The ``nerd`` command: data to results, and bad input in one sentence."""
 
 import json
 import math
@@ -263,29 +263,29 @@ def test_no_traceback_reaches_the_terminal():
 
 
 @pytest.mark.parametrize("name", slow_but(QUICK, SCENES))
-def test_from_data_to_figures(name, tmp_path, seed, capsys):
+def test_from_data_to_results(name, tmp_path, seed, capsys):
     scene = load_scene(name)
     data, run, best = (str(tmp_path / x) for x in ("data", "run", "best"))
-    figures = {x: tmp_path / f"{x}.json" for x in ("data", "train", "eval")}
+    results = {x: tmp_path / f"{x}.json" for x in ("data", "train", "eval")}
     argv = ["data", name, "--out", data, "--trajectories", "300", "--steps", "20"]
-    argv += ["--seed", str(seed), "--quiet", "--json", str(figures["data"])]
+    argv += ["--seed", str(seed), "--quiet", "--json", str(results["data"])]
     assert main(argv) == 0
-    card = read(figures["data"])
+    card = read(results["data"])
     assert card["trajectories"] + card["dropped"] == 300
     assert card["config"] == {"trajectories": 300, "steps": 20, "seed": seed}
 
     argv = ["train", name, "--data", data, "--out", run, "--export", best, *TINY]
     argv += ["--steps", "40", "--rollout-steps", "2", "--validate-every", "42"]
-    assert main([*argv, "--json", str(figures["train"])]) == 0
-    assert read(figures["train"])["training"]["steps_done"] == 42
+    assert main([*argv, "--json", str(results["train"])]) == 0
+    assert read(results["train"])["training"]["steps_done"] == 42
     assert main(argv) == 0  # finished: nothing to do
 
     argv = ["eval", name, "--model", best, "--num-trajectories", "8", "--quiet"]
     argv += ["--seed", str(seed)]
     capsys.readouterr()
-    assert main([*argv, "--json", str(figures["eval"])]) == 0
+    assert main([*argv, "--json", str(results["eval"])]) == 0
     table = capsys.readouterr().out
-    record, protocol = read_results(figures["eval"]), PRESETS[name].protocol()
+    record, protocol = read_results(results["eval"]), PRESETS[name].protocol()
     line = shlex.split(record["command"])
     assert line[:2] == ["nerd", "eval"] and set(line[2:]) == set(argv[1:]) - {"--quiet"}
     content, expected = record["results"], {c.name for c in simulators(scene)}
@@ -322,7 +322,7 @@ def test_from_data_to_figures(name, tmp_path, seed, capsys):
 
 
 @pytest.mark.slow
-def test_a_third_party_robot_from_data_to_figures(tmp_path, seed, monkeypatch, capsys):
+def test_a_third_party_robot_from_data_to_results(tmp_path, seed, monkeypatch, capsys):
     """Default folders, whose names hold no slash; the preset and protocol of any robot."""
     monkeypatch.chdir(tmp_path)
     name, folder = "dm_control/cheetah-run", "dm_control-cheetah-run"
@@ -395,7 +395,7 @@ def test_progress_is_shown_apart_from_the_table(tmp_path, monkeypatch, capsys):
 
 
 def test_a_scene_is_explained(scene, tmp_path, capsys):
-    path = tmp_path / "figures.json"
+    path = tmp_path / "results.json"
     assert main(["explain", scene.name, "--json", str(path)]) == 0
     text, content = capsys.readouterr().out, read(path)
     assert text.startswith(f"{scene.name}: {content['token_width']} features a step")

@@ -45,11 +45,11 @@ def half_widths(tmp_path):
 
 @pytest.mark.parametrize("name", ["cube", "cube_real"])
 def test_recorded_logs_become_a_data_set(name, tmp_path, capsys):
-    out, figures = tmp_path / "set", tmp_path / "figures.json"
+    out, results = tmp_path / "set", tmp_path / "results.json"
     argv = ["data", name, "--from", str(EXCERPT), "--out", str(out)]
-    assert main([*argv, "--json", str(figures)]) == 0
+    assert main([*argv, "--json", str(results)]) == 0
     assert "free fall along z" in capsys.readouterr().out
-    assert json.loads(figures.read_text())["trajectories"] == 12
+    assert json.loads(results.read_text())["trajectories"] == 12
     assert (out / "data.json").exists()
 
 
@@ -62,7 +62,7 @@ def network(real_cube, tmp_path):
 
 @pytest.mark.parametrize("update", ["physics", "all"])
 def test_what_was_fine_tuned_is_measured(update, network, tmp_path, capsys):
-    out, figures = tmp_path / "run", tmp_path / "figures.json"
+    out, results = tmp_path / "run", tmp_path / "results.json"
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", str(out)]
     how = ["--evaluations", "1"]
     if update == "all":
@@ -79,8 +79,8 @@ def test_what_was_fine_tuned_is_measured(update, network, tmp_path, capsys):
     assert results["update"] == update and results["validation_position_m"] > 0
     assert ("parameters" in results) == (update == "physics")
     argv = ["eval", "cube", "--data", str(EXCERPT), "--model", str(out)]
-    assert main([*argv, "--json", str(figures), "--baselines"]) == 0
-    content = json.loads(figures.read_text())
+    assert main([*argv, "--json", str(results), "--baselines"]) == 0
+    content = json.loads(results.read_text())
     assert {"scene", "split", "windows", "against", "others"} <= set(content)
     assert {"no motion", "MuJoCo", "model"} <= set(content["others"])
     for key in ("position_error_m", "orientation_error_rad"):

@@ -7,6 +7,6 @@ def test_both_take_their_turns(capsys, seed):
     options = compiled_env.Options(("cartpole/swingup",), rows=2, rounds=1, seed=seed)
     compiled_env.main(options)
     *_, line = capsys.readouterr().out.splitlines()
-    name, *figures = line.split()
+    name, *results = line.split()
     assert name == "cartpole/swingup"
-    assert all(float(figure) > 0.0 for figure in figures)
+    assert all(float(figure) > 0.0 for figure in results)

@@ -14,11 +14,11 @@ TOOLS = Path(__file__).parent / "tools"
 @pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.slow)])
 def test_nothing_is_lost(kills, seed, tmp_path):
     command = [sys.executable, "kill_trials.py", "--kills", str(kills)]
-    figures = tmp_path / "kills.json"
+    results = tmp_path / "kills.json"
     subprocess.run(
-        [*command, "--seed", str(seed), "--json", figures], check=True, cwd=TOOLS
+        [*command, "--seed", str(seed), "--json", results], check=True, cwd=TOOLS
     )
-    rows = read_json(figures)["kinds"]
+    rows = read_json(results)["kinds"]
     assert sum(row["kills"] for row in rows.values()) == kills
     for name, row in rows.items():
         assert row["equal"] == row["kills"], f"{name}: {row}"

@@ -250,7 +250,7 @@ def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path)
 
 
 @slow
-def test_a_step_that_leads_astray_is_taken_back(example, tmp_path):
+def test_a_step_that_makes_it_worse_is_taken_back(example, tmp_path):
     """However large the step, nothing is lost: the start is what is left then."""
     first_order = example("first_order")
     cfg = first_order.Config(
@@ -318,7 +318,7 @@ def test_rows_whose_episode_ended_begin_anew_and_the_others_go_on(example, seed)
 
 
 def test_no_row_points_the_batch_its_way(example, generator):
-    """Rows near chaos are shortened, others left alone to the bit."""
+    """Rows sensitive to the initial state are shortened, others left alone to the bit."""
     bound_rows = example("first_order").bound_rows
     gradient = torch.randn(65, 7, dtype=torch.float64, generator=generator)
     gradient /= gradient.norm(dim=-1, keepdim=True)

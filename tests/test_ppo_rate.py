@@ -1,4 +1,4 @@
-"""The rate of PPO, at a tiny budget: every dynamics has one, the truth's ratio is one."""
+"""The rate of PPO, at a tiny budget: every dynamics has one, MuJoCo's ratio is one."""
 
 from pathlib import Path
 

@@ -50,11 +50,11 @@ def test_as_many_parts_as_pay():
 
 def test_each_part_has_a_thread_and_each_thread_is_alone():
     """Both parts are at work at the same time, in threads with one of torch's each."""
-    met, seen, calls = threading.Barrier(2, timeout=60), [], count(1)
+    gate, seen, calls = threading.Barrier(2, timeout=60), [], count(1)
 
     def meet(x: Tensor) -> Tensor:
         if next(calls) > 2 * WARM:
-            met.wait()
+            gate.wait()
         seen.append((threading.get_ident(), torch.get_num_threads()))
         assert not torch.is_grad_enabled()
         return x

@@ -3,7 +3,7 @@
     python -m experiments.ablations
 
 All variants of one seed on every scene come before those of the next; what is finished is
-read, so that a run that was cut short goes on. Tables, figures and a picture of each scene
+read, so that a run that was cut short goes on. Tables, results and a picture of each scene
 are written after each seed.
 """
 
@@ -43,12 +43,12 @@ class Options:
     test_seed: int = TEST_SEED
     """Of their starts."""
     out: Path = Path("runs/ablations")
-    figures: Path | None = None
-    """Folder of figures and pictures; beside the tables by default."""
+    results: Path | None = None
+    """Folder of results and pictures; beside the tables by default."""
 
 
 def main(options: Options) -> dict[str, list[dict[str, Any]]]:
-    """Print the tables; returns all figures by scene."""
+    """Print the tables; returns all results by scene."""
     budget = Budget(
         options.trajectories, options.updates, options.rows, options.test_seed
     )
@@ -69,13 +69,13 @@ def main(options: Options) -> dict[str, list[dict[str, Any]]]:
 
 
 def report(scene: str, runs: list[dict[str, Any]], options: Options) -> None:
-    """One scene's tables, printed and written, with figures and a picture."""
+    """One scene's tables, printed and written, with results and a picture."""
     cases = runs[0]["errors"].values()
     units = {name: error["unit"] for case in cases for name, error in case.items()}
     rows = rows_of(runs)
     lines = list(markdown(rows, units))
     print("\n".join(lines), flush=True)
-    name, folder = f"ablations_{scene}", options.figures or options.out
+    name, folder = f"ablations_{scene}", options.results or options.out
     folder.mkdir(parents=True, exist_ok=True)
     (options.out / f"{name}.md").write_text("\n".join(lines) + "\n")
     content = {"threads": torch.get_num_threads(), "runs": runs}

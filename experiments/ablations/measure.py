@@ -56,7 +56,7 @@ class Bed:
     Args:
         scene: the robot.
         budget: how much of each.
-        folder: of the data, which are drawn once, and of all figures.
+        folder: of the data, which are drawn once, and of all results.
     """
 
     def __init__(self, scene: Scene, budget: Budget, folder: Path) -> None:
@@ -73,7 +73,7 @@ class Bed:
             for source in protocol.cases.values()
         ]
         self.start = cast(TensorDict, TensorDict.cat(cases))
-        self.truth = self.paths(MujocoDynamics(scene))
+        self.ground_truth = self.paths(MujocoDynamics(scene))
 
     def paths(self, dynamics: Dynamics) -> Tensor:
         """Positions of every passive test, ``(rows, steps, nq)``."""
@@ -81,7 +81,7 @@ class Bed:
 
     def errors(self, dynamics: Dynamics) -> dict[str, dict[str, dict[str, Any]]]:
         """Case -> quantity -> mean, final and 95th percentile."""
-        errors = position_errors(self.scene, self.truth, self.paths(dynamics))
+        errors = position_errors(self.scene, self.ground_truth, self.paths(dynamics))
         found = {}
         for case, rows in self.cases():
             part = {name: error[rows] for name, error in errors.items()}
@@ -99,10 +99,10 @@ class Bed:
             yield GROUNDS, slice(rows, total)
 
     def measure(self, name: str, seed: int) -> dict[str, Any]:
-        """Figures of one variant, made unless they are there."""
+        """Results of one variant, made unless they are there."""
         variant = VARIANTS[self.scene.name][name]
         folder = self.folder / f"{name.replace(' ', '_')}_{seed}"
-        path, settings = folder / "figures.json", asdict(self.budget)
+        path, settings = folder / "results.json", asdict(self.budget)
         if path.exists() and read_json(path)["settings"] == settings:
             return read_json(path)
         began = time.process_time()
@@ -110,7 +110,7 @@ class Bed:
         seconds = time.process_time() - began
         mode = {"inference": "window", "window": variant.window}
         how: dict[str, Any] = mode if variant.window else {}
-        figures = {
+        results = {
             "variant": name,
             "seed": seed,
             "what": variant.what,
@@ -121,7 +121,7 @@ class Bed:
             "errors": self.errors(NeRDDynamics(model, **how)),
             "settings": settings,
         }
-        write_json(path, figures)
+        write_json(path, results)
         return read_json(path)
 
     def train(self, variant: Variant, folder: Path, seed: int) -> NeRD:

@@ -11,7 +11,7 @@ INCHES = 0.22  # per bar
 
 
 def plot_ratios(rows: Sequence[Row], path: Path) -> None:
-    """One panel for each test, one bar for each variant, to the right if it errs more.
+    """One panel for each test, one bar for each variant, to the right if it has more error.
 
     Args:
         rows: of one scene, the base first.

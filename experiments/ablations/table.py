@@ -1,4 +1,4 @@
-"""Figures of all seeds as rows: mean and spread, final, 95th percentile, ratio to base."""
+"""Results of all seeds as rows: mean and spread, final, 95th percentile, ratio to base."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 
 from .variants import BASE
 
-Figures = Mapping[str, Any]
+Results = Mapping[str, Any]
 """Of one variant and seed, see `Bed.measure`."""
 
 
@@ -57,11 +57,11 @@ class Row:
         return prod(ratios) ** (1.0 / len(ratios))
 
 
-def rows_of(found: Sequence[Figures]) -> list[Row]:
+def rows_of(found: Sequence[Results]) -> list[Row]:
     """A row for each variant of one scene, in order, against the base's same seeds."""
-    by_name: dict[str, list[Figures]] = {}
-    for figures in found:
-        by_name.setdefault(figures["variant"], []).append(figures)
+    by_name: dict[str, list[Results]] = {}
+    for results in found:
+        by_name.setdefault(results["variant"], []).append(results)
     rows = []
     for name, runs in by_name.items():
         seeds = tuple(run["seed"] for run in runs)
@@ -80,11 +80,11 @@ def rows_of(found: Sequence[Figures]) -> list[Row]:
 
 
 def cell_of(
-    runs: Sequence[Figures], base: Sequence[Figures], case: str, quantity: str
+    runs: Sequence[Results], base: Sequence[Results], case: str, quantity: str
 ) -> Cell:
     """One quantity of one test, of a variant's seeds and of the base's same ones."""
 
-    def all_of(runs: Sequence[Figures], kind: str) -> list[float]:
+    def all_of(runs: Sequence[Results], kind: str) -> list[float]:
         found = (run["errors"][case][quantity][kind] for run in runs)
         return [inf if x is None else x for x in found]  # null: it was not finite
 

@@ -19,10 +19,10 @@ from .variants import Variant
 TOKENS = 1024  # per update
 LENGTH = 32  # of a sequence: more than the longest history tried
 LR = 0.03  # of Muon; larger than for a whole training, since this one is short
-LR_OTHER = 0.003  # of AdamW beside it
+ADAMW_LR_WITH_MUON = 0.003  # of AdamW beside it
 LR_ALONE = 0.02  # of AdamW where all is its own; both are the best on validation starts
-SOFTENING: Mapping[str, float] = {"double_pendulum": 1.0, "ant": 0.02}
-"""Of the loss, as for each scene's network alone (see `make model-SCENE-mlp`)."""
+LOSS_EPS: Mapping[str, float] = {"double_pendulum": 1.0, "ant": 0.02}
+"""Of the loss, as for each scene's learned model (see `make model-SCENE-mlp`)."""
 
 
 class VariantTrainer(Trainer):
@@ -56,8 +56,8 @@ class VariantTrainer(Trainer):
             batch_size=TOKENS // length,
             sequence_length=length,
             lr=LR,
-            adamw_lr=LR_OTHER if variant.has_muon else LR_ALONE,
-            loss_eps=SOFTENING[scene.name],
+            adamw_lr=ADAMW_LR_WITH_MUON if variant.has_muon else LR_ALONE,
+            loss_eps=LOSS_EPS[scene.name],
             seed=seed,
         )
         super().__init__(scene, data, source, config, folder, quiet=True, logger="csv")

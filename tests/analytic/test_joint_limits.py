@@ -1,11 +1,11 @@
-"""Soft ends of joints: MuJoCo's own forces, whatever their springs and impedance."""
+"""Soft joint limits: MuJoCo's own forces, whatever their springs and impedance."""
 
 from dataclasses import replace
 
 import mujoco
 import pytest
 import torch
-from helpers import make_scene, random_transitions, true_step
+from helpers import make_scene, mujoco_step, random_transitions
 
 from torchrl_nerd.analytic import joint_limits
 from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
@@ -69,7 +69,7 @@ def test_one_substep_is_that_of_mujoco(ends, generator, monkeypatch):
     monkeypatch.setattr(joint_limits, "NUM_SWEEPS", 3000)
     scene = chain(**ENDS[ends])
     rows = random_rows(scene, generator)
-    want = true_step(scene, rows, rows[JOINT_TORQUE])["next"]
+    want = mujoco_step(scene, rows, rows[JOINT_TORQUE])["next"]
     size = (want[QVEL] - rows[QVEL]).abs().amax()
     for got, key in zip(step(scene, rows), (QPOS, QVEL), strict=True):
         torch.testing.assert_close(got, want[key], rtol=0.0, atol=float(1e-5 * size))
@@ -79,7 +79,7 @@ def test_one_substep_is_that_of_mujoco(ends, generator, monkeypatch):
 def test_a_control_step_is_near_that_of_mujoco(scene, generator):
     """Of joints beyond their ends, and a tenth of what leaving the ends out costs."""
     rows = random_rows(scene, generator)
-    want = true_step(scene, rows, rows[JOINT_TORQUE])["next"][QVEL]
+    want = mujoco_step(scene, rows, rows[JOINT_TORQUE])["next"][QVEL]
     unlimited = UnconstrainedStep(scene)
     unlimited.limits = None
     _, free, _ = unlimited(rows[QPOS], rows[QVEL], rows[JOINT_TORQUE])
@@ -119,9 +119,9 @@ def test_it_converges_however_joints_are_coupled(generator):
       <actuator>{motors}</actuator></mujoco>""")
     rows = random_rows(scene, generator)
     qpos, qvel = rows[QPOS], rows[QVEL]
-    free_step = UnconstrainedStep(scene)
+    unconstrained = UnconstrainedStep(scene)
     for _ in range(300):
-        qpos, qvel, *_ = free_step(qpos, qvel, 0.0 * qvel)
+        qpos, qvel, *_ = unconstrained(qpos, qvel, 0.0 * qvel)
         assert qvel.abs().max() < 1e3
     assert (qpos.abs() < 1.0).all() and qvel.norm(dim=-1).median() < 20.0
 
@@ -130,9 +130,9 @@ def test_gradients_pass_through_an_end(generator):
     scene = chain(0.01, 5)
     rows = random_rows(scene, generator)[:4]
     torque = rows[JOINT_TORQUE].clone().requires_grad_()
-    free_step = UnconstrainedStep(scene)
+    unconstrained = UnconstrainedStep(scene)
 
     def speed(torque):
-        return free_step(rows[QPOS], rows[QVEL], torque)[1]
+        return unconstrained(rows[QPOS], rows[QVEL], torque)[1]
 
     assert torch.autograd.gradcheck(speed, (torque,), eps=1e-6, atol=1e-5)

@@ -8,8 +8,8 @@ import torch
 from helpers import (
     in_ground,
     make_scene,
+    mujoco_step,
     random_transitions,
-    true_step,
     with_points_in_order,
 )
 
@@ -26,8 +26,10 @@ BALL = """<mujoco><option cone="{cone}" timestep="0.001"/><worldbody>
 
 
 NAMES = "double_pendulum", "ant", "anymal", "cube", "cube_slope"
-GROUNDED = [load_scene(name) for name in NAMES]
-each_grounded = pytest.mark.parametrize("scene", GROUNDED, ids=lambda scene: scene.name)
+ON_GROUND = [load_scene(name) for name in NAMES]
+each_on_ground = pytest.mark.parametrize(
+    "scene", ON_GROUND, ids=lambda scene: scene.name
+)
 each_stages = pytest.mark.parametrize("stages", [1, 2, 3])
 coarse_stages = pytest.mark.parametrize("stages", [1, 2])
 
@@ -41,10 +43,10 @@ def moved(scene, rows, stages=2, merged=1, outer=1, precision="float64"):
 def errors(scene, rows, stages=2, outer=1):
     """Error of velocities and places, over the true change of velocity, of each row."""
     qpos, qvel, _ = moved(scene, rows, stages, outer=outer)
-    truth = rows["next"]
-    size = (truth[QVEL] - rows[QVEL]).norm(dim=-1).clamp_min(1e-6)
-    fast = (qvel - truth[QVEL]).norm(dim=-1) / size
-    slip = differentiate_pos(scene.layout, qpos, truth[QPOS]).norm(dim=-1)
+    ground_truth = rows["next"]
+    size = (ground_truth[QVEL] - rows[QVEL]).norm(dim=-1).clamp_min(1e-6)
+    fast = (qvel - ground_truth[QVEL]).norm(dim=-1) / size
+    slip = differentiate_pos(scene.layout, qpos, ground_truth[QPOS]).norm(dim=-1)
     return fast, slip / (size * scene.control_step)
 
 
@@ -56,7 +58,7 @@ def solver_scene(scene, stages):
 def touching(scene, generator, stages=2):
     rows = in_ground(scene, ROWS, generator)
     torque = rows[JOINT_TORQUE]
-    return true_step(solver_scene(scene, stages), rows.exclude("next"), torque)
+    return mujoco_step(solver_scene(scene, stages), rows.exclude("next"), torque)
 
 
 def air(scene, generator):
@@ -72,10 +74,10 @@ def air(scene, generator):
             rows[QPOS][:, at] = float(scene.model.jnt_range[joint].mean())
     rows[QVEL].mul_(0.3)
     rows[JOINT_TORQUE] = 0.01 * rows[JOINT_TORQUE]
-    return true_step(scene, rows.exclude("next"), rows[JOINT_TORQUE])
+    return mujoco_step(scene, rows.exclude("next"), rows[JOINT_TORQUE])
 
 
-@each_grounded
+@each_on_ground
 @coarse_stages
 def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, stages, generator):
     """What the law leaves out is in proportion to their impedance."""
@@ -87,13 +89,13 @@ def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, stages, gener
     for impedance in (1e-3, 1e-4):  # MuJoCo's least
         for solimp in (model.geom_solimp, model.jnt_solimp):
             solimp[:, :2] = impedance
-        fast, slip = errors(one, true_step(one, rows, torque), stages)
+        fast, slip = errors(one, mujoco_step(one, rows, torque), stages)
         assert fast.median() < 20.0 * impedance and slip.median() < 20.0 * impedance
         found.append(fast.median())
     assert found[1] < 0.3 * found[0]  # a tenth, but for rows that lose touch
 
 
-@each_grounded
+@each_on_ground
 @each_stages
 def test_it_goes_where_mujoco_goes(scene, stages, generator):
     fast, slip = errors(scene, touching(scene, generator, stages), stages)
@@ -101,29 +103,29 @@ def test_it_goes_where_mujoco_goes(scene, stages, generator):
     assert fast.median() < most and slip.median() < most
 
 
-@each_grounded
+@each_on_ground
 def test_two_stages_are_more_accurate_than_one(scene, generator):
     rows = touching(scene, generator)
     (once, _), (twice, _) = (errors(scene, rows, stages) for stages in (1, 2))
     assert twice.median() < once.median()
 
 
-@each_grounded
+@each_on_ground
 def test_two_outer_steps_are_more_accurate_still(scene, generator):
     rows = touching(scene, generator)
     outer = next(k for k in (2, 5) if scene.substeps % k == 0)
-    (whole, _), (halves, _) = (errors(scene, rows, 2, n) for n in (1, outer))
-    assert halves.median() < whole.median()
+    (whole, _), (finer, _) = (errors(scene, rows, 2, n) for n in (1, outer))
+    assert finer.median() < whole.median()
 
 
-@each_grounded
+@each_on_ground
 def test_three_stages_are_nearer_to_the_reference_solver(scene, generator):
     rows = touching(scene, generator, stages=3)
     (twice, _), (thrice, _) = (errors(scene, rows, stages) for stages in (2, 3))
     assert thrice.median() < 0.8 * twice.median()
 
 
-@each_grounded
+@each_on_ground
 @each_stages
 def test_merged_substeps_are_longer_substeps(scene, stages, generator):
     rows = touching(scene, generator)
@@ -134,7 +136,7 @@ def test_merged_substeps_are_longer_substeps(scene, stages, generator):
         torch.testing.assert_close(one, other)
 
 
-@each_grounded
+@each_on_ground
 @each_stages
 def test_outer_steps_are_shorter_control_steps(scene, stages, generator):
     rows = touching(scene, generator, stages)
@@ -150,7 +152,7 @@ def test_outer_steps_are_shorter_control_steps(scene, stages, generator):
         torch.testing.assert_close(other, one)
 
 
-@each_grounded
+@each_on_ground
 @each_stages
 def test_half_a_step_in_the_air_has_an_eighth_of_the_error(scene, stages, generator):
     """A quarter of it after a single look, a sixteenth of a velocity's after three."""
@@ -160,15 +162,17 @@ def test_half_a_step_in_the_air_has_an_eighth_of_the_error(scene, stages, genera
         model.opt.timestep /= shorter
         here = replace(scene, model=model)
         start = rows.exclude("next")
-        truth = true_step(solver_scene(here, stages), start, rows[JOINT_TORQUE])
-        fast, slip = errors(here, truth, stages)
+        ground_truth = mujoco_step(
+            solver_scene(here, stages), start, rows[JOINT_TORQUE]
+        )
+        fast, slip = errors(here, ground_truth, stages)
         found.append((fast.median(), slip.median()))  # the fastest are far off
     less = {1: (1.5, 1.5), 2: (2.5, 2.5), 3: (5.0, 2.5)}[stages]
     for coarse, fine, times in zip(*found, less, strict=True):  # relative: over a half
         assert fine < max(coarse / times, 1e-7)
 
 
-@each_grounded
+@each_on_ground
 def test_springs_are_as_good_in_float32(scene, generator):
     rows = touching(scene, generator)
     expected, got = moved(scene, rows), moved(scene, rows, precision="float32")
@@ -178,7 +182,7 @@ def test_springs_are_as_good_in_float32(scene, generator):
     assert got[0].dtype == got[1].dtype == torch.float64
 
 
-@each_grounded
+@each_on_ground
 def test_any_batch_is_a_batch_of_rows(scene, generator):
     rows = touching(scene, generator)[:6]
     flat, square = moved(scene, rows), moved(scene, rows.reshape(2, 3))
@@ -236,7 +240,7 @@ def test_a_rolling_ball_is_turned_by_its_rim():
     ("scene", "sentence"),
     [
         (load_scene("franka"), "expected a scene with a ground, got 'franka'"),
-        (GROUNDED[0].reference, "expected substeps of mjINT_EULER, got mjINT_RK4"),
+        (ON_GROUND[0].reference, "expected substeps of mjINT_EULER, got mjINT_RK4"),
         (ball("pyramidal"), "expected elliptic friction cones, got pyramidal ones"),
     ],
 )
@@ -246,8 +250,8 @@ def test_what_it_does_not_know_is_refused(scene, sentence):
 
 
 def test_nobody_stages_four_times():
-    with pytest.raises(ValueError, match="expected one look, two or three, got 4"):
-        PenaltyContactStep(GROUNDED[0], stages=4)
+    with pytest.raises(ValueError, match="expected 1, 2 or 3 stages, got 4"):
+        PenaltyContactStep(ON_GROUND[0], num_stages=4)
 
 
 @pytest.mark.parametrize("outer", [0, 3])
@@ -267,7 +271,7 @@ def test_so_are_contacts_and_limits_of_another_law():
         PenaltyContactStep(replace(scene, model=model))
 
 
-@each_grounded
+@each_on_ground
 @each_stages
 def test_points_in_another_order_push_alike(scene, stages, generator):
     rows = touching(scene, generator, stages)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import pytest
 import torch
-from helpers import make_scene, random_transitions, true_step
+from helpers import make_scene, mujoco_step, random_transitions
 
 from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL
@@ -37,7 +37,7 @@ def chain(integrator, control_step, substeps):
 
 def errors(scene, rows):
     """Of velocities' and positions' changes ``(rows, nv)``, and the changes' sizes."""
-    after = true_step(scene, rows.exclude("next"), rows[JOINT_TORQUE])["next"]
+    after = mujoco_step(scene, rows.exclude("next"), rows[JOINT_TORQUE])["next"]
     change, start = StateDelta(scene).delta, (rows[QPOS], rows[QVEL])
     want = change(*start, after[QPOS], after[QVEL])
     got = change(*start, *UnconstrainedStep(scene)(*start, rows[JOINT_TORQUE])[:2])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import true_step
+from helpers import mujoco_step
 from tensordict import TensorDict
 
 from torchrl_nerd.configs import DataConfig
@@ -66,19 +66,19 @@ def test_sets_follow_each_other_in_the_order_given(scene, tmp_path, seed):
         load_data(scene, *[*folders, tmp_path / "none"])
 
 
-def test_every_transition_obeys_the_true_dynamics(scene, generator):
+def test_every_transition_obeys_the_mujoco_dynamics(scene, generator):
     data = simulate(scene, 16, 6, generator)
     data = data[is_sound(data)]
     for key in STATE:
         assert torch.equal(data["next", key][:, :-1], data[key][:, 1:])
-    first = true_step(
+    first = mujoco_step(
         scene, data[:, 0].exclude("next"), data[:, 0]["next", "joint_torque"]
     )
     for key in STATE:  # without a past there is nothing that could differ
         expected, got = first["next", key], data[:, 0]["next", key]
         torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
     every = data.reshape(-1)  # later steps had a solver that started warm
-    again = true_step(scene, every.exclude("next"), every["next", "joint_torque"])
+    again = mujoco_step(scene, every.exclude("next"), every["next", "joint_torque"])
     for key in STATE:
         expected, got = again["next", key], every["next", key]
         torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-6)

@@ -139,10 +139,10 @@ def test_lost_frames_are_found(log, real_cube, generator, count):
     apart = position(log)[rows + count] - position(log)[rows - 1]
     rows = rows[torch.linalg.vector_norm(apart, dim=-1) > 0.01]
     row = int(rows[torch.randint(len(rows), (), generator=generator)])
-    spoilt = [without(log, row, count)]
+    corrupted = [without(log, row, count)]
     if count > 1:  # one frame of an impact: poses alone do not tell
-        spoilt.append(changed(spoilt[0], linear=NONE, angular=NONE))
-    for wrong in spoilt:
+        corrupted.append(changed(corrupted[0], linear=NONE, angular=NONE))
+    for wrong in corrupted:
         with pytest.raises(ValueError, match="lost, before row"):
             check_log(wrong, real_cube)
 

@@ -1,4 +1,4 @@
-"""Ways to draw training data: what each promises, on every robot, and true physics."""
+"""Ways to draw training data: what each promises, on every robot, and MuJoCo."""
 
 import json
 import math
@@ -279,16 +279,16 @@ def test_cards_say_what_is_set(scene, tmp_path, seed):
     assert not {"ground", "drive", "starts"} & set(ranges)
 
 
-def test_nudged_robots_are_stopped_where_they_fell_and_pushed(scene, generator):
+def test_perturbed_robots_are_stopped_where_they_fell_and_pushed(scene, generator):
     seed, rows = int(torch.randint(2**31, (), generator=generator)), 64
     fallen = SettledStates(scene, 0.2)
     rest = fallen(rows, seeded(seed))
-    nudged = PerturbedRestStates(fallen)(rows, seeded(seed))
-    push = nudged["qvel"].abs().amax(-1)
+    perturbed = PerturbedRestStates(fallen)(rows, seeded(seed))
+    push = perturbed["qvel"].abs().amax(-1)
     assert push.max() < 3.0 * 6.0  # six deviations of the largest unit
     assert push.min() > 0.0
     assert push.quantile(0.25) < 0.1 * push.quantile(0.75)  # over decades
-    moved = differentiate_pos(scene.layout, rest["qpos"], nudged["qpos"])
+    moved = differentiate_pos(scene.layout, rest["qpos"], perturbed["qpos"])
     assert moved.abs().max() < 0.03 * 6.0
     stopped = PerturbedRestStates(fallen, 1e-9)(rows, seeded(seed))
     assert stopped["qvel"].abs().amax(-1).min() < 1e-4

@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import load_scene, make_env
 from torchrl_nerd.dynamics import MujocoDynamics, MujocoWarpDynamics
-from torchrl_nerd.envs.ground_truth import GROUND_TRUTH
+from torchrl_nerd.envs.ground_truth import GROUND_GROUND_TRUTH
 
 pytest.importorskip("mujoco_warp")
 
@@ -24,7 +24,7 @@ ROWS, STEPS = 4, 3
 ROUNDING = 1e-4  # of the largest number: hundreds of float32's steps, over all substeps
 
 
-def grounded_drive(scene, generator, depth=0.005):
+def drive_on_ground(scene, generator, depth=0.005):
     """A random drive from starts so deep (m) in the ground, where there is one."""
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
     if terrain is None:
@@ -43,30 +43,30 @@ def assert_agree(got: TensorDict, expected: TensorDict) -> None:
 @pytest.mark.parametrize("is_touching", [False, True])
 def test_a_step_is_that_of_mujoco(scene, is_touching, generator):
     if is_touching:
-        state, torques, terrain = grounded_drive(scene, generator)
+        state, torques, terrain = drive_on_ground(scene, generator)
         gaps = scene.clearances(state["qpos"], terrain)
         assert (gaps < 0.0).any(-1).all() or not len(scene.contacts)
     else:
         state, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
-    true, warp = MujocoDynamics(scene, 1), MujocoWarpDynamics(scene, "cpu")
+    ground_truth, warp = MujocoDynamics(scene, 1), MujocoWarpDynamics(scene, "cpu")
     for torque in torques:
-        expected = true.step(state, torque, terrain)
+        expected = ground_truth.step(state, torque, terrain)
         assert_agree(warp.step(state, torque, terrain), expected)
         state = expected
 
 
 def test_sensors_feel_what_they_feel_in_mujoco(generator):
     scene = load_scene("dm_control/hopper-hop")
-    state, torques, terrain = grounded_drive(scene, generator)
-    true, warp = MujocoDynamics(scene, 1), MujocoWarpDynamics(scene, "cpu")
-    expected = true.step(state, torques[0], terrain)
+    state, torques, terrain = drive_on_ground(scene, generator)
+    ground_truth, warp = MujocoDynamics(scene, 1), MujocoWarpDynamics(scene, "cpu")
+    expected = ground_truth.step(state, torques[0], terrain)
     assert expected["sensordata"].any()
     assert_agree(warp.step(state, torques[0], terrain), expected)
 
 
 def test_broken_rows_break_no_other_and_heal(generator):
     scene = load_scene("double_pendulum")
-    state, torques, terrain = grounded_drive(scene, generator)
+    state, torques, terrain = drive_on_ground(scene, generator)
     clean = MujocoWarpDynamics(scene, "cpu").step(state, torques[0], terrain)
     broken, torque = state.clone(), torques[0].clone()
     broken["qpos"][0], broken["qvel"][1], torque[2] = torch.nan, 1e30, torch.inf
@@ -80,7 +80,7 @@ def test_broken_rows_break_no_other_and_heal(generator):
 
 def test_contacts_that_have_no_room_are_not_lost_in_silence(generator):
     scene = load_scene("ant")
-    state, torques, terrain = grounded_drive(scene, generator, depth=0.3)
+    state, torques, terrain = drive_on_ground(scene, generator, depth=0.3)
     expected = MujocoDynamics(scene, 1).step(state, torques[0], terrain)
     little = MujocoWarpDynamics(scene, "cpu", max_contacts=1)
     after = little.step(state, torques[0], terrain)
@@ -91,7 +91,7 @@ def test_contacts_that_have_no_room_are_not_lost_in_silence(generator):
 
 
 def test_an_env_moves_as_it_does_in_mujoco(generator):
-    assert "mujoco_warp" in GROUND_TRUTH
+    assert "mujoco_warp" in GROUND_GROUND_TRUTH
     envs = [
         make_env("cartpole/swingup", dynamics=name, num_envs=ROWS, seed=3)
         for name in ("mujoco", "mujoco_warp")
@@ -121,10 +121,10 @@ def test_what_it_cannot_do_is_refused_in_a_sentence():
 @pytest.mark.parametrize("is_capturing", [True, False])
 def test_a_gpu_steps_as_mujoco_does(scene, is_capturing, generator):
     state, torques, terrain = random_drive(scene, 64, 5, generator)
-    true = MujocoDynamics(scene)
+    ground_truth = MujocoDynamics(scene)
     warp = MujocoWarpDynamics(scene, "cuda", is_capturing=is_capturing)
     for torque in torques:
-        expected = true.step(state, torque, terrain)
+        expected = ground_truth.step(state, torque, terrain)
         ground = None if terrain is None else terrain.cuda()
         after = warp.step(state.to("cuda"), torque.cuda(), ground)
         assert after.device is not None and after.device.type == "cuda"

@@ -56,7 +56,7 @@ def test_gradient_of_other_rows_outlives_a_partial_reset(env, generator):
 
 
 @pytest.mark.parametrize("dynamics", ["mujoco", "dm_control"])
-def test_true_dynamics_have_no_gradients(dynamics):
+def test_mujoco_dynamics_have_no_gradients(dynamics):
     with pytest.raises(ValueError, match=f"for gradients, got '{dynamics}'"):
         make_env("cartpole/swingup", dynamics, differentiable=True)
 

@@ -1,4 +1,4 @@
-"""dm_env's own tests of an environment, for every task in learned and true dynamics."""
+"""dm_env's own tests of an environment, for every task in learned and MuJoCo."""
 
 import dm_env
 import numpy as np

@@ -33,7 +33,7 @@ def test_specs_hold(task_id, dynamics, num_envs, generator):
     assert env.batch_size == (num_envs,) and env.batch_locked
 
 
-def test_learned_and_true_envs_have_equal_specs(task_id, generator):
+def test_learned_and_mujoco_envs_have_equal_specs(task_id, generator):
     envs = [EnvMaker(task_id, dynamics, generator)() for dynamics in DYNAMICS]
     for env in envs[1:]:
         for name in ("action", "observation", "reward", "done", "state"):

@@ -1,4 +1,4 @@
-"""Every registered task through Gymnasium, in learned and in true dynamics."""
+"""Every registered task through Gymnasium, in learned and in MuJoCo."""
 
 import warnings
 
@@ -23,7 +23,7 @@ gymnasium_id = torchrl_nerd.gymnasium.gymnasium_id
 
 @pytest.fixture(params=["learned", "mujoco"])
 def dynamics(request, task_id, tmp_path, generator) -> str:
-    """A checkpoint of random weights, and the truth."""
+    """A checkpoint of random weights, and the ground truth."""
     if request.param == "mujoco":
         return "mujoco"
     model = random_model(make_task(task_id).scene, generator)

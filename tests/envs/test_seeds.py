@@ -121,7 +121,7 @@ def test_the_global_generators_are_left_alone(task_id, dynamics, generator, tmp_
 
 
 def fingerprint(folder: Path, seed: int) -> str:
-    """Hash of a few steps of every task, in learned and in true dynamics."""
+    """Hash of a few steps of every task, in learned and in MuJoCo."""
     digest = hashlib.sha256()
     for task_id in TASKS:
         scene = make_task(task_id).scene.name

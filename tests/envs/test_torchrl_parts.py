@@ -142,7 +142,7 @@ def idle_policy(env):
     return lambda td: td.set("action", torch.zeros(*td.batch_size, width))
 
 
-def test_parallel_env_may_mix_learned_and_true_dynamics(generator):
+def test_parallel_env_may_mix_learned_and_mujoco_dynamics(generator):
     makers = [EnvMaker(TASK, d, generator, HORIZON) for d in ("window", "mujoco")]
     parallel = ParallelEnv(2, [functools.partial(make, ROWS) for make in makers])
     try:
@@ -154,11 +154,11 @@ def test_parallel_env_may_mix_learned_and_true_dynamics(generator):
     for index in range(2):
         check_batch(data[index])
     assert (data["qpos"][0, :, 0] != data["qpos"][1, :, 0]).any(-1).all()
-    truth = makers[1](ROWS)
+    ground_truth = makers[1](ROWS)
     start = data[1, :, 0].select("qpos", "qvel", "terrain", strict=False)
-    truth.reset(start.clone(), set_state=True)
-    action = torch.zeros(truth.action_spec.shape)
-    after = truth.step(TensorDict({"action": action}, [ROWS]))["next"]
+    ground_truth.reset(start.clone(), set_state=True)
+    action = torch.zeros(ground_truth.action_spec.shape)
+    after = ground_truth.step(TensorDict({"action": action}, [ROWS]))["next"]
     assert torch.equal(after["qpos"], data["next", "qpos"][1, :, 0])
 
 

@@ -39,10 +39,10 @@ def test_without_its_network_the_error_rises_by_a_fifth(name, drive):
         steps = max(protocol.horizons)
         start = initial_states(source, TRAJECTORIES, SEED)
         actions = action_drive(source, len(start), steps, SEED, drive == "driven")
-        truth = open_loop(MujocoDynamics(model.scene), start, steps, actions)
+        ground_truth = open_loop(MujocoDynamics(model.scene), start, steps, actions)
         for each in (model, without_network(model)):
             path = open_loop(NeRDDynamics(each), start, steps, actions)
-            errors = position_errors(model.scene, truth, path)
+            errors = position_errors(model.scene, ground_truth, path)
             for quantity, error in errors.items():
                 found.setdefault(quantity, []).append(error.mean(1))
     for quantity, parts in found.items():

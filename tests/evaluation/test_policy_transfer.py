@@ -77,8 +77,10 @@ def test_returns_take_the_mean_action(policy: Policy) -> None:
 
 
 def test_summary_of_known_returns() -> None:
-    truth = torch.tensor([100.0, 300.0], dtype=torch.float64)
-    summary = summarize(torch.tensor([110.0, 330.0, 0.0], dtype=torch.float64), truth)
+    ground_truth = torch.tensor([100.0, 300.0], dtype=torch.float64)
+    summary = summarize(
+        torch.tensor([110.0, 330.0, 0.0], dtype=torch.float64), ground_truth
+    )
     assert summary.episodes == 3
     assert summary.mean == pytest.approx(440.0 / 3.0)
     assert summary.difference == pytest.approx(0.1)
@@ -86,13 +88,13 @@ def test_summary_of_known_returns() -> None:
     assert summary.difference_interval == pytest.approx(1.96 * spread / 2**0.5 / 200.0)
 
 
-@pytest.mark.parametrize("truth", [torch.zeros(5), torch.ones(1)])
-def test_summary_says_what_it_cannot_measure(truth: torch.Tensor) -> None:
+@pytest.mark.parametrize("ground_truth", [torch.zeros(5), torch.ones(1)])
+def test_summary_says_what_it_cannot_measure(ground_truth: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="expected"):
-        summarize(torch.ones(len(truth)), truth)
+        summarize(torch.ones(len(ground_truth)), ground_truth)
 
 
-def test_true_engines_agree_and_truth_is_added(policy: Policy) -> None:
+def test_mujoco_engines_agree_and_ground_truth_is_added(policy: Policy) -> None:
     summaries = transfer(TASK, make_actor(policy), ["dm_control"], 6, slow_episodes=3)
     assert {name: s.episodes for name, s in summaries.items()} == {
         "dm_control": 3,

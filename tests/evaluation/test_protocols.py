@@ -1,4 +1,4 @@
-"""Every robot is measured as in the paper, beside the figures that the paper prints."""
+"""Every robot is measured as in the paper, beside the results that the paper prints."""
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def table(text: str) -> dict[tuple[int, str], float]:
     }
 
 
-def test_every_scene_has_a_protocol_and_recipes_are_of_scenes():
+def test_every_scene_has_a_protocol_and_presets_are_of_scenes():
     assert set(PRESETS) == set(SCENES) >= set(PRESETS)
 
 
@@ -60,7 +60,7 @@ def test_protocols_fit_their_scene(scene):
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_recipes_fit_their_scene(name):
+def test_presets_fit_their_scene(name):
     preset = PRESETS[name]
     assert preset.task in TASKS and make_task(preset.task).scene is load_scene(name)
     network = network_config(preset.train.network)
@@ -70,13 +70,13 @@ def test_recipes_fit_their_scene(name):
     )
 
 
-def test_published_figures_of_the_cartpole():
+def test_published_results_of_the_cartpole():
     expected = {("passive", *key): value for key, value in table(CARTPOLE).items()}
     assert len(expected) == 6
     assert PRESETS["cartpole"].protocol().published == expected
 
 
-def test_published_figures_of_the_double_pendulum():
+def test_published_results_of_the_double_pendulum():
     expected = {
         (f"terrain {ground}", 100, joint): value
         for (ground, joint), value in table(DOUBLE_PENDULUM).items()
@@ -85,7 +85,7 @@ def test_published_figures_of_the_double_pendulum():
     assert PRESETS["double_pendulum"].protocol().published == expected
 
 
-def test_published_figures_of_the_ant():
+def test_published_results_of_the_ant():
     protocol = PRESETS["ant"].protocol()
     assert protocol.horizons == (100, 500) and not protocol.random_actions
     assert protocol.published == {
@@ -108,7 +108,7 @@ def test_arms_are_driven_and_no_other_robot_is():
         ("gymnasium/Swimmer-v5", ["passive", "random"]),
     ],
 )
-def test_robots_of_others_start_within_their_own_ranges(name, cases, seed):
+def test_third_party_robots_start_within_their_own_ranges(name, cases, seed):
     scene = load_scene(name)
     protocol, preset = protocol_of(scene), preset_of(name)
     assert list(protocol.cases) == cases and not protocol.published

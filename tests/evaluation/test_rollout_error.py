@@ -1,4 +1,4 @@
-"""Open-loop error: the documented formulas, zero for the truth against itself."""
+"""Open-loop error: the documented formulas, zero for the ground truth against itself."""
 
 from copy import copy
 from dataclasses import replace
@@ -51,7 +51,7 @@ def heavier(scene):
     return replace(scene, model=model)
 
 
-def test_the_truth_against_itself_has_no_error(task_id, seed):
+def test_the_ground_truth_against_itself_has_no_error(task_id, seed):
     task = make_task(task_id)
     dynamics = [MujocoDynamics(task.scene, num_threads=n) for n in (1, 2)]
     summaries = passive_errors(task, *dynamics, [3, 12], ROWS, seed)
@@ -59,15 +59,15 @@ def test_the_truth_against_itself_has_no_error(task_id, seed):
     for by_name in summaries.values():
         assert by_name
         for error in by_name.values():
-            figures = (error.mean, error.interval, error.final, error.p95)
-            assert max(figures) < 1e-15  # a quaternion against itself: not quite zero
+            results = (error.mean, error.interval, error.final, error.p95)
+            assert max(results) < 1e-15  # a quaternion against itself: not quite zero
 
 
 def test_fixed_base_by_hand(rng):
     scene = load_scene("cartpole")
-    truth, learned = (10.0 * path for path in random_paths(scene, rng))
-    errors = position_errors(scene, truth, learned)
-    difference = (truth - learned).numpy()
+    ground_truth, learned = (10.0 * path for path in random_paths(scene, rng))
+    errors = position_errors(scene, ground_truth, learned)
+    difference = (ground_truth - learned).numpy()
     np.testing.assert_allclose(errors["slider"], np.abs(difference[..., 0]))
     np.testing.assert_allclose(errors["hinge"], wrapped(difference[..., 1]), atol=1e-12)
     assert list(errors) == ["slider", "hinge"]
@@ -75,9 +75,9 @@ def test_fixed_base_by_hand(rng):
 
 def test_ball_joint_by_hand(rng):
     scene = HANDMADE["arm"]
-    truth, learned = random_paths(scene, rng)
-    errors = position_errors(scene, truth, learned)
-    a, b = truth.numpy(), learned.numpy()
+    ground_truth, learned = random_paths(scene, rng)
+    errors = position_errors(scene, ground_truth, learned)
+    a, b = ground_truth.numpy(), learned.numpy()
     expected = angle_between(a[..., :4], b[..., :4])
     np.testing.assert_allclose(errors["shoulder"], expected, atol=1e-7)
     np.testing.assert_allclose(errors["elbow"], wrapped(a[..., 4] - b[..., 4]))
@@ -85,9 +85,9 @@ def test_ball_joint_by_hand(rng):
 
 def test_floating_base_by_hand(rng):
     scene = HANDMADE["floater"]
-    truth, learned = random_paths(scene, rng)
-    errors = position_errors(scene, truth, learned)
-    a, b = truth.numpy(), learned.numpy()
+    ground_truth, learned = random_paths(scene, rng)
+    errors = position_errors(scene, ground_truth, learned)
+    a, b = ground_truth.numpy(), learned.numpy()
     offset = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
     np.testing.assert_allclose(errors["base_position"], offset)
     turn = angle_between(a[..., 3:7], b[..., 3:7])
@@ -101,18 +101,18 @@ def test_floating_base_by_hand(rng):
 
 def test_full_turns_and_quaternion_signs_are_no_error(rng, generator):
     scene = HANDMADE["floater"]
-    truth, _ = random_paths(scene, rng)
-    other = truth.clone()
+    ground_truth, _ = random_paths(scene, rng)
+    other = ground_truth.clone()
     other[..., 7] += 2.0 * torch.pi * torch.randint(-3, 4, (ROWS, STEPS)).double()
     other[..., 3:7] *= -1.0
     other[..., 8:12] *= torch.where(torch.rand(ROWS, STEPS, 1) < 0.5, -1.0, 1.0)
-    for error in position_errors(scene, truth, other).values():
+    for error in position_errors(scene, ground_truth, other).values():
         assert error.abs().max() < 1e-6
     quats = random_quats(ROWS * STEPS, generator).reshape(ROWS, STEPS, 4)
     other[..., 3:7] = quats
     there, back = (
         position_errors(scene, *paths)["base_orientation"]
-        for paths in ((truth, other), (other, truth))
+        for paths in ((ground_truth, other), (other, ground_truth))
     )
     torch.testing.assert_close(there, back)
     assert (there <= torch.pi + 1e-9).all() and there.max() > 0.1
@@ -120,8 +120,8 @@ def test_full_turns_and_quaternion_signs_are_no_error(rng, generator):
 
 def test_a_slide_is_never_wrapped(rng):
     scene = load_scene("cartpole")
-    truth, _ = random_paths(scene, rng)
-    errors = position_errors(scene, truth, truth + 2.0 * torch.pi)
+    ground_truth, _ = random_paths(scene, rng)
+    errors = position_errors(scene, ground_truth, ground_truth + 2.0 * torch.pi)
     assert (errors["slider"] - 2.0 * torch.pi).abs().max() < 1e-9
     assert errors["hinge"].max() < 1e-9
 
@@ -158,16 +158,19 @@ def test_non_finite_errors_stay_visible(rng):
 
 def test_horizons_are_prefixes_of_one_rollout(task_id, seed):
     task = make_task(task_id)
-    truth, other = MujocoDynamics(task.scene), MujocoDynamics(heavier(task.scene))
-    together = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed)
+    ground_truth, other = (
+        MujocoDynamics(task.scene),
+        MujocoDynamics(heavier(task.scene)),
+    )
+    together = passive_errors(task, other, ground_truth, [2, 9, 5], ROWS, seed)
     is_moving = task.scene.name != "franka"  # at rest, without gravity
     for horizon, by_name in together.items():
-        alone = passive_errors(task, other, truth, [horizon], ROWS, seed)
+        alone = passive_errors(task, other, ground_truth, [horizon], ROWS, seed)
         assert alone == {horizon: by_name}
         assert any(error.mean > 0.0 for error in by_name.values()) == is_moving
-    again = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed)
+    again = passive_errors(task, other, ground_truth, [2, 9, 5], ROWS, seed)
     assert again == together
-    unlike = passive_errors(task, other, truth, [2, 9, 5], ROWS, seed + 1)
+    unlike = passive_errors(task, other, ground_truth, [2, 9, 5], ROWS, seed + 1)
     assert (unlike != together) == is_moving
 
 
@@ -214,11 +217,11 @@ def test_actions_become_torque_through_the_tasks_controller(name, random_actions
     task, steps = make_task(name), 4
     start = initial_states(task, 3, seed)
     drive = action_drive(task, 3, steps, seed, random_actions)
-    truth = MujocoDynamics(task.scene, num_threads=1)
-    path = open_loop(truth, start, steps, drive)
+    ground_truth = MujocoDynamics(task.scene, num_threads=1)
+    path = open_loop(ground_truth, start, steps, drive)
     again = action_drive(task, 3, steps, seed, random_actions)
     state = start
-    truth.reset(state)
+    ground_truth.reset(state)
     for step in range(steps):
         torque = again(step, state)
         idle = task.controller(
@@ -230,7 +233,7 @@ def test_actions_become_torque_through_the_tasks_controller(name, random_actions
             for sign in (-1.0, 1.0)
         )
         assert ((torque >= low) & (torque <= high)).all()
-        state = truth.step(state.select("qpos", "qvel"), torque)
+        state = ground_truth.step(state.select("qpos", "qvel"), torque)
         torch.testing.assert_close(path[:, step], state["qpos"], rtol=0, atol=1e-12)
 
 

@@ -18,7 +18,7 @@ PAPER = {
     "anymal/forward": 1323.0,
     "anymal/sideways": 1360.0,
 }
-"""Returns in truth, tables 1 and 2 of the paper."""
+"""Returns in ground truth, tables 1 and 2 of the paper."""
 
 
 def test_they_are_of_tasks_that_have_a_goal() -> None:

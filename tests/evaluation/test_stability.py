@@ -185,7 +185,7 @@ def test_the_command_writes_table_json_and_plot(tmp_path, capsys):
     assert plot.stat().st_size > 1000
 
 
-def test_figures_outlive_an_interruption(tmp_path, monkeypatch):
+def test_results_outlive_an_interruption(tmp_path, monkeypatch):
     out, run = tmp_path / "s.json", CASES["batching"].run
 
     def interrupted(*arguments):

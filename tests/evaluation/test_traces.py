@@ -37,8 +37,8 @@ def test_energy_of_a_state_that_is_not_finite_is_nan():
 def test_equal_dynamics_have_equal_traces(name, tmp_path, seed):
     scene = load_scene(name)
     source = next(iter(protocol_of(scene).cases.values()))
-    truth, same = (MujocoDynamics(scene, num_threads=1) for _ in range(2))
-    traces = compare_traces(source, (same, truth), 6, 5, seed)
+    ground_truth, same = (MujocoDynamics(scene, num_threads=1) for _ in range(2))
+    traces = compare_traces(source, (same, ground_truth), 6, 5, seed)
     assert all(float(error.max()) < 1e-7 for error in traces.errors.values())
     assert all(error.shape == (5, 7) for error in traces.errors.values())
     learned, true = traces.energies
@@ -54,6 +54,6 @@ def test_unconstrained_motion_keeps_its_energy(seed):
     scene = load_scene("cartpole")
     assert scene.model.dof_damping.max() == 0.0
     source = next(iter(protocol_of(scene).cases.values()))
-    truth = MujocoDynamics(scene, num_threads=1)
-    kept = compare_traces(source, (truth, truth), 20, 4, seed).energies[1]
+    ground_truth = MujocoDynamics(scene, num_threads=1)
+    kept = compare_traces(source, (ground_truth, ground_truth), 20, 4, seed).energies[1]
     assert float(kept.max() - kept.min()) < 0.02 * float(kept.abs().max() + 25.0)

@@ -42,17 +42,17 @@ def test_starts_are_those_over_planes_and_in_the_clear(case, seed):
 
 @each_case
 def test_the_pendulum_hits_the_ground_and_the_trained_model_follows(case, seed):
-    """Far nearer to the truth than the same model without any ground in reach."""
+    """Far nearer to the ground truth than the same model without any ground in reach."""
     task, rows, steps = CASES[case], 64, 40
     start = initial_states(task, rows, seed)
-    truth = open_loop(MujocoDynamics(task.scene, 1), start, steps)
+    ground_truth = open_loop(MujocoDynamics(task.scene, 1), start, steps)
     model = from_pretrained("double_pendulum")
     learned = open_loop(NeRDDynamics(model.over(task.scene)), start, steps)
     air = torch.tensor([0.0, 0.0, 1.0, -50.0]).double().expand(rows, -1)
     blind = open_loop(NeRDDynamics(model), start.clone().set("terrain", air), steps)
-    touching = task.scene.clearances(truth).amin((1, 2)) < 0.0
+    touching = task.scene.clearances(ground_truth).amin((1, 2)) < 0.0
     assert touching.any()
-    errors = [(x - truth)[touching].abs().mean() for x in (learned, blind)]
+    errors = [(x - ground_truth)[touching].abs().mean() for x in (learned, blind)]
     assert errors[0] < 0.4 * errors[1]
 
 

@@ -40,14 +40,16 @@ def test_mujocos_centre_of_mass_falls_freely(real_cube, generator):
 
     centre = 0.01 * torch.randn(3, generator=generator).double()
     values = dict(zip(CENTRE, centre.tolist(), strict=True))
-    truth = MujocoDynamics(cube_with(real_cube, {**PUBLISHED, **values}), num_threads=1)
+    ground_truth = MujocoDynamics(
+        cube_with(real_cube, {**PUBLISHED, **values}), num_threads=1
+    )
     step = FreeBodyPenaltyStep(real_cube, num_substeps=SUBSTEPS)
     step.set_values(values)
     state = real_cube.sample_initial(8, generator)[0]
     real_cube.place_on_terrain(state, torch.ones(8, dtype=torch.float64))
     start = TensorDict(state, [8])
-    truth.reset(start)
-    expected = truth.step(start, start["qpos"][:, :0])
+    ground_truth.reset(start)
+    expected = ground_truth.step(start, start["qpos"][:, :0])
     qpos, qvel, _ = step(start["qpos"], start["qvel"])
     moved = (expected["qpos"] - start["qpos"]).abs().max()
     assert (qpos - expected["qpos"]).abs().max() < 1e-3 * moved

@@ -1,4 +1,4 @@
-"""Free motion: what MuJoCo's own mass matrix and bias forces say."""
+"""Unconstrained motion: what MuJoCo's own mass matrix and bias forces say."""
 
 import copy
 

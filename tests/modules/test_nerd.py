@@ -79,7 +79,7 @@ def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_casting_a_model_casts_its_network_alone(scene, dtype, generator):
+def test_casting_a_model_casts_its_network_only(scene, dtype, generator):
     model = random_model(scene, generator).to(dtype)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     token = model.encode(state["qpos"], state["qvel"], torques[0], terrain).token

@@ -86,7 +86,7 @@ def test_joints_with_limits_stop_where_the_data_end(scene, generator):
     assert torch.equal(speed[:, free_v], qvel[:, free_v])
 
 
-def test_beyond_the_box_is_beyond_trust(scene, generator):
+def test_beyond_the_training_range_is_out_of_distribution(scene, generator):
     model = random_model(scene, generator)
     bounds = model.training_range
     tokens, _ = normalised(model, little_data(scene))

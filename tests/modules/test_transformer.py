@@ -201,7 +201,7 @@ def test_sizes_that_make_no_transformer_are_refused(sizes, named):
         CausalTransformer(TransformerConfig(**sizes), INPUTS, OUTPUTS)
 
 
-def test_autocast_leaves_the_ends_of_a_network_alone(generator):
+def test_autocast_leaves_the_ends_of_a_network_only(generator):
     tokens = randn(generator, 6, INPUTS, dtype=torch.float32)
     for layer in (FullLinear(INPUTS, OUTPUTS), FullLinear(INPUTS, OUTPUTS, bias=False)):
         with torch.autocast("cpu", torch.bfloat16):

@@ -9,8 +9,8 @@ from helpers import (
     HANDMADE,
     every_scene,
     make_scene,
+    mujoco_step,
     random_transitions,
-    true_step,
 )
 
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
@@ -36,7 +36,7 @@ def change_of(scene, steps):
 
 
 def redrawn(scene, steps, key, address, generator):
-    """One coordinate drawn anew, well inside its limits, and one true step from there."""
+    """One coordinate drawn anew, well inside its limits, and one MuJoCo step from there."""
     moved = steps.exclude("next").clone()
     draw = torch.rand(len(steps), dtype=torch.float64, generator=generator)
     value = 4.0 * draw - 2.0
@@ -46,7 +46,7 @@ def redrawn(scene, steps, key, address, generator):
             low, high = scene.model.jnt_range[joint]
             value = low + (0.2 + 0.6 * draw) * (high - low)
     moved[key][:, address] = value
-    return true_step(scene, moved, steps["next", "joint_torque"])
+    return mujoco_step(scene, moved, steps["next", "joint_torque"])
 
 
 def scalar_joints(scene):
@@ -150,5 +150,5 @@ def test_looking_for_symmetries_leaves_the_model_alone(scene, generator):
     assert scene.symmetries is not None
     assert scene.model.opt.disableflags == flags
     assert not flags & mujoco.mjtDisableBit.mjDSBL_LIMIT
-    after = true_step(scene, before, before["next", "joint_torque"])
+    after = mujoco_step(scene, before, before["next", "joint_torque"])
     assert torch.equal(after["next", QVEL], before["next", QVEL])

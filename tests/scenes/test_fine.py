@@ -1,4 +1,4 @@
-"""A finer teacher: the same scene to the model, smaller errors to the truth."""
+"""A finer reference solver: the same scene, a smaller error of the ground truth."""
 
 import warnings
 
@@ -23,7 +23,7 @@ from torchrl_nerd.modules.networks import network_config
 
 
 @every_scene
-def test_it_is_another_truth_of_the_same_scene(scene):
+def test_it_is_another_ground_truth_of_the_same_scene(scene):
     fine = scene.reference
     assert fine.reference is fine and fine.hash != scene.hash
     assert fine.control_step == pytest.approx(scene.control_step, rel=1e-12)

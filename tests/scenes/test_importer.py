@@ -1,4 +1,4 @@
-"""Robots of others: their actuators, grounds and steps are what their own model has."""
+"""Third-party robots: their actuators, grounds and steps are what their own model has."""
 
 import copy
 from dataclasses import replace
@@ -193,12 +193,14 @@ def test_servo_torques_are_the_actuators(servos, generator):
     assert not servos.controller.is_motor and len(servos.actuated) == 6
 
 
-def test_true_steps_are_the_original_models(robot, generator):
+def test_mujoco_steps_are_the_original_models(robot, generator):
     assert robot.controller.is_motor
     check_steps(robot, generator, hold=False)
 
 
-def test_true_steps_of_servos_are_the_originals_with_the_force_held(servos, generator):
+def test_mujoco_steps_of_servos_are_the_originals_with_the_force_held(
+    servos, generator
+):
     check_steps(servos, generator, hold=True)
 
 

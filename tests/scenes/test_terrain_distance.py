@@ -185,7 +185,7 @@ def test_without_parameters_the_ground_is_the_files(ground, generator):
 
 
 @pytest.mark.parametrize("ground", ["moving step", "all moving"])
-def test_both_true_dynamics_put_the_ground_in_place(ground, generator):
+def test_both_mujoco_dynamics_put_the_ground_in_place(ground, generator):
     scene = scene_over(ground)
     terrain = random_terrain(scene, 6, generator)
     state = {QPOS: random_places(6, generator), QVEL: torch.zeros(6, 6).double()}

@@ -29,7 +29,7 @@ SUITE = [
     *("hopper-hop", "humanoid-stand", "pendulum-swingup", "reacher-easy"),
     *("swimmer-swimmer6", "walker-run"),
 ]
-TRUTH = "dm_control"
+GROUND_TRUTH = "dm_control"
 ROWS, STEPS = 3, 40
 
 each_task = pytest.mark.parametrize("name", SUITE)
@@ -55,7 +55,7 @@ def assert_same(got: torch.Tensor, expected, tolerance: float = 1e-6) -> None:
 @each_task
 def test_ground_truth_is_the_suite_step_for_step(name, seed, generator):
     """From the suite's own resets, of the seeds that the env draws."""
-    env = make_env(task_id(name), dynamics=TRUTH, num_envs=ROWS, seed=seed)
+    env = make_env(task_id(name), dynamics=GROUND_TRUTH, num_envs=ROWS, seed=seed)
     state = env.reset()
     u = row_uniforms(seed, torch.zeros(ROWS, dtype=torch.long), 1)[:, 0]
     theirs = [suite_env(name, int(x * 2**32)) for x in u]
@@ -73,7 +73,10 @@ def test_ground_truth_is_the_suite_step_for_step(name, seed, generator):
 
 def test_an_episode_lasts_as_long_as_in_the_suite(seed):
     name = "pendulum-swingup"
-    env, theirs = make_env(task_id(name), dynamics=TRUTH, seed=seed), suite_env(name)
+    env, theirs = (
+        make_env(task_id(name), dynamics=GROUND_TRUTH, seed=seed),
+        suite_env(name),
+    )
     theirs.reset()
     env.reset()
     idle = torch.zeros(env.action_spec.shape)
@@ -85,10 +88,10 @@ def test_an_episode_lasts_as_long_as_in_the_suite(seed):
 
 
 @pytest.mark.parametrize("name", ["cheetah-run", "hopper-hop", "reacher-easy"])
-def test_specs_hold_in_learned_and_true_dynamics(name, generator):
+def test_specs_hold_in_learned_and_mujoco_dynamics(name, generator):
     task = make_task(task_id(name))
     check_env_specs(NeRDEnv(task, random_model(task.scene, generator), 2))
-    for dynamics in ("mujoco", TRUTH):
+    for dynamics in ("mujoco", GROUND_TRUTH):
         check_env_specs(make_env(task, dynamics=dynamics, num_envs=2))
 
 
@@ -129,10 +132,10 @@ def test_resets_follow_the_seed_and_travel(name, generator):
 def test_feet_feel_in_learned_dynamics_what_mujoco_says(generator):
     """At the state and action that led to it: the suite's own after a step is older."""
     task = make_task("dm_control/hopper-stand")
-    truth = make_env(task, dynamics="mujoco", num_envs=32, seed=1)
-    truth.reset()
-    action = random_actions(truth, 60, generator)
-    state = act_all(truth, action)[:, -1]
+    ground_truth = make_env(task, dynamics="mujoco", num_envs=32, seed=1)
+    ground_truth.reset()
+    action = random_actions(ground_truth, 60, generator)
+    state = act_all(ground_truth, action)[:, -1]
     assert state["observation"][:, -2:].any(), "no foot on the ground"
     seen = task.observation(dict(state.items()) | {"action": action[-1]})
     theirs = suite_env("hopper-stand")
@@ -149,7 +152,7 @@ def test_feet_feel_in_learned_dynamics_what_mujoco_says(generator):
 def test_mujoco_and_dm_control_feel_the_same(seed, generator):
     envs = [
         make_env("dm_control/hopper-stand", dynamics=engine, num_envs=4, seed=seed)
-        for engine in ("mujoco", TRUTH)
+        for engine in ("mujoco", GROUND_TRUTH)
     ]
     states = [env.reset() for env in envs]
     for torque in random_drive(envs[0].scene, 4, 10, generator)[1]:
@@ -162,8 +165,8 @@ def test_mujoco_and_dm_control_feel_the_same(seed, generator):
 
 def test_a_held_action_is_the_same_action_again_and_again(seed, generator):
     name = task_id("walker-walk")
-    held = make_env(SuiteTask(name, 3), dynamics=TRUTH, num_envs=2, seed=seed)
-    plain = make_env(name, dynamics=TRUTH, num_envs=2, seed=seed)
+    held = make_env(SuiteTask(name, 3), dynamics=GROUND_TRUTH, num_envs=2, seed=seed)
+    plain = make_env(name, dynamics=GROUND_TRUTH, num_envs=2, seed=seed)
     assert held.task.horizon == 334 and plain.task.horizon == 1000
     for env in (held, plain):
         env.reset()

@@ -215,7 +215,7 @@ def _edit_arrays(path: Path, rng: Generator, marker: Path) -> None:
     name = str(rng.choice(sorted(arrays)))
     value = arrays[name]
     with np.errstate(all="ignore"):
-        spoilt: tuple[Callable[[], Any], ...] = (
+        corrupted: tuple[Callable[[], Any], ...] = (
             lambda: np.array(Marker(marker), dtype=object),
             lambda: value.astype(str),
             lambda: value.astype(complex),
@@ -233,7 +233,7 @@ def _edit_arrays(path: Path, rng: Generator, marker: Path) -> None:
             lambda: np.zeros(len(value), [("a", "f8")]),
             lambda: value.astype("M8[s]"),
         )
-        arrays[name] = spoilt[int(rng.integers(len(spoilt)))]()
+        arrays[name] = corrupted[int(rng.integers(len(corrupted)))]()
     if rng.random() < 0.2:
         arrays[str(rng.choice(NAMES[:4]))] = arrays.pop(name)
     np.savez(path, allow_pickle=True, **arrays)

@@ -1,4 +1,4 @@
-"""Spoilt files through every public loader: refused in one sentence, or sound.
+"""Corrupted files through every public loader: refused in one sentence, or sound.
 
     python tests/tools/fuzz_files.py --files 10000 --seed 0 --json fuzz.json
 
@@ -47,7 +47,7 @@ class Options:
     first: int = 0
     """Number of the first file: to repeat one, or to go on."""
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 def in_child(work: Callable[[], Iterable[str]]) -> list[str]:
@@ -159,7 +159,7 @@ def try_files(
         said = in_child(work)
         found = list(zip(said[::3], said[1::3], said[2::3], strict=False))
         if not found:
-            raise RuntimeError(f"file {numbers[0]} could not be spoilt")
+            raise RuntimeError(f"file {numbers[0]} could not be corrupted")
         for number, each in zip(numbers, found, strict=False):
             yield number, *each
         numbers = numbers[len(found) :]

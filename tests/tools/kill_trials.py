@@ -65,7 +65,7 @@ class Options:
     """In all, in turns among the kinds of work."""
     seed: int = 0
     json: Path | None = None
-    """Write the figures to this file."""
+    """Write the results to this file."""
 
 
 class Work(Protocol):

@@ -1,4 +1,4 @@
-"""Figures of a run in TensorBoard, Weights & Biases and MLflow themselves, offline."""
+"""Results of a run in TensorBoard, Weights & Biases and MLflow themselves, offline."""
 
 import json
 import time
@@ -35,16 +35,16 @@ def wandb(monkeypatch) -> Iterator[ModuleType]:
 
 
 @pytest.fixture
-def figures(rng) -> dict[int, dict[str, float]]:
+def results(rng) -> dict[int, dict[str, float]]:
     """By step, two of them."""
     return {
         step: {"loss": rng.normal(), "hinge_100": rng.normal()} for step in (10, 20, 35)
     }
 
 
-def write(run: Path, name, settings, figures) -> None:
+def write(run: Path, name, settings, results) -> None:
     log = TrainingLog(run, 0, open_logger(name, run, 0, settings))
-    for step, row in figures.items():
+    for step, row in results.items():
         log.write({"step": step, **row})
     log.close()
 
@@ -81,9 +81,9 @@ def finished_records(path: Path, seconds: float = 30.0) -> list:
         time.sleep(0.1)
 
 
-def test_weights_and_biases_has_every_figure(wandb, run, figures, monkeypatch, seed):
+def test_weights_and_biases_has_every_figure(wandb, run, results, monkeypatch, seed):
     monkeypatch.setenv("WANDB_MODE", "offline")
-    write(run, "wandb", {"scene": "cartpole", "seed": seed}, figures)
+    write(run, "wandb", {"scene": "cartpole", "seed": seed}, results)
     (path,) = run.glob("wandb/offline-run-*/run-*.wandb")
     found, settings, names = {}, {}, set()
     for record in finished_records(path):
@@ -96,7 +96,7 @@ def test_weights_and_biases_has_every_figure(wandb, run, figures, monkeypatch, s
         for update in (*record.run.config.update, *record.config.update):
             settings[update.key] = update.value_json
         names |= {(record.run.project, record.run.display_name)}
-    assert found == figures
+    assert found == results
     assert json.loads(settings["seed"]) == seed
     assert (PROJECT, "some run") in names
 
@@ -110,23 +110,23 @@ def test_who_has_no_key_is_told_so(wandb, run, tmp_path, monkeypatch):
         open_logger("wandb", run, 0, {})
 
 
-def test_tensorboard_forgets_what_a_killed_run_wrote_later(run, figures):
+def test_tensorboard_forgets_what_a_killed_run_wrote_later(run, results):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    write(run, "tensorboard", {}, figures)
+    write(run, "tensorboard", {}, results)
     time.sleep(1.0)  # within a second TensorBoard tells its files' order by their names
     log = TrainingLog(run, 10, open_logger("tensorboard", run, 10 + 1, {}))
     log.write({"step": 20, "loss": 7.0})
     log.close()
     board = EventAccumulator(str(run / "tensorboard")).Reload()
     rows = [(event.step, event.value) for event in board.Scalars("loss")]
-    assert rows == [(10, pytest.approx(figures[10]["loss"])), (20, 7.0)]
+    assert rows == [(10, pytest.approx(results[10]["loss"])), (20, 7.0)]
 
 
-def test_mlflow_has_every_figure(run, figures, monkeypatch, seed):
+def test_mlflow_has_every_figure(run, results, monkeypatch, seed):
     mlflow = pytest.importorskip("mlflow")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    write(run, "mlflow", {"scene": "cartpole", "seed": seed}, figures)
+    write(run, "mlflow", {"scene": "cartpole", "seed": seed}, results)
     assert mlflow.active_run() is None
     client = mlflow.MlflowClient(f"sqlite:///{run}/mlflow.db")
     experiment = client.get_experiment_by_name(PROJECT)
@@ -136,7 +136,7 @@ def test_mlflow_has_every_figure(run, figures, monkeypatch, seed):
     for key in ("loss", "hinge_100"):
         history = client.get_metric_history(made.info.run_id, key)
         assert {m.step: m.value for m in history} == {
-            step: row[key] for step, row in figures.items()
+            step: row[key] for step, row in results.items()
         }
 
 
@@ -156,7 +156,7 @@ def test_where_a_library_is_missing_the_extra_is_named(
     assert said.count("\n") == 1
 
 
-def test_the_table_alone(run, figures):
-    write(run, "csv", {}, figures)
+def test_the_table_alone(run, results):
+    write(run, "csv", {}, results)
     assert [path.name for path in run.iterdir()] == ["log.csv"]
     assert open_logger("csv", run, 0, {}) is None

@@ -1,9 +1,9 @@
-"""Losses: the documented formulas, zero for the truth, gradients that are slopes."""
+"""Losses: the documented formulas, zero for the ground truth, gradients that are slopes."""
 
 import numpy as np
 import pytest
 import torch
-from helpers import every_scene, random_transitions, true_step
+from helpers import every_scene, mujoco_step, random_transitions
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import NO_PREDICTIONS
@@ -53,7 +53,7 @@ def handmade_data(scene: Scene, steps: int, generator):
     for _ in range(steps - 1):
         state = transitions[-1]["next"].select("qpos", "qvel")
         torque = torch.randn(ROWS, scene.model.nu, generator=generator).double()
-        transitions.append(true_step(scene, state, torque))
+        transitions.append(mujoco_step(scene, state, torque))
     return torch.stack(transitions, 1)
 
 
@@ -92,7 +92,7 @@ def test_predicting_no_change_costs_less_than_one(generator):
 
 
 @every_scene
-def test_the_truth_has_no_loss(scene, generator):
+def test_the_ground_truth_has_no_loss(scene, generator):
     draw = true_data if scene.name in SCENES else handmade_data
     data = draw(scene, 5, generator)
     model = model_of(scene, data, MLPConfig(1, 4))

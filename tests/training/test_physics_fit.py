@@ -28,10 +28,12 @@ def made(scene, step, generator, height):
 def test_flight_tells_gravity_and_the_centre_of_mass(real_cube, generator):
     step = FreeBodyPenaltyStep(real_cube)
     drawn = 0.01 * torch.randn(3, generator=generator).double()
-    truth = {"gravity": 9.7, **dict(zip(CENTRE, drawn.tolist(), strict=True))}
-    step.set_values(truth)
+    ground_truth = {"gravity": 9.7, **dict(zip(CENTRE, drawn.tolist(), strict=True))}
+    step.set_values(ground_truth)
     tosses = made(real_cube, step, generator, height=1.0)
-    assert fit_flight(real_cube, tosses) == pytest.approx(truth, abs=1e-5, rel=1e-4)
+    assert fit_flight(real_cube, tosses) == pytest.approx(
+        ground_truth, abs=1e-5, rel=1e-4
+    )
 
 
 def test_tosses_without_flight_tell_nothing(real_cube, generator):
@@ -42,7 +44,7 @@ def test_tosses_without_flight_tell_nothing(real_cube, generator):
 def test_a_fit_lowers_the_error(real_cube, generator):
     step = FreeBodyPenaltyStep(real_cube, num_substeps=2)
     tosses = made(real_cube, step, generator, height=0.0)
-    truth, rows = step.values(), tosses.starts(STATES)
+    ground_truth, rows = step.values(), tosses.starts(STATES)
 
     def error_of(values, rows):
         step.set_values(values)
@@ -56,12 +58,12 @@ def test_a_fit_lowers_the_error(real_cube, generator):
         return float(weighted_error(real_cube, errors).mean())
 
     names = ("friction", "gravity")
-    wrong = {**truth, "gravity": 1.02 * truth["gravity"], "friction": 0.2}
+    wrong = {**ground_truth, "gravity": 1.02 * ground_truth["gravity"], "friction": 0.2}
     *_, found = fit_parameters(error_of, wrong, names, rows, evaluations=25)
     before, after = (error_of(x, rows) for x in (wrong, found))
     assert after < 0.2 * before
     assert {k: found[k] for k in PARAMETERS if k not in names} == {
-        k: truth[k] for k in PARAMETERS if k not in names
+        k: ground_truth[k] for k in PARAMETERS if k not in names
     }
 
 

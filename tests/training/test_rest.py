@@ -14,8 +14,8 @@ from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import SCENES
 from torchrl_nerd.training.rest import MAX_SPEED, REST_SPEED, ROWS, find_rest, resting
 
-GROUNDED = [name for name in SCENES if load_scene(name).terrain is not None]
-each_grounded = pytest.mark.parametrize("name", GROUNDED)
+ON_GROUND = [name for name in SCENES if load_scene(name).terrain is not None]
+each_on_ground = pytest.mark.parametrize("name", ON_GROUND)
 
 
 def states_at_rest(scene, generator, rows=32):
@@ -41,7 +41,7 @@ def sluggish_and_at_rest(scene, generator):
     return sluggish_model(scene, generator, 1e-5), states_at_rest(scene, generator)
 
 
-@each_grounded
+@each_on_ground
 def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
     model, states = sluggish_and_at_rest(load_scene(name), generator)
     assert not torch.equal(after(model, states, 50)[QPOS], states[QPOS])
@@ -53,7 +53,7 @@ def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
     assert torch.equal(end[QPOS], states[QPOS]) and not end[QVEL].any()
 
 
-@each_grounded
+@each_on_ground
 def test_what_moves_is_left_alone(name, generator):
     scene = load_scene(name)
     model, states = sluggish_and_at_rest(scene, generator)
@@ -63,7 +63,7 @@ def test_what_moves_is_left_alone(name, generator):
     assert torch.equal(after(model, states, 3)[QPOS], before[QPOS])
 
 
-@each_grounded
+@each_on_ground
 def test_what_gains_more_speed_than_at_rest_is_awake(name, generator):
     model, states = sluggish_and_at_rest(load_scene(name), generator)
     find_rest(model, states)

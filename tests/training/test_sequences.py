@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import true_step
+from helpers import mujoco_step
 from tensordict import TensorDict
 from torch import Generator
 
@@ -52,13 +52,13 @@ def test_windows_lie_inside_one_trajectory(length, sequences, data, seed):
         assert torch.equal(terrain, data["terrain"][row, start])
 
 
-def test_windows_move_as_the_truth_does(scene, sequences, generator):
+def test_windows_move_as_the_ground_truth_does(scene, sequences, generator):
     qpos, qvel, torque, terrain = sequences.rollout(20, 3, generator)
     for t in range(3):
         state = {"qpos": qpos[:, t], "qvel": qvel[:, t]}
         if terrain is not None:
             state["terrain"] = terrain
-        after = true_step(scene, TensorDict(state, batch_size=[20]), torque[:, t])
+        after = mujoco_step(scene, TensorDict(state, batch_size=[20]), torque[:, t])
         torch.testing.assert_close(
             after["next", "qpos"], qpos[:, t + 1], rtol=1e-7, atol=1e-6
         )

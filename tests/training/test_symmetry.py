@@ -1,4 +1,4 @@
-"""A robot's isometries: groups that the true solver and the features agree with."""
+"""A robot's isometries: groups that the MuJoCo solver and the features agree with."""
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def data(scene, generator):
 
 
 def test_the_image_of_a_trajectory_is_the_trajectory_of_the_image(scene, data):
-    """Whole rollouts of the true solver, impacts included."""
+    """Whole rollouts of the MuJoCo solver, impacts included."""
     steps, start = 10, data[:, 0]
     torque = data[JOINT_TORQUE][:, :steps]
     dynamics = MujocoDynamics(scene, num_threads=1)
@@ -52,7 +52,7 @@ def test_the_image_of_a_trajectory_is_the_trajectory_of_the_image(scene, data):
         )
         expected = isometry.qpos(data[NEXT_QPOS][:, :steps])
         assert _apart(scene, path[QPOS], expected).median() < 1e-9
-        assert _apart(scene, path[QPOS], expected).max() < 1e-3  # chaos, in contact
+        assert _apart(scene, path[QPOS], expected).max() < 1e-3  # sensitive, in contact
         expected = isometry.qvel(data[NEXT_QVEL][:, :steps])
         assert (path[QVEL] - expected).abs().median() < 1e-8
 
@@ -114,7 +114,7 @@ def test_statistics_are_those_of_all_images(scene, data):
 
 
 def test_batches_show_images_of_the_data(scene, data, generator):
-    """Those of one step and those of rollouts, which the true solver also takes."""
+    """Those of one step and those of rollouts, which the MuJoCo solver also takes."""
     symmetry = Symmetry.of(scene, data)
     model = NeRD(
         scene,

@@ -12,8 +12,8 @@ from helpers import (
     make_scene,
     moved_rows,
     moved_scene,
+    mujoco_step,
     random_transitions,
-    true_step,
     with_points_in_order,
 )
 
@@ -204,13 +204,13 @@ def test_what_far_points_do_is_not_seen(scene, junk, generator, monkeypatch):
     assert is_far.any()
     true = transform.kinematics.forward
 
-    def spoilt(qpos, qvel):
+    def corrupted(qpos, qvel):
         places, velocity = true(qpos, qvel)
         velocity = velocity.clone()
         velocity[:, : transform.count][is_far] = junk
         return places, velocity
 
-    monkeypatch.setattr(transform.kinematics, "forward", spoilt)
+    monkeypatch.setattr(transform.kinematics, "forward", corrupted)
     for got, want in zip(transform.contact_features(*given), features, strict=True):
         assert torch.equal(got, want)
 
@@ -254,7 +254,7 @@ def test_equal_features_mean_equal_motion_on_a_slope(generator):
     turned[QPOS][:, :3] = rows[QPOS][:, :3]
     seen, change = [], []
     for start in (rows, turned):
-        step = true_step(scene, start.exclude("next"), rows["next", "joint_torque"])
+        step = mujoco_step(scene, start.exclude("next"), rows["next", "joint_torque"])
         after, now = step["next"], (start[QPOS], start[QVEL])
         features = contact_features(scene, start).values()
         own = RobotCentric(scene).state_features(*now)

@@ -7,9 +7,9 @@ from helpers import (
     every_scene,
     moved_rows,
     moved_scene,
+    mujoco_step,
     random_states,
     random_transitions,
-    true_step,
 )
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -81,7 +81,7 @@ def test_a_robot_moves_the_same_way_everywhere(scene, generator):
     shift = torch.stack(shift)
     moved = moved_rows(scene, rows.exclude("next"), float(yaw), shift)
     elsewhere = moved_scene(scene, float(yaw), shift)
-    there = true_step(elsewhere, moved, rows["next", "joint_torque"])
+    there = mujoco_step(elsewhere, moved, rows["next", "joint_torque"])
     got, want = delta_of(elsewhere, there), delta_of(scene, rows)
     assert (got - want).abs().max() < 1e-5 * want.abs().max()
 

@@ -35,13 +35,15 @@ def test_in_closed_loop_the_policy_acts_on_what_it_sees(closed_loop, seed):
         return shown.set("action", torch.full((1, 1), 0.3 if len(seen) % 2 else -0.3))
 
     pair = roll_out_both("cartpole/swingup", BOTH, actor, STEPS, seed, closed_loop)
-    learned, truth = pair.paths
+    learned, ground_truth = pair.paths
     assert pair.kinds == ["learned", "ground truth"]
-    assert torch.equal(learned[0], truth[0]) and not torch.equal(learned[2], truth[2])
+    assert torch.equal(learned[0], ground_truth[0]) and not torch.equal(
+        learned[2], ground_truth[2]
+    )
     assert torch.equal(torch.stack(seen[0::2]), learned[:-1])
-    assert torch.equal(torch.stack(seen[1::2]), truth[:-1])
+    assert torch.equal(torch.stack(seen[1::2]), ground_truth[:-1])
     # the policy pushes the two carts to opposite sides; in open loop to the same
-    assert (abs(learned[-1] - truth[-1]).max() > 1e-3) == closed_loop
+    assert (abs(learned[-1] - ground_truth[-1]).max() > 1e-3) == closed_loop
 
 
 def test_random_actions_are_those_of_their_seed_and_the_same_in_both(seed):

@@ -1,4 +1,4 @@
-"""Files that were spoilt are refused in one sentence, and nothing in them is ever run."""
+"""Corrupted files are refused in one sentence, and nothing in them is ever run."""
 
 import shutil
 import subprocess
@@ -52,11 +52,11 @@ def edit(path: Path, **changes: object) -> None:
     write_json(path, {**read_json(path), **changes})
 
 
-def test_spoilt_files_are_refused_or_sound(kind, tmp_path, rng):
+def test_corrupted_files_are_refused_or_sound(kind, tmp_path, rng):
     sound, marker = make(kind, tmp_path / "sound"), tmp_path / "marker"
     shapes = shapes_of(KINDS[kind].load(shutil.copytree(sound, tmp_path / "copy")))
     for _ in range(FILES):
-        place = shutil.copytree(sound, tmp_path / "spoilt")
+        place = shutil.copytree(sound, tmp_path / "corrupted")
         done = corruptions.corrupt(place, rng, marker)
         said = outcome(KINDS[kind], place, shapes)
         assert said in OUTCOMES and not marker.exists(), f"{done}: {said}"
@@ -198,7 +198,7 @@ def test_odd_names_are_refused_in_one_sentence(call, name):
 
 
 @pytest.mark.slow
-def test_thousands_of_spoilt_files(seed, tmp_path):
+def test_thousands_of_corrupted_files(seed, tmp_path):
     """Each in a process with limits on time and memory."""
     command = [sys.executable, "fuzz_files.py", "--files", "3000", "--seed", str(seed)]
     subprocess.run([*command, "--json", tmp_path / "f.json"], check=True, cwd=TOOLS)
