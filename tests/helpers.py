@@ -63,9 +63,14 @@ def slow_but(quick: Iterable[Any], names: Iterable[Any]) -> list:
     """All names for `pytest.mark.parametrize`; those that are not quick, marked slow."""
     quick = set(quick)
     return [
-        name if name in quick else pytest.param(name, marks=pytest.mark.slow)
+        name if name in quick else pytest.param(*_several(name), marks=pytest.mark.slow)
         for name in names
     ]
+
+
+def _several(values: Any) -> tuple:
+    """The values of several parameters, or of one."""
+    return values if isinstance(values, tuple) else (values,)
 
 
 def make_scene(model: mujoco.MjModel | str, name: str = "handmade") -> Scene:

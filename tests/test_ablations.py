@@ -7,7 +7,7 @@ from ablations.__main__ import Options, main
 from ablations.networks import LSTMConfig, MarkovConfig
 from ablations.training import VariantTrainer
 from ablations.variants import BASE, VARIANTS
-from helpers import moved_rows, random_transitions
+from helpers import moved_rows, random_transitions, slow_but
 from tensordict import TensorDict
 
 from torchrl_nerd.data.generate import is_sound, simulate
@@ -25,10 +25,10 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN
 from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.samples import raw_tokens
 
-every_variant = pytest.mark.parametrize(
-    ("name", "variant"),
-    [(scene, name) for scene, variants in VARIANTS.items() for name in variants],
-)
+VARIANTS_OF = [
+    (scene, name) for scene, variants in VARIANTS.items() for name in variants
+]
+every_variant = pytest.mark.parametrize(("name", "variant"), VARIANTS_OF)
 UPDATES = 48  # a quarter of them, by chance, on sequences
 UNMOVED = {  # whether a variant of the Ant knows where it stands
     name: name not in ("world frame", "end to end") for name in VARIANTS["ant"]
@@ -58,7 +58,7 @@ def test_the_true_target_leads_to_the_true_next_state(name, variant, generator):
     torch.testing.assert_close(qvel, rows[NEXT_QVEL], atol=1e-10, rtol=0.0)
 
 
-@every_variant
+@pytest.mark.parametrize(("name", "variant"), slow_but([("ant", BASE)], VARIANTS_OF))
 def test_it_trains(name, variant, seed, generator, tmp_path):
     scene = load_scene(name)
     data = simulate(scene, 3, 40, generator)
@@ -159,6 +159,7 @@ def test_one_token_is_a_transformer_without_a_past(generator):
     torch.testing.assert_close(network(token), alone)
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_table_and_reads_what_is_done(
     seed, tmp_path, monkeypatch, capsys
 ):

@@ -1,8 +1,10 @@
 """The benchmark of compiled envs, at a tiny budget."""
 
 import compiled_env
+import pytest
 
 
+@pytest.mark.slow  # compiles
 def test_both_take_their_turns(capsys, seed):
     options = compiled_env.Options(("cartpole/swingup",), rows=2, rounds=1, seed=seed)
     compiled_env.main(options)

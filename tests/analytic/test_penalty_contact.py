@@ -239,7 +239,7 @@ def test_a_rolling_ball_is_turned_by_its_rim():
 @pytest.mark.parametrize(
     ("scene", "sentence"),
     [
-        (load_scene("franka"), "expected a scene with a ground, got 'franka'"),
+        (load_scene("cartpole"), "expected a scene with a ground, got 'cartpole'"),
         (ON_GROUND[0].reference, "expected substeps of mjINT_EULER, got mjINT_RK4"),
         (ball("pyramidal"), "expected elliptic friction cones, got pyramidal ones"),
     ],

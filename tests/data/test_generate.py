@@ -11,18 +11,11 @@ from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import generate, load_data
 from torchrl_nerd.data.simulate import LARGEST, is_sound, simulate
 from torchrl_nerd.files import read_json
-from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.seeds import fold_in
 
 SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
 STATE = ("qpos", "qvel")
-DRIVEN = [
-    scene
-    for scene in map(load_scene, SCENES)
-    if scene.actuated and scene.sampling.drive is None
-]
-each_driven = pytest.mark.parametrize("scene", DRIVEN, ids=lambda scene: scene.name)
-"""Every robot with motors whose torques are drawn at random."""
 
 
 def unequal(data: TensorDict, expected: TensorDict) -> list:
@@ -102,8 +95,8 @@ def test_starts_and_torques_lie_within_the_ranges(scene, generator):
         assert (torque <= torch.tensor(ranges.torque)).all()
 
 
-@each_driven
-def test_passive_and_quiet_rows_have_their_shares(scene, generator):
+def test_passive_and_quiet_rows_have_their_shares(motor_scene, generator):
+    scene = motor_scene
     rows, steps = 1000, 30
     data = simulate(scene, rows, steps, generator)
     relative = data["next", "joint_torque"] / torch.tensor(scene.sampling.torque)
@@ -155,8 +148,8 @@ def test_soundness_is_finite_and_bounded(generator):
             assert torch.equal(is_sound(wrapped), expected)
 
 
-@each_driven
-def test_broken_trajectories_are_dropped_and_counted(scene, tmp_path, seed):
+def test_broken_trajectories_are_dropped_and_counted(motor_scene, tmp_path, seed):
+    scene = motor_scene
     strong = tuple(1e9 * torque for torque in scene.sampling.torque)
     ranges = {"torque": strong, "zero_torque_fraction": 0.5, "low_torque_fraction": 0.0}
     wild = replace(scene, sampling=replace(scene.sampling, **ranges))

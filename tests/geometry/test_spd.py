@@ -57,9 +57,9 @@ def test_few_columns_or_many(columns, generator):
         torch.testing.assert_close(each(matrix, rows), expected, **CLOSE)
 
 
-@pytest.mark.parametrize("shape", slow_but(SHAPES[:1], SHAPES), ids=str)
-def test_branch_by_branch(shape, generator):
-    root, count, size = branches = BranchSparsity(*shape)
+@pytest.mark.parametrize(("root", "count", "size"), slow_but(SHAPES[:1], SHAPES))
+def test_branch_by_branch(root, count, size, generator):
+    branches = BranchSparsity(root, count, size)
     matrix, right = drawn(root + count * size, generator)
     branch = torch.tensor([-1] * root + [k for k in range(count) for _ in range(size)])
     is_apart = (branch[:, None] != branch) & (branch[:, None] >= 0) & (branch >= 0)

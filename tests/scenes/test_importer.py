@@ -346,7 +346,7 @@ def test_ranges_can_be_given():
     state, _ = scene.sample_initial(50, torch.Generator().manual_seed(0))
     assert scene.clearances(state[QPOS]).min() >= 0.3
     buried = Scene.from_gymnasium("Hopper-v5", clearance=1e3)
-    with pytest.raises(ValueError, match="starts clear of the ground"):
+    with pytest.raises(ValueError, match="states clear of the ground"):
         buried.sample_initial(1, torch.Generator().manual_seed(0))
 
 

@@ -157,8 +157,8 @@ def test_the_command_continues_from_several_data_sets(tmp_path, monkeypatch, cap
         ),
         (["--data", "a", "--init-from", "none"], "checkpoint folder, got 'none'"),
         (
-            ["--data", "a", "--init-from", "cartpole-micro"],
-            "start from, mlp-1x16, got",
+            ["--data", "a", "--init-from", "cartpole-mlp"],
+            "start from, mlp-1x32, got",
         ),
         (["--data", "a", "none"], "expected a data set in none"),
         (

@@ -249,11 +249,10 @@ class Trainer:
         """Mean errors of the averaged model; the best model so far is saved."""
         self.errors = self.validation(self.averaged_model(), self.device)
         score = self.validation.score(self.errors)
-        is_best = score < self.best
-        self.best = score if is_best else self.best
         # the first model is saved even if its rollouts diverge
-        if is_best or not (self.folder / "best").exists():
+        if score < self.best or not (self.folder / "best").exists():
             self._save_model("best")
+        self.best = min(self.best, score)
         return metrics(self.errors)
 
     def save(self) -> None:
