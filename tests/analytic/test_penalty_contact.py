@@ -246,7 +246,7 @@ def test_a_rolling_ball_is_turned_by_its_rim():
 )
 def test_what_it_does_not_know_is_refused(scene, sentence):
     with pytest.raises(ValueError, match=sentence):
-        PenaltyContactStep(scene)
+        PenaltyContactStep(scene, num_outer_steps=1)
 
 
 def test_nobody_stages_four_times():
