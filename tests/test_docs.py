@@ -23,6 +23,7 @@ from tensordict import TensorDict
 
 import torchrl_nerd
 from torchrl_nerd import load_scene
+from torchrl_nerd.checkpoint import shipped_card, shipped_models
 
 ROOT = Path(__file__).parents[1]
 DOCS, README = ROOT / "docs", ROOT / "README.md"
@@ -267,6 +268,26 @@ def test_examples_in_docstrings_run(path):
     assert tried > 0 and failed == 0
 
 
+# -- models --------------------------------------------------------------------------------
+
+
+def test_the_gallery_has_every_shipped_model_under_its_kind():
+    shown, kind = {}, ""
+    for line in (DOCS / "gallery.md").read_text().splitlines():
+        kind = line[3:].lower() if line.startswith("## ") else kind
+        if found := re.match(r"\| `([\w-]+)`.*\|", line):
+            shown[found[1]] = kind, line
+    for name in shipped_models():
+        card = shipped_card(name)
+        kind, line = shown.pop(name)
+        assert kind == card["kind"]
+        if (network := card["network"]) is not None:
+            kind = {"transformer": "transformer", "mlp": "MLP"}[network["kind"]]
+            depth = network.get("layers") or network["depth"]
+            assert f"{kind} {depth}x{network['width']}" in line
+    assert not shown
+
+
 # -- results -------------------------------------------------------------------------------
 
 
@@ -306,7 +327,7 @@ def test_readme_s_results_are_what_was_measured(row):
     named = [model, "analytic", "coarse", "paper (NeRD)"]
     assert shown == [f"{errors[n]['mean']:.2g}" if n in errors else "-" for n in named]
     assert unit == errors[model]["unit"] and errors[model]["kind"] == "learned"
-    card = torchrl_nerd.checkpoint.shipped_card(model)
+    card = shipped_card(model)
     assert card["network"]["kind"] == network.lower()
 
 
