@@ -21,7 +21,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import Candidate, models
 from torchrl_nerd.evaluation.bench.rates import RateBenchmark, Sample
 from torchrl_nerd.files import read_json, write_json
@@ -140,11 +140,15 @@ def measure(options: Options) -> dict[str, Ratio]:
 
 def conditions(options: Options) -> dict[str, Any]:
     """What a baseline holds for: tasks, batch, threads and networks."""
-    networks = {
-        c.name: asdict(c.make(make_task(task_id).scene).model.config)  # pyright: ignore
-        for task_id in options.tasks
-        for c in models(make_task(task_id).scene)
-    }
+    networks = {}
+    for task_id in options.tasks:
+        scene = make_task(task_id).scene
+        made = {c.name: c.make(scene) for c in models(scene)}
+        networks |= {
+            name: asdict(dynamics.model.config)
+            for name, dynamics in made.items()
+            if isinstance(dynamics, NeRDDynamics)
+        }
     return {"rows": options.rows, "threads": options.threads, "networks": networks}
 
 

@@ -16,7 +16,7 @@ from dynamics_helpers import edit_card, random_drive, random_model, roll, unequa
 
 import torchrl_nerd
 from torchrl_nerd import from_pretrained, load_scene
-from torchrl_nerd.analytic import FreeBodyPenaltyStep
+from torchrl_nerd.analytic import FreeBodyPenaltyStep, make_step
 from torchrl_nerd.checkpoint import (
     CARD,
     PRETRAINED,
@@ -241,3 +241,23 @@ def last_training(target: str) -> tuple[dict, int]:
     }
     more = sum(int(words[words.index("--trajectories") + 1]) for words in drawn)
     return changes, more
+
+
+def test_a_model_saved_again_still_names_the_solver_it_learned_from(tmp_path):
+    model = from_pretrained("cartpole-mlp-rk4")
+    card = make_card(
+        load_checkpoint(save_checkpoint(model, tmp_path, make_card(model)))
+    )
+    assert (
+        card["reference_ratio"]
+        == shipped_card("cartpole-mlp-rk4")["reference_ratio"]
+        > 1
+    )
+
+
+def test_a_folder_goes_before_the_short_name_of_a_shipped_model(tmp_path, monkeypatch):
+    step = make_step(load_scene("ant"))
+    save_checkpoint(step, tmp_path / "ant", make_card(step))
+    assert from_pretrained("ant").kind == "learned"
+    monkeypatch.chdir(tmp_path)
+    assert from_pretrained("ant").kind == "analytic"

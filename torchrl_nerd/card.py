@@ -59,6 +59,7 @@ def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str,
     if isinstance(model, NeRD):
         card["network"] = _described(NETWORK_KINDS, model.config)
         card["features"] = asdict(model.scene_features.config)
+        card["reference_ratio"] = model.reference_ratio
     if isinstance(model, HybridNeRD):
         step = model.analytic_step
     if step is not None:

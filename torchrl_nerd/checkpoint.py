@@ -93,6 +93,8 @@ def read_checkpoint(
     )
     model.load_state_dict(weights)
     model.eval()
+    if isinstance(model, NeRD):
+        model.reference_ratio = solver_scene.reference_ratio
     if card.get("scene_hash") != solver_scene.hash:
         return model, None
     return model, self_check(model, solver_scene, tensors, str(folder / WEIGHTS))
@@ -101,7 +103,8 @@ def read_checkpoint(
 def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> Model:
     """A shipped model by its name, or one of your own by its folder.
 
-    The name of a scene stands for its learned model: ``ant`` for ``ant-mlp``.
+    The name of a scene stands for its learned model, ``ant`` for ``ant-mlp``, where no
+    folder has that name.
 
     Raises:
         ValueError: neither a shipped model nor a folder with a checkpoint.
@@ -109,11 +112,12 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     asked = str(name_or_folder)
     name = folder_name(asked) if is_import(asked) else asked
     shipped = shipped_models()
-    for known in (name, f"{name}-mlp"):
-        if known in shipped:
-            return load_checkpoint(PRETRAINED / known, scene)
+    if name in shipped:
+        return load_checkpoint(PRETRAINED / name, scene)
     if os.path.isdir(asked):  # False, too, for what no path can be
         return load_checkpoint(Path(name_or_folder), scene)
+    if f"{name}-mlp" in shipped:
+        return load_checkpoint(PRETRAINED / f"{name}-mlp", scene)
     if is_import(asked):
         raise ValueError(
             f"no model of '{asked}' is shipped: make one with `nerd data {asked}` and "

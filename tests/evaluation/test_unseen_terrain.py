@@ -47,7 +47,7 @@ def test_the_pendulum_hits_the_ground_and_the_trained_model_follows(case, seed):
     start = initial_states(task, rows, seed)
     ground_truth = open_loop(MujocoDynamics(task.scene, 1), start, steps)
     model = from_pretrained("double_pendulum")
-    learned = open_loop(NeRDDynamics(model.over(task.scene)), start, steps)
+    learned = open_loop(NeRDDynamics(model.with_terrain(task.scene)), start, steps)
     air = torch.tensor([0.0, 0.0, 1.0, -50.0]).double().expand(rows, -1)
     blind = open_loop(NeRDDynamics(model), start.clone().set("terrain", air), steps)
     touching = task.scene.clearances(ground_truth).amin((1, 2)) < 0.0
@@ -59,20 +59,21 @@ def test_the_pendulum_hits_the_ground_and_the_trained_model_follows(case, seed):
 def test_other_robots_and_other_features_are_refused():
     model = from_pretrained("double_pendulum")
     with pytest.raises(ValueError, match="got another robot in 'cartpole'"):
-        model.over(load_scene("cartpole"))
+        model.with_terrain(load_scene("cartpole"))
 
     def floor(spec):
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1, 1, 1))
 
     with pytest.raises(ValueError, match="ground with the features .*contact_normal"):
-        model.over(double_pendulum_over(floor))
+        model.with_terrain(double_pendulum_over(floor))
 
 
 def test_the_command_measures_them(tmp_path, capsys):
     out = tmp_path / "errors.json"
-    argv = ["eval", "double_pendulum", "--unseen-terrain", "--rows", "4"]
+    argv = ["eval", "double_pendulum", "--unseen-terrain", "--num-trajectories", "4"]
     assert main([*argv, "--json", str(out)]) == 0
-    rows = read_json(out)["errors"]
-    assert [row["case"] for row in rows] == [case for case in CASES for _ in range(2)]
+    errors = read_json(out)["results"]["errors"]
+    assert {row["case"] for row in errors} == set(CASES)
+    assert {"double_pendulum", "analytic"} <= {row["name"] for row in errors}
     assert main(["eval", "cartpole", "--unseen-terrain"]) == 2
     assert "no unseen terrain for 'cartpole'" in capsys.readouterr().err

@@ -58,7 +58,7 @@ class Command(ABC):
 
     def settings(self) -> list[str]:
         """Every option and its value, a line each."""
-        return [f"  {name:<20}{value}" for name, value in _leaves(self)]
+        return [f"  {name:<28} {value}" for name, value in _leaves(self)]
 
 
 @dataclass(frozen=True, kw_only=True)

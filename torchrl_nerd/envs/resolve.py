@@ -1,5 +1,6 @@
 """One name for every dynamics: what `make_env` and every command take."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import Dynamics, Model, dynamics_of
 from torchrl_nerd.envs.ground_truth import ENGINES, GROUND_TRUTH
-from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes import Scene, is_import
 
 KINDS = ("nerd", "hybrid", "analytic")
 """Names of the models of a scene, beside those of engines and of shipped models."""
@@ -32,7 +33,16 @@ def resolve_model(name: str | Path, scene: Scene) -> Model:
     if asked in STEPS:
         return make_step(scene, STEPS[asked])
     if asked == "nerd":
-        return from_pretrained(scene.name, scene)
+        names = shipped_models()
+        for known in (scene.name, f"{scene.name}-mlp"):
+            if known in names:
+                return from_pretrained(known, scene)
+        if is_import(scene.name):
+            return from_pretrained(scene.name, scene)
+        raise ValueError(
+            f"no learned model of '{scene.name}' is shipped: train one with `nerd train "
+            f"{scene.name}` and give its folder, or use dynamics 'analytic'"
+        )
     if asked == "hybrid":
         if f"{scene.name}-hybrid" not in shipped_models():
             raise ValueError(
@@ -40,7 +50,7 @@ def resolve_model(name: str | Path, scene: Scene) -> Model:
                 "lowers the error of its analytic step; use dynamics 'analytic'"
             )
         return from_pretrained(f"{scene.name}-hybrid", scene)
-    if asked in shipped_models() or Path(asked).is_dir():
+    if asked in shipped_models() or os.path.isdir(asked):
         return from_pretrained(name, scene)
     engines = ", ".join(GROUND_TRUTH)
     raise ValueError(

@@ -97,6 +97,7 @@ class NeRD(nn.Module):
     ) -> None:
         super().__init__()
         self.scene, self.config = scene, network
+        self.reference_ratio = scene.reference_ratio  # of the solver it learned from
         self.scene_features = scene_features or SceneFeatures(scene, features)
         self.state_delta = state_delta or StateDelta(scene)
         num_features, num_outputs = self.scene_features.size, self.state_delta.size
@@ -196,6 +197,7 @@ class NeRD(nn.Module):
             )
         model.network.to(self.dtype)
         model.load_state_dict(self.state_dict())
+        model.reference_ratio = self.reference_ratio
         return model.to(self.device).train(self.training)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
