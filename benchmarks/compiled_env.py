@@ -18,7 +18,7 @@ from torchrl_nerd import NeRDEnv
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.bench.rates import Runner, two_in_turn
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import TASKS, make_task
 
 
@@ -89,8 +89,9 @@ def main(options: Options) -> None:
         )
         print(f"{task:<30}{rates}{row['compile_s']:>14.1f}", flush=True)
     if options.json is not None:
-        about = {"rows": options.rows, "seed": options.seed, "torch": torch.__version__}
-        write_json(options.json, {**about, "tasks": results})
+        write_results(
+            options.json, {"rows": options.rows, "tasks": results}, options.seed
+        )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from tyro.conf import Positional
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import generate
 from torchrl_nerd.dynamics.mujoco import CONTROL, torque_model
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
@@ -93,7 +93,8 @@ def main(options: Options) -> float:
     if options.json is not None:
         names = ("rollout_per_s", "data_per_s", "ratio")
         results = dict(zip(names, (*rates, ratio), strict=True))
-        write_json(options.json, {"scene": scene.name, "threads": threads, **results})
+        results |= {"scene": scene.name, "threads": threads}
+        write_results(options.json, results, options.seed)
     return ratio
 
 

@@ -7,7 +7,6 @@ where there is contact, kinematics and collision; prints median shares. TorchRL'
 is what lies outside `_step`.
 """
 
-import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import tyro
 from torchrl_nerd import NeRDEnv
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import Model
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import make_task
@@ -106,8 +105,7 @@ def main(options: Options) -> None:
         shares = f"{row['torchrl_share']:>9.1%}{row['task_share']:>7.1%}"
         print(f"{line}{shares}{rate:>10.0f}{row['contact_share']:>9.1%}")
     if options.json is not None:
-        machine = {"processor": platform.machine(), "threads": torch.get_num_threads()}
-        write_json(options.json, {"rows": options.rows, **machine, "models": results})
+        write_results(options.json, {"rows": options.rows, "models": results})
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.policy import make_actor
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.settings import expect_at_least
 
@@ -158,7 +158,7 @@ def main(options: Options) -> dict[str, dict[str, Speed]]:
             task: {name: asdict(speed) for name, speed in by_name.items()}
             for task, by_name in found.items()
         }
-        write_json(options.json, {"threads": 1, "tasks": results})
+        write_results(options.json, {"threads": 1, "tasks": results}, options.seed)
     return found
 
 

@@ -22,7 +22,7 @@ from tyro.conf import Positional
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import CHUNK, Mapper, generate
 from torchrl_nerd.data.ray_map import ray_map
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 
@@ -80,7 +80,8 @@ def main(options: Options) -> None:
     if options.json is not None:
         results = {"one_process_per_s": here, "ray_per_s": there, "start_s": start}
         results |= {"first_s": times["ray"][0], "worker_mib": max(memory.values())}
-        write_json(options.json, {"scene": scene.name, "workers": count, **results})
+        results |= {"scene": scene.name, "workers": count}
+        write_results(options.json, results, options.seed)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, two_in_turn
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
@@ -170,7 +170,7 @@ def main(options: Options) -> list[Point]:
         results: dict[str, Any] = {"points": [asdict(p) for p in points]}
         asked = {"network": options.network, "compiled": options.compile}
         asked |= {"threads": 1, "memory_bytes": memory}
-        write_json(options.json, asked | results)
+        write_results(options.json, asked | results, options.seed)
     return points
 
 

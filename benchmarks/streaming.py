@@ -19,7 +19,7 @@ from tyro.conf import Positional
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, two_in_turn
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import load_scene
@@ -82,9 +82,7 @@ def main(options: Options) -> list[Speed]:
     if options.json is not None:
         about = {"scene": scene.name, "rows": options.rows, "threads": options.threads}
         speeds = [asdict(x) for x in found]
-        write_json(
-            options.json, {**about, "torch": torch.__version__, "speeds": speeds}
-        )
+        write_results(options.json, {**about, "speeds": speeds}, options.seed)
     return found
 
 

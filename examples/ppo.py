@@ -30,8 +30,7 @@ from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.plots import plot_learning_curve
 from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
-from torchrl_nerd.evaluation.policy_transfer import mean_returns
-from torchrl_nerd.evaluation.transfer_report import report_transfer
+from torchrl_nerd.evaluation.policy_transfer import mean_returns, report_transfer
 from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.tasks import Task
 

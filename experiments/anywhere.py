@@ -19,13 +19,13 @@ from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
     open_loop_errors,
     scene_of,
 )
-from torchrl_nerd.files import write_json
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import PRESETS, Source
@@ -95,7 +95,8 @@ def main(options: Options) -> dict[str, float]:
         results[name] = float(apart.max())
         print(f"{name:<18}{steps} steps: {results[name]:.1e} relative")
     if options.json is not None:
-        write_json(options.json, {"scene": scene.name, "relative": results})
+        found = {"scene": scene.name, "relative": results}
+        write_results(options.json, found, options.seed)
     return results
 
 

@@ -7,7 +7,6 @@ model meets the same tests: open-loop error, passive and under random actions, a
 return of one and the same policy. What is done is kept under `--out`: a killed run goes on.
 """
 
-import platform
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.robots import PPO_CONFIGS, PRESETS, make_task
@@ -228,8 +228,8 @@ def main(options: Options) -> None:
     for results in run(options):
         rows.append(results)
         if options.json is not None:
-            machine = {"processor": platform.machine(), **_settings(options)}
-            write_json(options.json, {"options": machine, "models": rows})
+            results = {"options": _settings(options), "models": rows}
+            write_results(options.json, results, list(options.seeds))
     print(table(rows))
 
 

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 import tyro
 from tensordict import TensorDict
 from torch import Generator
@@ -21,6 +20,7 @@ from torchrl_nerd.checkpoint import CARD, load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
@@ -131,8 +131,7 @@ def main(options: Options) -> list[dict[str, Any]]:
         )
         print(f"{results['network']:<16}{sizes}  {errors}", flush=True)
         if options.json is not None:
-            threads = torch.get_num_threads()
-            write_json(options.json, {"threads": threads, "models": found})
+            write_results(options.json, found, options.seed)
     return found
 
 

@@ -21,4 +21,4 @@ def test_a_row_for_every_preset(capsys, seed, tmp_path):
     assert found.preset == "transformer-2x64" and not found.is_compiled
     assert found.ratio == found.streaming_per_s / found.window_per_s > 0.0
     assert "transformer-2x64" in capsys.readouterr().out.splitlines()[-1]
-    assert json.loads(path.read_text())["speeds"][0]["ratio"] == found.ratio
+    assert json.loads(path.read_text())["results"]["speeds"][0]["ratio"] == found.ratio

@@ -11,10 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 
 from .measure import Bed, Budget
@@ -78,8 +77,8 @@ def report(scene: str, runs: list[dict[str, Any]], options: Options) -> None:
     name, folder = f"ablations_{scene}", options.results or options.out
     folder.mkdir(parents=True, exist_ok=True)
     (options.out / f"{name}.md").write_text("\n".join(lines) + "\n")
-    content = {"threads": torch.get_num_threads(), "runs": runs}
-    write_json(folder / f"{name}.json", content | {"rows": [asdict(r) for r in rows]})
+    results = {"runs": runs, "rows": [asdict(row) for row in rows]}
+    write_results(folder / f"{name}.json", results, list(options.seeds))
     plot_ratios(rows, folder / f"{name}.png")
 
 

@@ -6,7 +6,7 @@ policy's mean action, the undiscounted sum of rewards. The return difference is
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -20,6 +20,8 @@ from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
 from torchrl_nerd.evaluation.bench.error_table import text_table
+from torchrl_nerd.files import write_json
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
@@ -194,3 +196,31 @@ def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
         about = [name, s.kind, s.model, str(s.episodes)]
         body.append([*about, mean, f"{s.std:.1f}", difference])
     return f"{text_table(head, body)}\n{PAPER_NOTE}"
+
+
+def report_transfer(
+    task: str, actor: Actor, learned_in: str, episodes: int, seed: int, folder: Path
+) -> dict[str, ReturnSummary]:
+    """Print returns in every dynamics and write them to ``returns.json``.
+
+    Args:
+        task: its id.
+        actor: any TorchRL policy.
+        learned_in: the dynamics that the policy was trained in; measured beside the
+            shipped model, MuJoCo and dm_control.
+        episodes: in each, see `transfer`.
+        seed: of the initial states.
+        folder: of the file.
+
+    Returns:
+        Summaries by name of the dynamics.
+
+    Raises:
+        ValueError: see `transfer`, or a folder that cannot be written.
+    """
+    learned = ("nerd",) if shipped_models(make_task(task).scene) else ()
+    everywhere = (learned_in, *learned, "mujoco", "dm_control")
+    returns = transfer(task, actor, everywhere, episodes, seed=seed)
+    print(transfer_table(returns))
+    write_json(folder / "returns.json", {k: asdict(v) for k, v in returns.items()})
+    return returns

@@ -88,31 +88,32 @@ def error_table(
         rows: see `error_rows`.
         rates: name -> control steps per second, for a last column.
     """
-    lines = []
     quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
+    candidates = list(dict.fromkeys((row.name, row.kind) for row in rows))
+    found = {(row.name, row.quantity): row for row in rows}
+    tables = []
     for first in range(0, len(quantities), QUANTITIES):
         shown = quantities[first : first + QUANTITIES]
-        columns = [
-            f"{quantity} ({unit}) mean" if column == "mean" else column
-            for quantity, unit in shown
-            for column in ("mean", "final", "p95")
+        titles = [title for q, unit in shown for title in (f"{q} ({unit})", "", "")]
+        head = ["name", "kind", *("mean", "final", "p95") * len(shown)]
+        body = [
+            [name, kind, *(cell for q, _ in shown for cell in _cells(found, name, q))]
+            for name, kind in candidates
         ]
-        head = ["name", "kind", *columns, *(["steps/s"] if rates is not None else [])]
-        cells: dict[tuple[str, str], dict[str, ErrorRow]] = {}
-        for row in rows:
-            cells.setdefault((row.name, row.kind), {})[row.quantity] = row
-        body = []
-        for (name, kind), by_quantity in cells.items():
-            line = [name, kind]
-            for quantity, _ in shown:
-                row = by_quantity.get(quantity)
-                found = (row.mean, row.final, row.p95) if row else (None,) * 3
-                line += [shown_error(value) for value in found]
-            if rates is not None:
-                line.append(f"{rates[name]:,.0f}" if name in rates else "-")
-            body.append(line)
-        lines.append(text_table(head, body))
-    return "\n\n".join(lines)
+        if rates is not None:
+            titles, head = [*titles, ""], [*head, "steps/s"]
+            for line in body:
+                line.append(f"{rates[line[0]]:,.0f}" if line[0] in rates else "-")
+        tables.append(text_table(head, body, titles))
+    return "\n\n".join(tables)
+
+
+def _cells(
+    found: Mapping[tuple[str, str], ErrorRow], name: str, quantity: str
+) -> list[str]:
+    row = found.get((name, quantity))
+    values = (row.mean, row.final, row.p95) if row else (None,) * 3
+    return [shown_error(value) for value in values]
 
 
 def shown_error(value: float | None) -> str:
@@ -122,13 +123,28 @@ def shown_error(value: float | None) -> str:
     return f"{value:.3g}" if isfinite(value) else "diverges"
 
 
-def text_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Lines with aligned columns, the first two to the left."""
+def text_table(
+    head: Sequence[str], body: Sequence[Sequence[str]], titles: Sequence[str] = ()
+) -> str:
+    """Lines with aligned columns, the first two to the left.
+
+    Args:
+        head: titles of the columns.
+        body: lines of cells.
+        titles: over the columns after the first two; each may be as wide as three columns.
+    """
     widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
-    return "\n".join(
+    lines = [
         "  ".join(
             cell.ljust(width) if number < 2 else cell.rjust(width)
             for number, (cell, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
         for line in (head, *body)
-    )
+    ]
+    if titles:
+        above = " " * (widths[0] + widths[1] + 2)
+        for at, title in enumerate(titles):
+            if title:
+                above = above.ljust(sum(widths[: at + 2]) + 2 * (at + 2)) + title
+        lines.insert(0, above)
+    return "\n".join(lines)
