@@ -73,7 +73,7 @@ def test_the_command_measures_them(tmp_path, capsys):
     argv = ["eval", "double_pendulum", "--unseen-terrain", "--num-trajectories", "4"]
     assert main([*argv, "--json", str(out)]) == 0
     errors = read_json(out)["results"]["errors"]
-    assert {row["case"] for row in errors} == set(CASES)
+    assert {row["case"] for row in errors} == {*CASES, "driven"}
     assert {"double_pendulum", "analytic"} <= {row["name"] for row in errors}
     assert main(["eval", "cartpole", "--unseen-terrain"]) == 2
     assert "no unseen terrain for 'cartpole'" in capsys.readouterr().err
