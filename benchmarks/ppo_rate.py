@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from torchrl_nerd import make_env
-from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.checkpoint import shipped_card, shipped_models
 from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.policy import make_actor
 from torchrl_nerd.evaluation.results import write_results
@@ -102,7 +102,8 @@ class Learner:
 
 def default_tasks() -> list[str]:
     """Tasks with settings of PPO whose robot has a shipped model."""
-    return [name for name in PPO_CONFIGS if name.split("/")[0] in shipped_models()]
+    robots = {shipped_card(name)["scene"] for name in shipped_models()}
+    return [name for name in PPO_CONFIGS if name.split("/")[0] in robots]
 
 
 def speeds(task: str, options: Options) -> dict[str, Speed]:
