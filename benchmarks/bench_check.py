@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import quantiles
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import torch
@@ -145,7 +145,7 @@ def conditions(options: Options) -> dict[str, Any]:
         scene = make_task(task_id).scene
         made = {c.name: c.make(scene) for c in models(scene)}
         networks |= {
-            name: asdict(dynamics.model.config)
+            name: asdict(cast(Any, dynamics.model.config))
             for name, dynamics in made.items()
             if isinstance(dynamics, NeRDDynamics)
         }
