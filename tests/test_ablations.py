@@ -15,6 +15,7 @@ from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.geometry.rotations import quat_conjugate, quat_multiply
 from torchrl_nerd.keys import (
     CONTACT_NORMAL,
+    JOINT_TORQUE,
     NEXT_QPOS,
     NEXT_QVEL,
     QPOS,
@@ -40,7 +41,7 @@ def built(name: str, variant: str, data: TensorDict):
 
 
 def encoded(model, rows: TensorDict):
-    return raw_tokens(model.tokens, model.state_delta, rows)
+    return raw_tokens(model.scene_features, model.state_delta, rows)
 
 
 @every_variant
@@ -49,10 +50,12 @@ def test_the_true_target_leads_to_the_true_next_state(name, variant, generator):
     rows = random_transitions(scene, 64, generator)
     model = built(name, variant, rows)
     token, target = encoded(model, rows)
-    assert token.shape == (64, model.tokens.size)
+    assert token.shape == (64, model.scene_features.size)
     assert target.shape == (64, model.state_delta.size)
     output = model.normalize.normalize(TARGET, target)
-    qpos, qvel = model.decode(rows[QPOS], rows[QVEL], output)
+    state = rows[QPOS], rows[QVEL]
+    seen = model.encode(*state, rows[JOINT_TORQUE], rows.get(TERRAIN, None))
+    qpos, qvel = model.decode(state, seen, output)
     off = differentiate_pos(scene.layout, rows[NEXT_QPOS], qpos)
     torch.testing.assert_close(off, torch.zeros_like(off), atol=1e-10, rtol=0.0)
     torch.testing.assert_close(qvel, rows[NEXT_QVEL], atol=1e-10, rtol=0.0)
@@ -123,7 +126,7 @@ def test_end_to_end_sees_no_ground_and_a_link_frame_turns_it(generator):
     seen = {name: encoded(model, rows)[0] for name, model in models.items()}
     assert torch.equal(seen["end to end"], encoded(models["end to end"], other)[0])
     assert not torch.equal(seen[BASE], encoded(models[BASE], other)[0])
-    width = models[BASE].tokens.contact.sizes[CONTACT_NORMAL]
+    width = models[BASE].scene_features.contact.sizes[CONTACT_NORMAL]
     here, there = (
         seen[name][:, -width:].unflatten(-1, (-1, 3)) for name in (BASE, "link frame")
     )

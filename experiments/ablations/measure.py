@@ -114,7 +114,7 @@ class Bed:
             "variant": name,
             "seed": seed,
             "what": variant.what,
-            "features": model.tokens.size,
+            "features": model.scene_features.size,
             "outputs": model.state_delta.size,
             "weights": sum(weight.numel() for weight in model.network.parameters()),
             "seconds": round(seconds, 1),
