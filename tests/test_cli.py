@@ -13,6 +13,7 @@ from helpers import slow_but
 
 from torchrl_nerd import __version__
 from torchrl_nerd.cli import COMMANDS, main
+from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.evaluation.bench.candidates import mujoco_name, simulators
 from torchrl_nerd.evaluation.bench.error_table import PAPER
 from torchrl_nerd.evaluation.bench.evaluation_set import cases_of
@@ -130,7 +131,11 @@ def test_help_shows_the_preset_of_the_scene(command, scene, capsys):
         main([command, scene.name, "--help"])
     text = capsys.readouterr().out
     assert stop.value.code == 0
-    count = preset.data.trajectories if command == "data" else preset.train.steps
+    count = {
+        "data": preset.data.trajectories,
+        "train": preset.train.steps,
+        "finetune": FinetuneConfig().evaluations,
+    }[command]
     assert f"default: {count})" in text
 
 

@@ -10,6 +10,7 @@ import torch
 
 from torchrl_nerd import __version__
 from torchrl_nerd.configs import (
+    FeatureConfig,
     FreeBodyConfig,
     PenaltyContactConfig,
     StepConfig,
@@ -22,6 +23,7 @@ from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
+from torchrl_nerd.settings import SettingError
 
 FORMAT = 2
 MAX_SIZE = 2**14  # of any number in a configuration
@@ -95,6 +97,17 @@ def step_config_of(card: dict[str, Any], folder: Path) -> StepConfig:
     return _config(STEP_KINDS, card.get("step"), "step", folder)
 
 
+def features_of(card: dict[str, Any], folder: Path) -> FeatureConfig:
+    """The predictions among the features of a card's network.
+
+    Raises:
+        ValueError: it names none that this version can build.
+    """
+    found = card.get("features")
+    fields = {"kind": "features", **found} if isinstance(found, dict) else None
+    return _config({"features": FeatureConfig}, fields, "features", folder)
+
+
 def _described(kinds: dict[str, type], config: Any) -> dict[str, Any]:
     """A configuration with the name of its kind."""
     kind = next(name for name, cls in kinds.items() if type(config) is cls)
@@ -105,12 +118,14 @@ def _config(kinds: dict[str, type], found: Any, what: str, folder: Path) -> Any:
     """The inverse of `_described`, of a card that may say anything."""
     fields = dict(found) if isinstance(found, dict) else {}
     kind = fields.pop("kind", None)
-    sizes = [x for x in fields.values() if not isinstance(x, str)]
     try:
-        if not all(type(size) is int and 0 < size <= MAX_SIZE for size in sizes):
-            raise TypeError
+        default = asdict(kinds[str(kind)]())
+        for name, value in fields.items():
+            fits = type(value) is type(default[name])
+            if not fits or (type(value) is int and not 0 < value <= MAX_SIZE):
+                raise TypeError(name)
         return kinds[str(kind)](**fields)
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, SettingError):
         raise ValueError(
             f"the card in {folder} has a {what} this version cannot build: {found!r}"
         ) from None

@@ -14,8 +14,13 @@ import mujoco
 import torch
 
 from torchrl_nerd.analytic import make_step
-from torchrl_nerd.card import FORMAT, make_card, network_config_of, step_config_of
-from torchrl_nerd.configs import FeatureConfig
+from torchrl_nerd.card import (
+    FORMAT,
+    features_of,
+    make_card,
+    network_config_of,
+    step_config_of,
+)
 from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.hybrid import HybridNeRD
@@ -158,7 +163,7 @@ def _build(
                 return make_step(solver_scene, config)
             network = network_config_of(card, folder)
             _expect_room(network, tensors)
-            features = FeatureConfig(**card["features"])
+            features = features_of(card, folder)
             if kind == "learned":
                 return NeRD(scene, features, network)
             if kind == "hybrid":
@@ -166,7 +171,10 @@ def _build(
                 step = make_step(solver_scene, config)
                 return HybridNeRD(scene, step, features, network)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the model in {folder} cannot be built: {error}") from None
+        raise ValueError(
+            f"the model in {folder}, kind {kind!r} with network {card.get('network')}, "
+            f"cannot be built: {error}"
+        ) from None
     raise ValueError(
         f"expected kind learned, hybrid or analytic in the card in {folder}, got {kind!r}"
     )

@@ -47,6 +47,13 @@ class PenaltyContactConfig:
     merged_substeps: int = 1
     precision: Precision = "float32"
 
+    def __post_init__(self) -> None:
+        if self.precision not in get_args(Precision):
+            raise SettingError(
+                f"expected precision of {', '.join(get_args(Precision))}, "
+                f"got {self.precision!r}"
+            )
+
 
 @dataclass(frozen=True)
 class FreeBodyConfig:
