@@ -9,7 +9,7 @@ import sys
 from itertools import pairwise
 
 import pytest
-from helpers import slow_but
+from helpers import EXCERPT, slow_but
 
 from torchrl_nerd import __version__
 from torchrl_nerd.cli import COMMANDS, main
@@ -145,7 +145,7 @@ def test_help_shows_the_preset_of_the_scene(command, scene, capsys):
         ("data cartpole --trajectories 300 --steps 7", "draw 300 trajectories of"),
         ("train cartpole --network mlp-4x64", "begin a run in runs/cartpole"),
         ("train cartpole --reference rk4", "to datasets/cartpole-rk4"),
-        ("eval cartpole --num-trajectories 77", "num_trajectories    77"),
+        ("eval cartpole --num-trajectories 77", "num_trajectories             77"),
         ("stability cube --cases resting", "('resting',)"),
         ("doctor --json out.json", "out.json"),
     ],
@@ -182,7 +182,8 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("command", ["data", "train", "finetune"])
 def test_a_dry_run_refuses_what_the_run_would(command, capsys):
-    assert "'unicorn'" in refusal(capsys, command, "unicorn", "--dry-run")
+    more = ["--from", str(EXCERPT)] if command == "finetune" else []
+    assert "'unicorn'" in refusal(capsys, command, "unicorn", "--dry-run", *more)
 
 
 def test_an_unknown_command_is_refused(capsys):
@@ -244,8 +245,12 @@ def test_what_cannot_be_read_is_pointed_at(argv, words, capsys):
 def test_a_folder_that_cannot_be_written_is_refused(command, tmp_path, capsys):
     place = tmp_path / "taken"
     place.write_text("not a folder")
-    argv = [command, "cartpole", "--out", str(place), "--data", str(tmp_path / "d")]
-    text = refusal(capsys, *(argv if command == "train" else argv[:4]))
+    more = {
+        "data": [],
+        "train": ["--data", str(tmp_path / "d")],
+        "finetune": ["--from", str(EXCERPT)],
+    }[command]
+    text = refusal(capsys, command, "cartpole", "--out", str(place), *more)
     assert str(place) in text
     assert place.read_text() == "not a folder"
     assert sorted(tmp_path.iterdir()) == [place]

@@ -74,10 +74,10 @@ def test_what_was_fine_tuned_is_measured(update, network, tmp_path, capsys):
         "card.json",
         "curve.json",
     }
-    results = json.loads((out / "card.json").read_text())["finetuning"]
-    assert {"converged_epoch", "converged_seconds", "start", "device"} <= set(results)
-    assert results["update"] == update and results["validation_position_m"] > 0
-    assert ("parameters" in results) == (update == "physics")
+    card = json.loads((out / "card.json").read_text())["finetuning"]
+    assert {"converged_epoch", "converged_seconds", "start", "device"} <= set(card)
+    assert card["update"] == update and card["validation_position_m"] > 0
+    assert ("parameters" in card) == (update == "physics")
     argv = ["eval", "cube", "--data", str(EXCERPT), "--model", str(out)]
     assert main([*argv, "--json", str(results), "--baselines"]) == 0
     content = json.loads(results.read_text())
