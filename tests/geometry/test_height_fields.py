@@ -6,8 +6,8 @@ import pytest
 import torch
 from helpers import random_quats
 
-from torchrl_nerd.geometry.height_fields import height_field_distance
 from torchrl_nerd.geometry.rotations import rotate, rotate_inverse
+from torchrl_nerd.geometry.surfaces import height_field_distance
 
 HALF_X, HALF_Y, HEIGHT, REACH = 1.5, 1.0, 0.6, 0.4
 FIELD = f"""

@@ -8,8 +8,7 @@ import pytest
 import torch
 from helpers import make_scene, random_transitions
 
-from torchrl_nerd.geometry.base import base_pose
-from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.base import JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.keys import QPOS, QVEL
@@ -44,8 +43,7 @@ def free_acceleration(scene, rows, period=0.0, torque=None):
         rows[QPOS], rows[QVEL][:0]
     )
     count = len(axes.bodies)
-    mount = map(torch.as_tensor, scene.fixed_base_pose)
-    rotation = base_pose(scene.base, rows[QPOS], *mount)[1]
+    rotation = scene.base_pose(rows[QPOS])[1]
     corners, places = points[:, count:], points[:, :count]
     where = rotation, corners, places
     return motion(rows[QPOS], rows[QVEL], torque, *where, period)

@@ -16,9 +16,8 @@ from torch import Tensor, nn
 
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult
 from torchrl_nerd.configs import FreeBodyConfig
-from torchrl_nerd.geometry.penalty import friction_force, normal_force
 from torchrl_nerd.geometry.rotations import quat_normalize
-from torchrl_nerd.scenes.penalty_law import PenaltyLaw
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw, friction_force, normal_force
 from torchrl_nerd.scenes.scene import Scene
 
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well

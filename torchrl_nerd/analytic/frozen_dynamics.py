@@ -6,11 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import BasePose
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.kinematics import PointKinematics
-from torchrl_nerd.geometry.motion import cross
+from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants
+from torchrl_nerd.geometry.kinematics import PointKinematics, cross
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
 from torchrl_nerd.geometry.spd import BranchSparsity, spd_inverse
 from torchrl_nerd.scenes.contact_points import shape_points

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.base import JointAxes, keep_constants
 
 NUM_SWEEPS = 3  # of the iteration; it starts from the forces of the solve before
 MAX_DAMPED = (

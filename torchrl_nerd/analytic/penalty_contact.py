@@ -26,7 +26,7 @@ from torchrl_nerd.analytic.base import AnalyticStep, StepResult, check_supported
 from torchrl_nerd.analytic.frozen_dynamics import DynamicsEvaluation
 from torchrl_nerd.analytic.substeps import SubstepIntegrator, SubstepState, state_at
 from torchrl_nerd.configs import PenaltyContactConfig, Precision
-from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.base import JointAxes
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.scene import Scene
 

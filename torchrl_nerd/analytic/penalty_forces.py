@@ -11,10 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.penalty import friction_force, limit_forces, normal_force
-from torchrl_nerd.scenes.penalty_law import PenaltyLaw, limit_stiffness
+from torchrl_nerd.geometry.base import JointAxes, keep_constants
+from torchrl_nerd.scenes.penalty_law import (
+    PenaltyLaw,
+    friction_force,
+    limit_forces,
+    limit_stiffness,
+    normal_force,
+)
 from torchrl_nerd.scenes.scene import Scene
 
 MIN_SLIP = 1e-6  # m/s: keeps the direction of slip defined at rest

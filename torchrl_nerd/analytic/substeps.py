@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from torchrl_nerd.analytic.frozen_dynamics import DynamicsEvaluation, FrozenDynamics
 from torchrl_nerd.analytic.penalty_forces import PenaltyContactForce, PenaltyLimitForce
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.motion import cross
+from torchrl_nerd.geometry.base import JointAxes, keep_constants
+from torchrl_nerd.geometry.kinematics import cross
 from torchrl_nerd.geometry.spd import matvec
 from torchrl_nerd.scenes.scene import Scene
 

@@ -14,9 +14,7 @@ from torch import Tensor
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult, check_supported
 from torchrl_nerd.analytic.joint_limits import JointLimits
 from torchrl_nerd.configs import UnconstrainedConfig
-from torchrl_nerd.geometry.base import BasePose
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last

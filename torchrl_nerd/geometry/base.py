@@ -1,4 +1,4 @@
-"""Which body a robot's own frame B_t rides on, and where that frame is."""
+"""The frame B_t that a robot's coordinates refer to, and its joint axes as points."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,22 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.manifold import FREE
+from torchrl_nerd.geometry.manifold import FREE, HINGE, SLIDE
 from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
+
+
+def keep_constants(module: nn.Module, **values: object) -> None:
+    """Keep copies as float64 buffers: they move with the module, checkpoints omit them."""
+    for name, value in values.items():
+        tensor = torch.from_numpy(np.array(value, dtype=np.float64))
+        module.register_buffer(name, tensor, persistent=False)
+
+
+def keep_indices(module: nn.Module, **values: object) -> None:
+    """Keep integers as buffers: `torch.compile` would guard every entry of a list."""
+    for name, value in values.items():
+        tensor = torch.from_numpy(np.array(value, dtype=np.int64))
+        module.register_buffer(name, tensor, persistent=False)
 
 
 @dataclass(frozen=True)
@@ -32,12 +45,12 @@ class Base:
         Raises:
             ValueError: the model has no joint, or more than one moving tree.
         """
+        weld = model.body_weldid
         roots = [
             body
             for body in range(1, model.nbody)
-            if model.body_dofnum[body] > 0
-            and model.body_weldid[body] == body
-            and model.body_weldid[model.body_parentid[body]] == 0
+            if model.body_dofnum[body] > 0 and weld[body] == body
+            if weld[model.body_parentid[body]] == 0
         ]
         if len(roots) != 1:
             found = "no joint" if not roots else f"{len(roots)} moving trees"
@@ -50,7 +63,7 @@ class Base:
 
 
 def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
-    """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base's mount."""
+    """World position ``(3,)``, m, and rotation ``(3, 3)`` of a fixed base."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     parent = int(model.body_parentid[base.body])
@@ -59,30 +72,12 @@ def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.n
     return position, rotation @ quat_matrix(model.body_quat[base.body])
 
 
-def base_pose(
-    base: Base, qpos: Tensor, mount_position: Tensor, mount_rotation: Tensor
-) -> tuple[Tensor, Tensor]:
-    """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t.
-
-    Args:
-        base: floating, read from ``qpos (*batch, nq)``, or fixed, where its mount is.
-        qpos: of the robot.
-        mount_position: ``(3,)``, m, world.
-        mount_rotation: ``(3, 3)``.
-    """
-    if not base.is_floating:
-        batch = qpos.shape[:-1]
-        return mount_position.expand(*batch, 3), mount_rotation.expand(*batch, 3, 3)
-    q = base.qpos_address
-    return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
-
-
 class BasePose(nn.Module):
-    """`base_pose` of one robot.
+    """World position and rotation of B_t.
 
     Args:
         base: of the robot.
-        mount: position ``(3,)``, m, and rotation ``(3, 3)``, see `fixed_base_pose`.
+        mount: pose of a fixed base, see `fixed_base_pose`; a floating one has its own.
     """
 
     position: Tensor
@@ -94,25 +89,82 @@ class BasePose(nn.Module):
         keep_constants(self, position=mount[0], rotation=mount[1])
 
     def forward(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
-        """Position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` for ``qpos``."""
-        return base_pose(self.base, qpos, self.position, self.rotation)
+        """Position ``(*batch, 3)``, m, and rotation ``(*batch, 3, 3)`` for ``qpos``."""
+        if not self.base.is_floating:
+            batch = qpos.shape[:-1]
+            return self.position.expand(*batch, 3), self.rotation.expand(*batch, 3, 3)
+        q = self.base.qpos_address
+        return qpos[..., q : q + 3], matrix_from_quat(qpos[..., q + 3 : q + 7])
 
 
 def over_ground(
     base: Base, qvel: Tensor, points: Tensor, velocity: Tensor, rotation: Tensor
 ) -> Tensor:
-    """Velocities ``(*batch, P, 3)`` over the ground of points that the base carries.
+    """Velocities ``(*batch, P, 3)``, m/s, of points in the world, in the axes of B_t.
 
     Args:
         base: of the robot.
         qvel: ``(*batch, nv)``.
-        points: ``(*batch, P, 3)``, m, as all that follows in B_t.
-        velocity: as seen by one who rides on the base, ``(*batch, P, 3)``, m/s.
+        points: ``(*batch, P, 3)``, m, in B_t.
+        velocity: relative to the base, ``(*batch, P, 3)``, m/s, in B_t.
         rotation: of the base, ``(*batch, 3, 3)``.
     """
     if not base.is_floating:
         return velocity
     v = base.dof_address
-    linear = (rotation.mT @ qvel[..., v : v + 3, None])[..., 0]
+    linear = (rotation.mT @ qvel[..., v : v + 3, None])[..., 0]  # (*batch, 3)
     angular = qvel[..., None, v + 3 : v + 6].expand_as(velocity)
     return velocity + linear[..., None, :] + torch.linalg.cross(angular, points)
+
+
+@dataclass(frozen=True, eq=False)
+class JointAxes:
+    """The J hinges and slides of a robot whose bodies have at most one joint each.
+
+    The anchor and the tip of every axis are points for `PointKinematics` to find.
+
+    | field | meaning |
+    |---|---|
+    | ``joints`` | ids, in the order of their dofs |
+    | ``bodies`` | of the points: all anchors, then all tips |
+    | ``positions`` | ``(2 J, 3)``, m, in the body's frame |
+    | ``is_slide`` | ``(J,)``: 1 for a slide, 0 for a hinge |
+    """
+
+    model: mujoco.MjModel
+    joints: list[int]
+    bodies: list[int]
+    positions: np.ndarray
+    is_slide: np.ndarray
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, base: Base) -> "JointAxes":
+        """Read them from a compiled model.
+
+        Raises:
+            ValueError: a ball joint, or several joints of one body.
+        """
+        joints = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
+        if len(joints) + base.is_floating < model.njnt or (model.body_jntnum > 1).any():
+            raise ValueError(
+                "expected hinges and slides, one to a body, for the equation of motion, "
+                "got others"
+            )
+        anchor, axis = model.jnt_pos[joints], model.jnt_axis[joints]
+        positions = np.concatenate((anchor, anchor + axis))
+        is_slide = (model.jnt_type[joints] == SLIDE).astype(np.float64)
+        return cls(
+            model, joints, 2 * model.jnt_bodyid[joints].tolist(), positions, is_slide
+        )
+
+    def ancestry(self, bodies: list[int]) -> np.ndarray:
+        """``(J, len(bodies))``: 1 where a body moves with a joint, else 0."""
+        moved = self.bodies[: len(self.joints)]
+        below = [[_is_below(self.model, body, top) for body in bodies] for top in moved]
+        return np.array(below, dtype=np.float64).reshape(len(moved), len(bodies))
+
+
+def _is_below(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
+    while body > ancestor:  # parents come first
+        body = int(model.body_parentid[body])
+    return body == ancestor

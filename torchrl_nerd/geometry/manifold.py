@@ -21,10 +21,8 @@ from torchrl_nerd.geometry.rotations import (
 )
 
 FREE, BALL, SLIDE, HINGE = (
-    int(mujoco.mjtJoint.mjJNT_FREE),
-    int(mujoco.mjtJoint.mjJNT_BALL),
-    int(mujoco.mjtJoint.mjJNT_SLIDE),
-    int(mujoco.mjtJoint.mjJNT_HINGE),
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}"))
+    for kind in ("FREE", "BALL", "SLIDE", "HINGE")
 )
 
 
@@ -47,8 +45,7 @@ class JointLayout:
     @classmethod
     def from_model(cls, model: mujoco.MjModel) -> "JointLayout":
         """Read the joints of a compiled model."""
-        linear: list[tuple[int, int]] = []
-        rotations: list[tuple[int, int]] = []
+        linear, rotations = [], []
         for joint in range(model.njnt):
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             kind = int(model.jnt_type[joint])
@@ -66,20 +63,11 @@ class JointLayout:
         """``linear`` as slices of qpos and qvel, each as long as it gets."""
         found: list[list[int]] = []
         for q, v in self.linear:
-            if (
-                found
-                and found[-1][0] + found[-1][2] == q
-                and found[-1][1] + found[-1][2] == v
-            ):
+            if found and (q, v) == (found[-1][0] + found[-1][2], sum(found[-1][1:])):
                 found[-1][2] += 1
             else:
                 found.append([q, v, 1])
         return tuple((slice(q, q + n), slice(v, v + n)) for q, v, n in found)
-
-    @property
-    def is_vector_space(self) -> bool:
-        """True where positions are plain numbers in the order of the velocities."""
-        return not self.rotations
 
 
 def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
@@ -88,22 +76,20 @@ def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
     Linear parts add in world axes; quaternions are multiplied from the right by the
     exponential of the body-axes rotation vector and normalised.
     """
-    if layout.is_vector_space:
+    if not layout.rotations:
         return qpos + tangent
     moved = torch.empty_like(qpos)
     for q, v in layout.runs:
         moved[..., q] = qpos[..., q] + tangent[..., v]
     for q, v in layout.rotations:
-        turn = quat_exp(tangent[..., v : v + 3])
-        moved[..., q : q + 4] = quat_normalize(
-            quat_multiply(qpos[..., q : q + 4], turn)
-        )
+        turned = quat_multiply(qpos[..., q : q + 4], quat_exp(tangent[..., v : v + 3]))
+        moved[..., q : q + 4] = quat_normalize(turned)
     return moved
 
 
 def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor:
     """Tangent vector that takes ``start`` to ``end``, ``(*batch, nv)``."""
-    if layout.is_vector_space:
+    if not layout.rotations:
         return end - start
     tangent = start.new_empty((*start.shape[:-1], layout.nv))
     for q, v in layout.runs:

@@ -14,10 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
-from torchrl_nerd.geometry.motion import cross
+from torchrl_nerd.geometry.base import Base, JointAxes, keep_constants
+from torchrl_nerd.geometry.kinematics import cross
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.geometry.spd import matvec, spd_solve
 
@@ -34,15 +32,8 @@ class _Inertia(NamedTuple):
     def momentum(self, spin: Tensor, slide: Tensor) -> tuple[Tensor, Tensor]:
         """Angular and linear, of bodies that turn and move so, ``(3, n, N)``."""
         trace = self.second[0, 0] + self.second[1, 1] + self.second[2, 2]
-        turning = trace * spin - (self.second * spin).sum(1)
-        return (
-            turning + cross(self.first, slide),
-            self.mass * slide + cross(spin, self.first),
-        )
-
-    def of_groups(self, members: Tensor) -> "_Inertia":
-        """Of several together, ``members (groups, n)``."""
-        return _Inertia(*(matvec(members, moment) for moment in self))
+        angular = trace * spin - (self.second * spin).sum(1) + cross(self.first, slide)
+        return angular, self.mass * slide + cross(spin, self.first)
 
 
 class RigidBodyDynamics(nn.Module):
@@ -117,7 +108,7 @@ class RigidBodyDynamics(nn.Module):
             qvel: ``(*batch, nv)``.
             joint_torque: ``(*batch, num_actuated)``; None for none.
             rotation: of the base, ``(*batch, 3, 3)``.
-            corners: where ``positions`` are, ``(*batch, 4 B, 3)``, m, in B_t.
+            corners: the points at ``positions``, ``(*batch, 4 B, 3)``, m, in B_t.
             places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m, in B_t.
             period: s, over which damping is implicit (taken at its middle).
         """
@@ -149,10 +140,10 @@ class RigidBodyDynamics(nn.Module):
         four = rows_last(corners, 2).unflatten(1, (-1, len(CORNERS)))
         second = (four[:, None] * four).sum(3) * (self.mass / len(CORNERS))
         bodies = _Inertia(self.mass, four.mean(2) * self.mass, second)
-        moment, force = bodies.of_groups(self.ancestry).momentum(spin, slide)
-        products = (
-            spin[:, :, None] * moment[:, None] + slide[:, :, None] * force[:, None]
-        )
+        moved = _Inertia(*(matvec(self.ancestry, x) for x in bodies))  # by each dof
+        moment, force = moved.momentum(spin, slide)
+        products = spin[:, :, None] * moment[:, None]  # (3, nv, nv, N)
+        products = products + slide[:, :, None] * force[:, None]
         upper = self.together[..., None] * products.sum(0)
         lower = (1.0 - self.together)[..., None] * upper.transpose(0, 1)
         extra = torch.diag(self.armature + 0.5 * period * self.damping)
@@ -165,11 +156,9 @@ class RigidBodyDynamics(nn.Module):
             driven[self.actuated] = rows_last(joint_torque, 1)
             push = push + driven
         stretch = self.rest[:, None] - position[self.qpos_addresses]
-        stretch = self.stiffness[:, None] * stretch
-        push = torch.cat(
-            (push[: self.num_base_dofs], push[self.num_base_dofs :] + stretch)
-        )
-        return mass_matrix, push
+        base, joints = push[: self.num_base_dofs], push[self.num_base_dofs :]
+        joints = joints + self.stiffness[:, None] * stretch
+        return mass_matrix, torch.cat((base, joints))
 
     def _axes(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """How each dof turns, and moves the base frame's origin, ``(3, nv, N)``."""
@@ -180,9 +169,7 @@ class RigidBodyDynamics(nn.Module):
         if self.num_base_dofs:
             one = torch.eye(6, dtype=axis.dtype, device=axis.device)
             one = one[..., None].expand(6, 6, axis.shape[-1])
-            slide, spin = (
-                torch.cat((one[k : k + 3], x), 1) for k, x in ((0, slide), (3, spin))
-            )
+            slide, spin = torch.cat((one[:3], slide), 1), torch.cat((one[3:], spin), 1)
         return spin, slide
 
     def _bias(
@@ -215,7 +202,7 @@ class RigidBodyDynamics(nn.Module):
 def rows_last(x: Tensor, size: int) -> Tensor:
     """``(*batch, n, d)`` (its last ``size`` dimensions) as ``(d, n, N)``."""
     batch = x.ndim - size
-    flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])
+    flat = x.reshape(x.shape[:batch].numel(), *x.shape[batch:])  # empty batches too
     return flat.permute(tuple(reversed(range(flat.ndim))))
 
 

@@ -58,14 +58,11 @@ def quat_exp(rotation_vector: Tensor) -> Tensor:
     squared = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
     is_small = squared < SMALL_ANGLE**2
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
-    half_sinc = torch.where(
-        is_small,
-        0.5 - squared / 48.0 + squared**2 / 3840.0,
-        (0.5 * angle).sin() / angle,
-    )
-    real = torch.where(
-        is_small, 1.0 - squared / 8.0 + squared**2 / 384.0, (0.5 * angle).cos()
-    )
+    half_sinc, real = (0.5 * angle).sin() / angle, (0.5 * angle).cos()
+    series = 0.5 - squared / 48.0 + squared**2 / 3840.0
+    half_sinc = torch.where(is_small, series, half_sinc)
+    series = 1.0 - squared / 8.0 + squared**2 / 384.0
+    real = torch.where(is_small, series, real)
     return torch.cat((real, half_sinc * rotation_vector), -1)
 
 
@@ -90,12 +87,9 @@ def quat_log(q: Tensor) -> Tensor:
     squared = (imaginary * imaginary).sum(-1, keepdim=True)
     is_small = squared < SMALL_ANGLE**2
     sine = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
-    ratio = torch.where(
-        is_small,
-        2.0 + squared / 3.0 + 3.0 * squared**2 / 20.0,
-        2.0 * torch.atan2(sine, real) / sine,
-    )
-    return ratio * imaginary
+    ratio = 2.0 * torch.atan2(sine, real) / sine
+    series = 2.0 + squared / 3.0 + 3.0 * squared**2 / 20.0
+    return torch.where(is_small, series, ratio) * imaginary
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -107,9 +101,8 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 def orientation_error(a: Tensor, b: Tensor) -> Tensor:
     """Geodesic angle between two unit quaternions, rad, ``(*batch,)``."""
-    return torch.linalg.vector_norm(
-        quat_log(quat_multiply(quat_conjugate(a), b)), dim=-1
-    )
+    between = quat_multiply(quat_conjugate(a), b)
+    return torch.linalg.vector_norm(quat_log(between), dim=-1)
 
 
 def matrix_from_quat(q: Tensor) -> Tensor:
@@ -120,7 +113,7 @@ def matrix_from_quat(q: Tensor) -> Tensor:
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))  # (*batch, 9) -> (*batch, 3, 3)
 
 
 def quat_matrix(quat: np.ndarray) -> np.ndarray:

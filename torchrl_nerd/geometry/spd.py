@@ -43,13 +43,9 @@ class BranchSparsity(NamedTuple):
             root += 1
         first = np.flatnonzero(parents == root - 1)
         sizes = np.diff([*first, model.nv])
-        if not root or not len(first) or len({*sizes}) > 1:
+        if not root or len({*sizes}) != 1 or max(root, *sizes) > MAX_SOLVE:
             return None
-        return (
-            cls(root, len(first), int(sizes[0]))
-            if max(root, *sizes) <= MAX_SOLVE
-            else None
-        )
+        return cls(root, len(first), int(sizes[0]))
 
 
 def spd_inverse(
@@ -70,11 +66,11 @@ def spd_solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solutions ``(n, N)`` of positive definite ``(n, n, N)``."""
     if len(right) > MAX_SOLVE or not torch.compiler.is_compiling():
         return torch.linalg.solve_ex(matrix.movedim(-1, 0), right.mT)[0].mT
-    return _eliminated(matrix, right)
+    return _eliminate(matrix, right)
 
 
-def _eliminated(matrix: Tensor, right: Tensor) -> Tensor:
-    """`spd_solve` by Gauss's elimination."""
+def _eliminate(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solutions by Gauss's elimination: forward, then back substitution."""
     columns, rows = [], []
     while len(right):
         row = matrix[0] / matrix[0, 0]
@@ -92,13 +88,14 @@ def _eliminated(matrix: Tensor, right: Tensor) -> Tensor:
 def _inverse(matrix: Tensor) -> Tensor:
     """Of few unknowns, ``(n, n, N)``."""
     one = torch.eye(len(matrix), dtype=matrix.dtype, device=matrix.device)
-    return torch.stack([_eliminated(matrix, column[:, None]) for column in one], 1)
+    return torch.stack([_eliminate(matrix, column[:, None]) for column in one], 1)
 
 
 def _inverse_by_branches(matrix: Tensor, branches: BranchSparsity) -> Tensor:
     """Inverse ``(n, n, N)`` from that of the root's Schur complement."""
     root, number, size = branches
     shape, rest = (number, size), matrix[root:, root:]
+    # t dofs of the root, c branches of s dofs each
     between = matrix[:root, root:].unflatten(1, shape)  # (t, c, s, N)
     own = rest.unflatten(1, shape).unflatten(0, shape)
     own = own.diagonal(0, 0, 2).movedim(-1, 2)  # (s, s, c, N)

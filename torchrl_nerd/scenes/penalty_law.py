@@ -1,4 +1,4 @@
-"""MuJoCo parameters that reproduce the paper's spring-and-damper contacts and limits.
+"""Spring-damper (penalty) contacts and joint limits: the law, and MuJoCo's parameters.
 
 The paper's engine pushes back with ``ke * depth + kd * speed`` and friction
 ``min(kf * slip, mu * normal)``. MuJoCo's soft constraint has force
@@ -14,9 +14,49 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import torch
+from torch import Tensor
 
 IMPEDANCE = 0.001
 SOLIMP = np.array([IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0])
+
+
+def normal_force(
+    stiffness: Tensor, damping: Tensor, depth: Tensor, speed: Tensor
+) -> Tensor:
+    """``max(k depth - d speed, 0)``, N, where a point is in the ground, else 0.
+
+    ``depth`` m, ``speed`` m/s along the normal: positive leaves the ground.
+    """
+    force = (stiffness * depth - damping * speed).clamp_min(0.0)
+    return torch.where(depth > 0.0, force, 0.0)
+
+
+def friction_force(
+    slip_damping: Tensor, friction: Tensor, normal: Tensor, slip_speed: Tensor
+) -> Tensor:
+    """``min(kf v, mu N)``, N, against the direction of slip of speed v, m/s."""
+    return torch.minimum(slip_damping * slip_speed, friction * normal)
+
+
+def limit_forces(
+    stiffness: Tensor,
+    damping: Tensor,
+    low: Tensor,
+    high: Tensor,
+    position: Tensor,
+    velocity: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """``k (low - q) - d v`` below a range and ``k (high - q) - d v`` above it, else 0.
+
+    Torques of the lower and of the upper limit, N m or N. The damper may outweigh the
+    spring; a limit that never pulls is the first of both clamped to at least zero and the
+    second to at most zero.
+    """
+    below = stiffness * (low - position) - damping * velocity
+    above = stiffness * (high - position) - damping * velocity
+    below = torch.where(position < low, below, 0.0)
+    return below, torch.where(position > high, above, 0.0)
 
 
 def set_penalty_contact(
@@ -33,14 +73,12 @@ def set_penalty_contact(
     """
     model.opt.impratio = kf / kd
     for geom in range(model.ngeom):
-        body = model.geom_bodyid[geom]
-        inverse_mass = model.body_invweight0[body, 0]
-        if inverse_mass == 0.0:
-            continue
-        model.geom_solref[geom] = (-ke * inverse_mass, -kd * inverse_mass)
-        model.geom_solimp[geom] = SOLIMP
-        model.geom_friction[geom, 0] = mu
-        model.geom_priority[geom] = 1
+        inverse_mass = model.body_invweight0[model.geom_bodyid[geom], 0]
+        if inverse_mass:
+            model.geom_solref[geom] = (-ke * inverse_mass, -kd * inverse_mass)
+            model.geom_solimp[geom] = SOLIMP
+            model.geom_friction[geom, 0] = mu
+            model.geom_priority[geom] = 1
 
 
 def set_penalty_limit(

@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.height_fields import height_field_distance
+from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_normalize
 from torchrl_nerd.geometry.surfaces import (
     SHAPES,
+    height_field_distance,
     into_frame,
     plane_distance,
     plane_in_frame,

@@ -20,9 +20,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
-from torchrl_nerd.geometry.base import BasePose, over_ground
-from torchrl_nerd.geometry.constants import keep_constants
-from torchrl_nerd.geometry.joint_axes import JointAxes
+from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants, over_ground
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.keys import (

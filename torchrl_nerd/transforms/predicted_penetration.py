@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import BasePose, over_ground
-from torchrl_nerd.geometry.constants import keep_constants
+from torchrl_nerd.geometry.base import BasePose, keep_constants, over_ground
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.scene import Scene

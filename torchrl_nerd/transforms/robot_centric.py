@@ -13,10 +13,9 @@ from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
-from torchrl_nerd.geometry.penalty import limit_forces
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
-from torchrl_nerd.scenes.penalty_law import limit_stiffness
+from torchrl_nerd.scenes.penalty_law import limit_forces, limit_stiffness
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
