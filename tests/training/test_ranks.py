@@ -76,7 +76,10 @@ def test_two_ranks_make_the_model_of_one(name, more, tmp_path, capsys):
     assert states[0]["step"] == states[1]["step"] == 15
     for key, value in states[0].items():
         if key.startswith(("model.", "average.")):
-            torch.testing.assert_close(states[1][key], value, atol=2e-4, rtol=1e-3)
+            if value.ndim == 2:  # torch.optim.Muon rounds its updates to bfloat16
+                assert (states[1][key] - value).norm() < 1e-2 * value.norm()
+            else:
+                torch.testing.assert_close(states[1][key], value, atol=2e-4, rtol=1e-3)
     assert len(losses[0]) == 5
     torch.testing.assert_close(*map(torch.tensor, losses), atol=0.0, rtol=1e-5)
 
