@@ -28,7 +28,7 @@ from torchrl_nerd.evaluation.rollout_error import (
 )
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.robots import PRESETS, Source
+from torchrl_nerd.robots import Source, load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
 
 FLOOR = 1e-6  # m and rad: no model's error is compared below it
@@ -77,7 +77,7 @@ def error_curves(
 
 def main(options: Options) -> dict[str, float]:
     """Print a line for each quantity."""
-    protocol = PRESETS[options.scene].protocol()
+    protocol = protocol_of(load_scene(options.scene))
     ((case, source),) = protocol.cases.items()
     scene, steps = scene_of(source), max(protocol.horizons)
     model = from_pretrained(options.model or options.scene, scene)

@@ -295,7 +295,7 @@ def test_from_data_to_results(name, tmp_path, seed, capsys):
     capsys.readouterr()
     assert main([*argv, "--json", str(results["eval"])]) == 0
     table = capsys.readouterr().out
-    record, protocol = read_results(results["eval"]), PRESETS[name].protocol()
+    record, protocol = read_results(results["eval"]), PRESETS[name].protocol
     line = shlex.split(record["command"])
     assert line[:2] == ["nerd", "eval"] and set(line[2:]) == set(argv[1:]) - {"--quiet"}
     content, expected = record["results"], {c.name for c in simulators(scene)}

@@ -45,7 +45,7 @@ def test_every_scene_has_a_protocol_and_presets_are_of_scenes():
 
 
 def test_protocols_fit_their_scene(scene):
-    protocol = PRESETS[scene.name].protocol()
+    protocol = PRESETS[scene.name].protocol
     names = {scene.model.joint(i).name for i in range(scene.model.njnt)}
     if scene.base.is_floating:
         names = {"base_position", "base_orientation", "joints"}
@@ -73,7 +73,7 @@ def test_presets_fit_their_scene(name):
 def test_published_results_of_the_cartpole():
     expected = {("passive", *key): value for key, value in table(CARTPOLE).items()}
     assert len(expected) == 6
-    assert PRESETS["cartpole"].protocol().published == expected
+    assert PRESETS["cartpole"].protocol.published == expected
 
 
 def test_published_results_of_the_double_pendulum():
@@ -82,11 +82,11 @@ def test_published_results_of_the_double_pendulum():
         for (ground, joint), value in table(DOUBLE_PENDULUM).items()
     }
     assert len(expected) == 14
-    assert PRESETS["double_pendulum"].protocol().published == expected
+    assert PRESETS["double_pendulum"].protocol.published == expected
 
 
 def test_published_results_of_the_ant():
-    protocol = PRESETS["ant"].protocol()
+    protocol = PRESETS["ant"].protocol
     assert protocol.horizons == (100, 500) and not protocol.random_actions
     assert protocol.published == {
         ("passive", 500, "base_position"): 0.057,
@@ -96,7 +96,7 @@ def test_published_results_of_the_ant():
 
 
 def test_arms_are_driven_and_no_other_robot_is():
-    driven = {name for name in PRESETS if PRESETS[name].protocol().random_actions}
+    driven = {name for name in PRESETS if PRESETS[name].protocol.random_actions}
     assert driven == {"franka", "franka_gravity"}
 
 

@@ -14,7 +14,7 @@ from torchrl_nerd.robots import PRESETS, load_scene
 from torchrl_nerd.robots.double_pendulum.scene import double_pendulum_over
 from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
 
-CASES = PRESETS["double_pendulum"].unseen_terrain().cases
+CASES = PRESETS["double_pendulum"].unseen_terrain.cases
 each_case = pytest.mark.parametrize("case", CASES)
 
 

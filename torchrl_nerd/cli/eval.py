@@ -125,7 +125,7 @@ class Eval(MeasuringCommand):
             raise ValueError(
                 f"no unseen terrain for '{self.scene}', expected one of {known}"
             )
-        return preset.unseen_terrain()
+        return preset.unseen_terrain
 
     def ground_truth(self, scene: Scene) -> MujocoDynamics:
         """MuJoCo with the scene's own solver or the reference solver."""

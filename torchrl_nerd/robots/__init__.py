@@ -1,11 +1,10 @@
-"""Robots, a folder each: a folder with a ``ROBOT`` is registered by being there."""
+"""Robots, a folder each, registered by being there: the ``ROBOT`` of ``presets.py``."""
 
-from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
-from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.robots.robot import (
     EvaluationProtocol,
     Preset,
@@ -17,23 +16,28 @@ from torchrl_nerd.scenes import Scene, import_scene, is_import
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.tasks.suite import SuiteTask
 
-ROBOTS: Mapping[str, Robot] = {
-    found.name: import_module(f"{__name__}.{found.name}").ROBOT
+ROBOTS: dict[str, Robot] = {
+    found.name: import_module(f"{__name__}.{found.name}.presets").ROBOT
     for found in iter_modules(__path__)
     if found.ispkg
 }
-SCENES: Mapping[str, Callable[[], Scene]] = {
-    name: build for robot in ROBOTS.values() for name, build in robot.scenes.items()
-}
-TASKS: Mapping[str, Callable[[], Task]] = {
-    name: make for robot in ROBOTS.values() for name, make in robot.tasks.items()
-}
-PRESETS: Mapping[str, Preset] = {
-    name: preset for robot in ROBOTS.values() for name, preset in robot.presets.items()
-}
-PPO_CONFIGS: Mapping[str, PPOConfig] = {
-    task: config for robot in ROBOTS.values() for task, config in robot.ppo.items()
-}
+SCENES = {k: v for robot in ROBOTS.values() for k, v in robot.scenes.items()}
+TASKS = {k: v for robot in ROBOTS.values() for k, v in robot.tasks.items()}
+PRESETS = {k: v for robot in ROBOTS.values() for k, v in robot.presets.items()}
+PPO_CONFIGS = {k: v for robot in ROBOTS.values() for k, v in robot.ppo.items()}
+THIRD_PARTY = (
+    Preset(  # an MLP on single states: nobody has tuned anything for such robots
+        protocol=None,
+        data=DataConfig(trajectories=10_000, steps=100),
+        train=TrainConfig(
+            network="mlp-4x128",
+            steps=10_000,
+            rollout_steps=500,
+            single_step_fraction=1.0,
+            loss_eps=0.02,
+        ),
+    )
+)
 
 
 @cache
@@ -75,7 +79,7 @@ def make_task(name: str) -> Task:
 
 def preset_of(name: str) -> Preset:
     """The preset of the scene of that name; one for all third-party robots."""
-    return PRESETS[name] if name in PRESETS else _third_party(name)
+    return PRESETS.get(name, THIRD_PARTY)
 
 
 def protocol_of(scene: Scene) -> EvaluationProtocol:
@@ -84,8 +88,8 @@ def protocol_of(scene: Scene) -> EvaluationProtocol:
     The latter starts within its own sampling ranges, once with zero actions and once, if
     it has actuators, with random ones.
     """
-    if scene.name in PRESETS:
-        return PRESETS[scene.name].protocol()
+    if (known := preset_of(scene.name).protocol) is not None:
+        return known
     names = ("passive", "random") if scene.actuated else ("passive",)
     cases: dict[str, Source] = {name: scene for name in names}
     return EvaluationProtocol(cases, (20, 100), random_actions=names[1:])
@@ -93,27 +97,13 @@ def protocol_of(scene: Scene) -> EvaluationProtocol:
 
 def recorded_protocol(name: str) -> RecordedProtocol:
     """What goes with recordings of the robot of that name."""
-    known = preset_of(name).recorded
-    return RecordedProtocol(name, name) if known is None else known
+    return preset_of(name).recorded or RecordedProtocol(name, name)
 
 
 def source_of(scene: Scene) -> Source:
     """Whose initial states validate models of a scene: its preset's task, or itself."""
     task = preset_of(scene.name).task
     return scene if task is None else make_task(task)
-
-
-def _third_party(name: str) -> Preset:
-    """An MLP on single states: nobody has tuned anything for this robot."""
-    train = TrainConfig(
-        network="mlp-4x128",
-        steps=10_000,
-        rollout_steps=500,
-        single_step_fraction=1.0,
-        loss_eps=0.02,
-    )
-    data = DataConfig(trajectories=10_000, steps=100)
-    return Preset(lambda: protocol_of(load_scene(name)), data, train)
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What a robot's folder gives: its scenes, its tasks and its presets."""
+"""What a robot's ``presets.py`` gives: its scenes, its tasks and its presets."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -57,7 +57,7 @@ class Preset:
 
     | field | meaning |
     |---|---|
-    | ``protocol`` | its test rollouts; built at each call, since tasks compile models |
+    | ``protocol`` | its test rollouts; None: within the scene's sampling ranges |
     | ``data`` | how much training data |
     | ``train`` | how its learned model is trained |
     | ``hybrid`` | how its hybrid is trained; None where learning does not help the step |
@@ -69,14 +69,14 @@ class Preset:
     | ``recorded`` | what goes with recordings of it |
     """
 
-    protocol: Callable[[], EvaluationProtocol]
+    protocol: EvaluationProtocol | None
     data: DataConfig
     train: TrainConfig
     hybrid: TrainConfig | None = None
     task: str | None = None
     strategy: str | None = None
     exports: Literal["best", "last"] = "best"
-    unseen_terrain: Callable[[], EvaluationProtocol] | None = None
+    unseen_terrain: EvaluationProtocol | None = None
     recorded: RecordedProtocol | None = None
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrl_nerd.geometry.rotations import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.tasks.task import State
+from torchrl_nerd.tasks.task import State, Task
 
 
 def symmetric(u: Tensor, half: Tensor | float) -> Tensor:
@@ -62,14 +62,17 @@ def heading(state: State) -> Tensor:
     return 1.0 - 2.0 * (y * y + z * z)
 
 
-def base_observation(state: State) -> Tensor:
-    """The paper's observation of a walking robot, ``(*batch, 13 + 2 n)``.
+class WalkingTask(Task):
+    """A task with the paper's observation of a walking robot."""
 
-    Height (m); orientation (wxyz; the paper's is xyzw); linear velocity of the base's
-    origin and angular velocity, both in world axes; joint positions and velocities;
-    p_up, p_heading. Neither horizontal position nor time.
-    """
-    qpos, qvel = state[QPOS], state[QVEL]
-    projections = torch.stack((uprightness(state), heading(state)), -1)
-    parts = (qpos[..., 2:7], qvel[..., :3], angular_velocity(state))
-    return torch.cat((*parts, qpos[..., 7:], qvel[..., 6:], projections), -1)
+    def observation(self, state: State) -> Tensor:
+        """Of a robot with n joints, ``(*batch, 13 + 2 n)``.
+
+        Height (m); orientation (wxyz; the paper's is xyzw); linear velocity of the base's
+        origin and angular velocity, both in world axes; joint positions and velocities;
+        p_up, p_heading. Neither horizontal position nor time.
+        """
+        qpos, qvel = state[QPOS], state[QVEL]
+        projections = torch.stack((uprightness(state), heading(state)), -1)
+        parts = (qpos[..., 2:7], qvel[..., :3], angular_velocity(state))
+        return torch.cat((*parts, qpos[..., 7:], qvel[..., 6:], projections), -1)

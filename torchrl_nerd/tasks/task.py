@@ -4,8 +4,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
+from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.controllers import Controller
 
@@ -55,10 +57,10 @@ class Task(ABC):
     def observation(self, state: State) -> Tensor:
         """What the policy sees, ``(*batch, observation_size)``, float64."""
 
-    @abstractmethod
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """What the step earned, ``(*batch,)``, float64."""
+        """What the step earned, ``(*batch,)``, float64; by default zero."""
+        return torch.zeros_like(next_state[QVEL][..., 0])
 
-    @abstractmethod
     def terminated(self, next_state: State) -> Tensor:
-        """Where the episode has failed or succeeded, bool ``(*batch,)``."""
+        """Where the episode failed or succeeded, bool ``(*batch,)``; by default never."""
+        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)

@@ -166,7 +166,7 @@ def test_what_is_left_out_is_not_measured(monkeypatch):
 def test_another_number_of_substeps_is_the_same_control_step(name):
     scene = load_scene(name)
     same = scene.with_substeps(scene.substeps)
-    task = next(iter(PRESETS[name].protocol().cases.values()))
+    task = next(iter(PRESETS[name].protocol.cases.values()))
     start = mid_states(task, 5, 1)
     paths = [open_loop(MujocoDynamics(s), start, 3) for s in (task.scene, same)]
     torch.testing.assert_close(paths[0], paths[1], rtol=0, atol=1e-9)

@@ -3,51 +3,49 @@
 from dataclasses import replace
 
 from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
-from torchrl_nerd.robots.ant.tasks import AntRun
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
+from torchrl_nerd.robots.ant.scene import ant
+from torchrl_nerd.robots.ant.tasks import AntRun, AntSpin, AntSpinTrack
+from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
 
-
-def protocol() -> EvaluationProtocol:
-    """Paper, Fig. 3."""
-    published = {
-        ("passive", 500, "base_position"): 0.057,
-        ("passive", 500, "base_orientation"): 0.095,
-        ("passive", 500, "joints"): 0.077,
-    }
-    return EvaluationProtocol({"passive": AntRun()}, (100, 500), published)
-
-
-PRESETS = {
-    "ant": Preset(
-        protocol,
-        DataConfig(trajectories=50_000, steps=100),
-        TrainConfig(  # the first stage of ant-mlp; `make model-ant-mlp` continues it
-            network="mlp-4x160",
-            predicted_force=True,
-            steps=46_000,
-            rollout_steps=6_000,
-            rollout_restarts=2,
-            single_step_fraction=1.0,
-            use_symmetry=True,
-            loss_eps=0.02,
-            validate_every=5_000,
-            bf16_fraction=0.85,
-        ),
-        task="ant/run",
-    )
+PUBLISHED = {  # paper, Fig. 3
+    ("passive", 500, "base_position"): 0.057,
+    ("passive", 500, "base_orientation"): 0.095,
+    ("passive", 500, "joints"): 0.077,
 }
+PRESET = Preset(
+    EvaluationProtocol({"passive": AntRun()}, (100, 500), PUBLISHED),
+    DataConfig(trajectories=50_000, steps=100),
+    TrainConfig(  # the first stage of ant-mlp; `make model-ant-mlp` continues it
+        network="mlp-4x160",
+        predicted_force=True,
+        steps=46_000,
+        rollout_steps=6_000,
+        rollout_restarts=2,
+        single_step_fraction=1.0,
+        use_symmetry=True,
+        loss_eps=0.02,
+        validate_every=5_000,
+        bf16_fraction=0.85,
+    ),
+    task="ant/run",
+)
 # As in the paper's reference code (rl_games), except that its step size follows the
 # policy's KL divergence; here it falls linearly.
-_ANT = PPOConfig(
+PPO = PPOConfig(
     total_frames=32_800_000,
     num_envs=2048,
     minibatch=16_384,
     lr=3e-4,
     widths=(128, 64, 32),
 )
-PPO = {
-    "ant/run": _ANT,
-    "ant/spin": _ANT,
-    # to keep to a rate takes a wider policy
-    "ant/spin_track": replace(_ANT, widths=(256, 128, 64)),
-}
+ROBOT = Robot(
+    scenes={"ant": ant},
+    tasks={"ant/run": AntRun, "ant/spin": AntSpin, "ant/spin_track": AntSpinTrack},
+    presets={"ant": PRESET},
+    ppo={
+        "ant/run": PPO,
+        "ant/spin": PPO,
+        # to keep to a rate takes a wider policy
+        "ant/spin_track": replace(PPO, widths=(256, 128, 64)),
+    },
+)

@@ -14,23 +14,12 @@ from torchrl_nerd.scenes.scene import Scene
 JOINTS = tuple(f"{joint}_{leg}" for leg in (1, 2, 3, 4) for joint in ("hip", "ankle"))
 GAIN = 400.0  # N m per unit of action, all joints; reference code, env_ant
 SUBSTEPS = 16  # of 1/960 s: control step 1/60 s; paper, appendix B
-LIMIT_STIFFNESS = 1e3  # N m/rad, beyond the range; reference importer's limit_ke
-LIMIT_DAMPING = 100.0  # N m s/rad; limit_kd
+# N m/rad and N m s/rad, beyond the range; reference importer's limit_ke, limit_kd
+LIMIT = {"ke": 1e3, "kd": 100.0}
 # Means of the robot's and the ground's numbers, as the reference engine takes them:
 # N/m, N s/m, N s/m, -
 CONTACT = {"ke": 7e4, "kd": 550.0, "kf": 2e3, "mu": 0.625}
-STANDING_POSE = (
-    0.0,
-    1.0,
-    0.0,
-    -1.0,
-    0.0,
-    -1.0,
-    0.0,
-    1.0,
-)  # rad, in the order of JOINTS
-STANDING_HEIGHT = 0.556  # m, of the torso's centre, feet touching
-
+STANDING_POSE = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)  # rad, as JOINTS
 HIP = 2 * pi / 9  # 40 deg
 ANKLE = (pi / 6, 5 * pi / 9)  # 30 to 100 deg; legs 2 and 3 mirror it
 
@@ -38,11 +27,10 @@ ANKLE = (pi / 6, 5 * pi / 9)  # 30 to 100 deg; legs 2 and 3 mirror it
 @cache
 def ant() -> Scene:
     """Build the scene. ``qpos`` = torso position (m), quaternion, joints (rad)."""
-    path = Path(__file__).parent / "ant.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("ant.xml")))
     set_penalty_contact(model, **CONTACT)
     for joint in JOINTS:
-        set_penalty_limit(model, joint, ke=LIMIT_STIFFNESS, kd=LIMIT_DAMPING)
+        set_penalty_limit(model, joint, **LIMIT)
     near, far = ANKLE
     # Reference code, utils/commons.py.
     base = BaseSampling(

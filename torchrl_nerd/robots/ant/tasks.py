@@ -1,21 +1,18 @@
 """Three tasks of the Ant: run, spin, spin at 5 rad/s. Paper, appendix B."""
 
-from abc import abstractmethod
-
 import torch
 from torch import Tensor
 
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.ant.scene import STANDING_POSE, ant
-from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import (
+    WalkingTask,
     angular_velocity,
-    base_observation,
     heading,
     tilted_start,
     uprightness,
 )
-from torchrl_nerd.tasks.task import State, Task
+from torchrl_nerd.tasks.task import State
 
 START_HEIGHT = 1.0  # m
 START_SPREAD = (0.2, 0.2, 0.1)  # m
@@ -24,34 +21,22 @@ MIN_HEIGHT = 0.3  # m
 SPIN_TARGET = 5.0  # rad/s
 
 
-class Ant(Task):
-    """What the three share: torques, starts, the 29 observed numbers, the end.
+class Ant(WalkingTask):
+    """What the three share: torques, starts, the end.
 
-    Observation: `base_observation`. Ends below 0.3 m. The reference code starts the
-    first joint at rest by a slip of its index and drops the 29th number (p_heading);
-    here as in the paper.
+    Ends below 0.3 m. The reference code starts the first joint at rest by a slip of its
+    index and drops the last observed number (p_heading); here as in the paper.
     """
 
+    build_scene = staticmethod(ant)
     horizon = 500
     num_uniforms = 29
     observation_size = 29
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return ant()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Above the ground, tilted up to 30 degrees, near the standing pose."""
         center = u.new_tensor((0.0, 0.0, START_HEIGHT, *STANDING_POSE))
         return tilted_start(u, center, START_SPREAD, START_TILT)
-
-    def observation(self, state: State) -> Tensor:
-        """See `base_observation`."""
-        return base_observation(state)
-
-    @abstractmethod
-    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Of the state that the step led to, ``(*batch,)``."""
 
     def terminated(self, next_state: State) -> Tensor:
         """The torso is too low, bool ``(*batch,)``."""

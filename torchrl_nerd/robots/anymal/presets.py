@@ -1,38 +1,37 @@
 """Presets of ANYmal: data, training, test rollouts, PPO."""
 
 from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
-from torchrl_nerd.robots.anymal.tasks import AnymalForward
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
+from torchrl_nerd.robots.anymal.scene import anymal
+from torchrl_nerd.robots.anymal.tasks import AnymalForward, AnymalSideways
+from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
 
-
-def protocol() -> EvaluationProtocol:
-    """A PD controller holds the nominal pose for an episode; nothing is published."""
-    return EvaluationProtocol({"standing": AnymalForward()}, (100, 1000))
-
-
-PRESETS = {
-    "anymal": Preset(
-        protocol,
-        DataConfig(trajectories=20_000, steps=100),
-        TrainConfig(  # the first stage of anymal-mlp; `make model-anymal-mlp` continues it
-            network="mlp-4x128",
-            predicted_force=True,
-            steps=15_000,
-            rollout_steps=1_000,
-            single_step_fraction=1.0,
-            loss_eps=0.02,
-            bf16_fraction=0.8,
-        ),
-        task="anymal/forward",
-    )
-}
+PRESET = Preset(
+    # a PD controller holds the nominal pose for an episode; nothing is published
+    EvaluationProtocol({"standing": AnymalForward()}, (100, 1000)),
+    DataConfig(trajectories=20_000, steps=100),
+    TrainConfig(  # the first stage of anymal-mlp; `make model-anymal-mlp` continues it
+        network="mlp-4x128",
+        predicted_force=True,
+        steps=15_000,
+        rollout_steps=1_000,
+        single_step_fraction=1.0,
+        loss_eps=0.02,
+        bf16_fraction=0.8,
+    ),
+    task="anymal/forward",
+)
 # As in the paper's reference code (rl_games), except that its step size follows the
 # policy's KL divergence; here it falls linearly.
-_ANYMAL = PPOConfig(
+PPO = PPOConfig(
     total_frames=65_500_000,
     num_envs=2048,
     minibatch=16_384,
     lr=3e-4,
     widths=(128, 64, 32),
 )
-PPO = {"anymal/forward": _ANYMAL, "anymal/sideways": _ANYMAL}
+ROBOT = Robot(
+    scenes={"anymal": anymal},
+    tasks={"anymal/forward": AnymalForward, "anymal/sideways": AnymalSideways},
+    presets={"anymal": PRESET},
+    ppo={"anymal/forward": PPO, "anymal/sideways": PPO},
+)

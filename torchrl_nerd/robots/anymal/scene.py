@@ -17,8 +17,8 @@ LEGS = ("LF", "RF", "LH", "RH")  # left and right, fore and hind
 GAIN = (75.0, 60.0, 12.0) * 4  # N m per unit of action: HAA, HFE, KFE; reference code
 SUBSTEPS = 10  # of 1/600 s; paper, appendix B
 CONTROL_STEP = 1 / 60  # s
-LIMIT_STIFFNESS = 1e3  # N m/rad, beyond the HAA's range; reference importer's limit_ke
-LIMIT_DAMPING = 10.0  # N m s/rad; limit_kd
+# N m/rad and N m s/rad, beyond the HAA's range; reference importer's limit_ke, limit_kd
+LIMIT = {"ke": 1e3, "kd": 10.0}
 # N/m, N s/m, N s/m, -. Means of the robot's and the ground's numbers, as the reference
 # engine takes them, but half its dampings of 750 and 550 N s/m. MuJoCo damps explicitly: a
 # substep of 1/600 s is stable below 2 m / dt, and a foot weighs as little as 0.475 kg
@@ -34,7 +34,6 @@ STANDING_POSE = (
     *(-0.03, 0.4, -0.8),
     *(0.03, 0.4, -0.8),
 )
-STANDING_HEIGHT = 0.6230  # m, of the base's origin, feet touching
 
 KP, KD = 85.0, 2.0  # N m/rad, N m s/rad: the tasks' controller; reference code
 ACTION_SCALE = 0.5  # rad per unit of action about the standing pose
@@ -48,11 +47,10 @@ def anymal() -> Scene:
 
     Joints in the order of `LEGS`, each HAA, HFE, KFE.
     """
-    path = Path(__file__).parent / "anymal.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("anymal.xml")))
     set_penalty_contact(model, **CONTACT)
     for leg in LEGS:
-        set_penalty_limit(model, f"{leg}_HAA", ke=LIMIT_STIFFNESS, kd=LIMIT_DAMPING)
+        set_penalty_limit(model, f"{leg}_HAA", **LIMIT)
     # Starts of the reference's data, which are those of its env.
     base = BaseSampling(
         low=(-0.2, -0.2, 0.65),

@@ -9,9 +9,8 @@ from torch import Tensor
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.anymal.scene import ACTION_SCALE, KD, KP, STANDING_POSE, anymal
 from torchrl_nerd.scenes.controllers import PDController
-from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.tasks.floating import angular_velocity, base_observation, symmetric
-from torchrl_nerd.tasks.task import State, Task
+from torchrl_nerd.tasks.floating import WalkingTask, angular_velocity, symmetric
+from torchrl_nerd.tasks.task import State
 
 START_HEIGHT = 0.7  # m
 START_SPEED = 0.1  # rad/s
@@ -20,7 +19,7 @@ MIN_CLEARANCE = 0.01  # m, of base and knees
 TORQUE_COST = 0.002  # per N m
 
 
-class Anymal(Task):
+class Anymal(WalkingTask):
     """Reward exp(-|v - v*|^2) + 0.5 exp(-w_up^2) - (0.002 sum(torque))^2.
 
     v is the horizontal velocity of the base's origin, in world axes. The action moves
@@ -28,19 +27,15 @@ class Anymal(Task):
     sum, as the paper prints it; the reference code instead takes 2.5e-5 sum(torque^2)
     and clips rewards at zero.
 
-    Observation: `base_observation`, 37 numbers. Ends where the base is below 0.4 m, or
-    base or knees come within 1 cm of the ground.
+    Ends where the base is below 0.4 m, or base or knees within 1 cm of the ground.
     """
 
+    build_scene = staticmethod(anymal)
     horizon = 1000
     num_uniforms = 24
     observation_size = 37
     velocity: ClassVar[tuple[float, float]]
     """Wanted velocity, m/s, forward and to the left."""
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return anymal()
 
     @property
     def controller(self) -> PDController:
@@ -65,10 +60,6 @@ class Anymal(Task):
             QPOS: torch.cat((base.expand(*batch, 7), pose), -1),
             QVEL: torch.cat((torch.zeros_like(u[..., :6]), rates), -1),
         }
-
-    def observation(self, state: State) -> Tensor:
-        """See `base_observation`."""
-        return base_observation(state)
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
         """Of the state that the step led to, and of the torque on the way."""

@@ -12,17 +12,17 @@ from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.scene import Scene
 
 GAIN = 1500.0  # N per unit of action; reference code, env_cartpole
-LIMIT_STIFFNESS = 1e4  # N/m, beyond +-4 m; reference URDF importer's limit_ke
-LIMIT_DAMPING = 10.0  # N s/m; limit_kd
+# N/m and N s/m, beyond +-4 m; reference URDF importer's limit_ke, limit_kd
+LIMIT = {"ke": 1e4, "kd": 10.0}
 SUBSTEPS = 5  # of 1/300 s: control step 1/60 s; paper, appendix B
 
 
 @cache
 def cartpole() -> Scene:
     """Build the scene. ``qpos`` = (cart x, pole angle from upright)."""
-    path = Path(__file__).parent / "cartpole.xml"
+    path = Path(__file__).with_name("cartpole.xml")
     model = mujoco.MjModel.from_xml_path(str(path))
-    set_penalty_limit(model, "slider", ke=LIMIT_STIFFNESS, kd=LIMIT_DAMPING)
+    set_penalty_limit(model, "slider", **LIMIT)
     return Scene(
         name="cartpole",
         model=model,

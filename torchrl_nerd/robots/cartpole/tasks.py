@@ -6,7 +6,6 @@ from torch import Tensor
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.cartpole.scene import cartpole
-from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.task import State, Task
 
 START = (1.0, torch.pi, 1.0, 1.0)  # half ranges of x, theta, their velocities
@@ -21,13 +20,10 @@ class CartpoleSwingup(Task):
     |theta'| > 10 rad/s.
     """
 
+    build_scene = staticmethod(cartpole)
     horizon = 300
     num_uniforms = 4
     observation_size = 4
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return cartpole()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """``qpos (*batch, 2)`` within 1 m and pi rad, ``qvel`` within 1 m/s and 1 rad/s."""

@@ -3,30 +3,19 @@
 from dataclasses import replace
 
 from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.robots.cube.scene import cube, cube_real, cube_slope
 from torchrl_nerd.robots.cube.tasks import CubeToss, RealCubeToss, SlopeToss
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, RecordedProtocol
+from torchrl_nerd.robots.robot import (
+    EvaluationProtocol,
+    Preset,
+    RecordedProtocol,
+    Robot,
+)
 
-STEPS = 80  # of a toss, as in the paper's appendix C.4, whose results are of real ones
-
-
-def protocol() -> EvaluationProtocol:
-    """Tosses onto level ground."""
-    return EvaluationProtocol({"toss": CubeToss()}, (STEPS,))
-
-
-def real_protocol() -> EvaluationProtocol:
-    """As `protocol`, with the measured cube's mass."""
-    return EvaluationProtocol({"toss": RealCubeToss()}, (STEPS,))
-
-
-def slope_protocol() -> EvaluationProtocol:
-    """As `protocol`, over slopes."""
-    return EvaluationProtocol({"toss": SlopeToss()}, (STEPS,))
-
-
+STEPS = (80,)  # of a toss: paper, appendix C.4, whose results are of real ones
 # 510 tosses of a cube, ContactNets (CoRL 2020, arXiv 2009.11193). The parameters are those
 # of its repository; it has no stiffness or damping: those of the scene's board.
-_RECORDED = RecordedProtocol(
+RECORDED = RecordedProtocol(
     scene="cube_real",
     model="cube_tosses",
     parameters={
@@ -46,8 +35,8 @@ _RECORDED = RecordedProtocol(
         )
     },
 )
-_DATA = DataConfig(trajectories=8_000, steps=100)
-_TRAIN = TrainConfig(
+DATA = DataConfig(trajectories=8_000, steps=100)
+TRAIN = TrainConfig(
     network="mlp-4x128",
     predicted_force=True,
     steps=12_000,
@@ -57,28 +46,36 @@ _TRAIN = TrainConfig(
     validate_every=3_000,
     bf16_fraction=0.85,
 )
-_SHORTER = replace(_TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500)
-PRESETS = {
-    "cube": Preset(
-        protocol,
-        _DATA,
-        _TRAIN,
-        task="cube/toss",
-        strategy="resting",
-        recorded=_RECORDED,
-    ),
-    "cube_real": Preset(
-        real_protocol,
-        _DATA,
-        replace(_SHORTER, predicted_force=False),
-        task="cube_real/toss",
-        recorded=_RECORDED,
-    ),
-    "cube_slope": Preset(
-        slope_protocol,
-        _DATA,
-        _SHORTER,
-        task="cube_slope/toss",
-        strategy="resting",
-    ),
-}
+SHORTER = replace(TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500)
+ROBOT = Robot(
+    scenes={"cube": cube, "cube_real": cube_real, "cube_slope": cube_slope},
+    tasks={
+        "cube/toss": CubeToss,
+        "cube_real/toss": RealCubeToss,
+        "cube_slope/toss": SlopeToss,
+    },
+    presets={
+        "cube": Preset(
+            EvaluationProtocol({"toss": CubeToss()}, STEPS),
+            DATA,
+            TRAIN,
+            task="cube/toss",
+            strategy="resting",
+            recorded=RECORDED,
+        ),
+        "cube_real": Preset(
+            EvaluationProtocol({"toss": RealCubeToss()}, STEPS),
+            DATA,
+            replace(SHORTER, predicted_force=False),
+            task="cube_real/toss",
+            recorded=RECORDED,
+        ),
+        "cube_slope": Preset(
+            EvaluationProtocol({"toss": SlopeToss()}, STEPS),
+            DATA,
+            SHORTER,
+            task="cube_slope/toss",
+            strategy="resting",
+        ),
+    },
+)

@@ -15,7 +15,6 @@ from torchrl_nerd.robots.cube.scene import (
     cube_slope,
     slope_beneath,
 )
-from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import angular_velocity
 from torchrl_nerd.tasks.task import State, Task
 
@@ -27,13 +26,10 @@ class CubeToss(Task):
     velocity, both in world axes.
     """
 
+    build_scene = staticmethod(cube)
     horizon = 74  # 0.5 s
     num_uniforms = 13
     observation_size = 11
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return cube()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Tosses of the training ranges.
@@ -59,32 +55,19 @@ class CubeToss(Task):
         parts = (state[QPOS][..., 2:], state[QVEL][..., :3], angular_velocity(state))
         return torch.cat(parts, -1)
 
-    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Zero."""
-        return torch.zeros_like(next_state[QVEL][..., 0])
-
-    def terminated(self, next_state: State) -> Tensor:
-        """Never."""
-        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)
-
 
 class RealCubeToss(CubeToss):
     """The same with the real cube's mass."""
 
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return cube_real()
+    build_scene = staticmethod(cube_real)
 
 
 class SlopeToss(CubeToss):
     """The same over a plane of its own in every row, up to 20 degrees steep."""
 
+    build_scene = staticmethod(cube_slope)
     num_uniforms = CubeToss.num_uniforms + 2
     parameters = {TERRAIN: 4}
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return cube_slope()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Tosses of the training ranges, as far above the slope as above level ground.

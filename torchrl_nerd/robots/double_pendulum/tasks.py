@@ -10,7 +10,6 @@ from torchrl_nerd.robots.double_pendulum.scene import (
     double_pendulum,
     evaluation_ground,
 )
-from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.task import State, Task
 
 MAX_START_SPEED = 2.0  # rad/s
@@ -26,14 +25,11 @@ class DoublePendulumPassive(Task):
         ground: 0 (out of reach) to 6; None draws one per row.
     """
 
+    build_scene = staticmethod(double_pendulum)
     horizon = 100
     num_uniforms = 5
     observation_size = 6
     parameters = {TERRAIN: 4}
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return double_pendulum()
 
     def __init__(self, ground: int | None = None) -> None:
         numbers = range(len(GROUNDS)) if ground is None else [ground]
@@ -58,11 +54,3 @@ class DoublePendulumPassive(Task):
     def observation(self, state: State) -> Tensor:
         """Sines, cosines and velocities (rad/s) of both joints, ``(*batch, 6)``."""
         return torch.cat((state[QPOS].sin(), state[QPOS].cos(), state[QVEL]), -1)
-
-    def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
-        """Zero, ``(*batch,)``."""
-        return torch.zeros_like(next_state[QVEL][..., 0])
-
-    def terminated(self, next_state: State) -> Tensor:
-        """Never, ``(*batch,)``."""
-        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)

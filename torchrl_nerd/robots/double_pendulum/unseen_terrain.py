@@ -1,25 +1,26 @@
 """Grounds of kinds that the training data never had: only planes are trained on.
 
-A contact point sees the nearest surface's distance and normal, whatever the surface is,
-so the trained weights run unchanged. Two things they cannot see: a surface that touches a
-link between its contact points, as the edge of a box does, and that MuJoCo gives a height
-field one contact for every prism of it that a cap dips into, so that its ground is
-several times stiffer near seams than a plane. The flat field, which is terrain 1 of the
-paper as a height field, shows how much of an error is the latter.
+A contact point sees distance and normal of the nearest surface, whatever its shape, so the
+trained weights run unchanged. They cannot see a surface that touches a link between its
+contact points, as the edge of a box does. Nor do they know that MuJoCo gives a height
+field one contact per prism that a cap dips into, so that its ground is several times
+stiffer near seams: the flat field, terrain 1 of the paper, shows how much that matters.
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import cos, pi, sin
 
 import mujoco
 import numpy as np
 from torch import Tensor
 
-from torchrl_nerd.keys import TERRAIN
+from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.double_pendulum.scene import double_pendulum_over
 from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
 from torchrl_nerd.robots.robot import EvaluationProtocol
-from torchrl_nerd.scenes import Scene
+
+GEOM = mujoco.mjtGeom
 
 
 class DoublePendulumOver(DoublePendulumPassive):
@@ -33,35 +34,26 @@ class DoublePendulumOver(DoublePendulumPassive):
 
     def __init__(self, add_ground: Callable[[mujoco.MjSpec], None]) -> None:
         super().__init__(ground=0)
-        self._add_ground = add_ground
-
-    def build_scene(self) -> Scene:
-        """The robot over that ground."""
-        return double_pendulum_over(self._add_ground)
+        self.build_scene = partial(double_pendulum_over, add_ground)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """``qpos`` and ``qvel (*batch, 2)`` as over planes, without a row's ground."""
         state = super().initial_state(u)
-        del state[TERRAIN]
-        return state
+        return {key: state[key] for key in (QPOS, QVEL)}
 
 
 def two_planes(spec: mujoco.MjSpec) -> None:
     """A valley: slopes of 15 and 30 degrees that meet 2.75 m below the root."""
     for tilt in (pi / 12, -pi / 6):
-        spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            pos=(0.0, 0.0, -0.75),
-            quat=(cos(tilt / 2), 0.0, sin(tilt / 2), 0.0),
-            size=(4.0, 4.0, 0.1),
-        )
+        quat = (cos(tilt / 2), 0.0, sin(tilt / 2), 0.0)
+        where = {"pos": (0.0, 0.0, -0.75), "quat": quat}
+        spec.worldbody.add_geom(type=GEOM.mjGEOM_PLANE, size=(4.0, 4.0, 0.1), **where)
 
 
 def box_edge(spec: mujoco.MjSpec) -> None:
     """A step: right of the edge 1.8 m below the root, left of it out of reach."""
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, pos=(2.5, -1.0, -0.8), size=(2.0, 1.0, 1.0)
-    )
+    place = {"pos": (2.5, -1.0, -0.8), "size": (2.0, 1.0, 1.0)}
+    spec.worldbody.add_geom(type=GEOM.mjGEOM_BOX, **place)
 
 
 def height_field(spec: mujoco.MjSpec) -> None:
@@ -82,16 +74,15 @@ def _add_field(spec: mujoco.MjSpec, heights: np.ndarray, base: float) -> None:
     spec.add_hfield(
         name="field", nrow=rows, ncol=columns, size=size, userdata=heights.reshape(-1)
     )
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field", pos=(0.0, -1.0, base)
-    )
+    where = {"hfieldname": "field", "pos": (0.0, -1.0, base)}
+    spec.worldbody.add_geom(type=GEOM.mjGEOM_HFIELD, **where)
 
 
-def unseen_terrain() -> EvaluationProtocol:
-    """Four grounds, 100 passive steps; the paper has none of them."""
-    grounds = (two_planes, box_edge, height_field, flat_field)
-    cases = {
+UNSEEN_TERRAIN = EvaluationProtocol(
+    {
         ground.__name__.replace("_", " "): DoublePendulumOver(ground)
-        for ground in grounds
-    }
-    return EvaluationProtocol(cases, (100,))
+        for ground in (two_planes, box_edge, height_field, flat_field)
+    },
+    (100,),
+)
+"""Four grounds, 100 passive steps; the paper has none of them."""

@@ -3,29 +3,16 @@
 from dataclasses import replace
 
 from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
+from torchrl_nerd.robots.franka.scene import franka, franka_gravity
 from torchrl_nerd.robots.franka.tasks import (
     FrankaGravityReachTorque,
+    FrankaReach,
     FrankaReachTorque,
 )
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset
+from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
+from torchrl_nerd.tasks import Task
 
-
-def protocol() -> EvaluationProtocol:
-    """An episode of random torques within the effort limits; nothing is published.
-
-    Passive, the arm would stay where it is: it starts at rest and knows no gravity.
-    """
-    cases = {"random": FrankaReachTorque()}
-    return EvaluationProtocol(cases, (128,), random_actions=("random",))
-
-
-def gravity_protocol() -> EvaluationProtocol:
-    """As `protocol`."""
-    cases = {"random": FrankaGravityReachTorque()}
-    return EvaluationProtocol(cases, (128,), random_actions=("random",))
-
-
-_TRAIN = TrainConfig(
+TRAIN = TrainConfig(
     network="mlp-4x128",
     steps=12_000,
     rollout_steps=600,
@@ -34,20 +21,10 @@ _TRAIN = TrainConfig(
     validate_every=3_000,
     bf16_fraction=0.85,
 )
-_DATA = DataConfig(trajectories=12_000, steps=100)
-PRESETS = {
-    "franka": Preset(protocol, _DATA, _TRAIN, task="franka/reach_torque"),
-    "franka_gravity": Preset(
-        gravity_protocol,
-        _DATA,
-        replace(_TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500),
-        task="franka_gravity/reach_torque",
-        strategy="correlated",
-    ),
-}
+DATA = DataConfig(trajectories=12_000, steps=100)
 # The reference code's policy has an LSTM before its hidden layers; here it sees the last
 # three observations, and is updated four times as often.
-_FRANKA = PPOConfig(
+PPO = PPOConfig(
     total_frames=26_200_000,
     num_envs=1024,
     epochs=8,
@@ -56,8 +33,38 @@ _FRANKA = PPOConfig(
     std=0.7,
     frame_stack=3,  # its observation has no velocities, and the policy must brake
 )
-PPO = {
-    "franka/reach": _FRANKA,
-    # std: of the torque that it can give; to brake in time by torque takes a wider policy
-    "franka/reach_torque": replace(_FRANKA, std=0.3, widths=(128, 128)),
-}
+
+
+def _protocol(task: Task) -> EvaluationProtocol:
+    """An episode of random torques within the effort limits; nothing is published.
+
+    Passive, the arm would stay where it is: it starts at rest and knows no gravity.
+    """
+    return EvaluationProtocol({"random": task}, (128,), random_actions=("random",))
+
+
+ROBOT = Robot(
+    scenes={"franka": franka, "franka_gravity": franka_gravity},
+    tasks={
+        "franka/reach": FrankaReach,
+        "franka/reach_torque": FrankaReachTorque,
+        "franka_gravity/reach_torque": FrankaGravityReachTorque,
+    },
+    presets={
+        "franka": Preset(
+            _protocol(FrankaReachTorque()), DATA, TRAIN, task="franka/reach_torque"
+        ),
+        "franka_gravity": Preset(
+            _protocol(FrankaGravityReachTorque()),
+            DATA,
+            replace(TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500),
+            task="franka_gravity/reach_torque",
+            strategy="correlated",
+        ),
+    },
+    ppo={
+        "franka/reach": PPO,
+        # std: of the torque that it can give; to brake by torque takes a wider policy
+        "franka/reach_torque": replace(PPO, std=0.3, widths=(128, 128)),
+    },
+)

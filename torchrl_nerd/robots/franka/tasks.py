@@ -10,7 +10,6 @@ from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
 from torchrl_nerd.robots.franka.scene import GAIN, HOME, franka, franka_gravity
 from torchrl_nerd.scenes.controllers import PDController
-from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks.floating import symmetric
 from torchrl_nerd.tasks.task import State, Task
 
@@ -30,14 +29,11 @@ class FrankaReachTorque(Task):
     the goal; no velocities. Never terminated. 128 actions.
     """
 
+    build_scene = staticmethod(franka)
     horizon = 128
     num_uniforms = 10
     observation_size = 13
     parameters = {GOAL: 3}
-
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return franka()
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """At rest near home; the goal is uniform in a box before the robot."""
@@ -73,10 +69,6 @@ class FrankaReachTorque(Task):
         distance = torch.linalg.vector_norm(offset, dim=-1)
         return -distance + _peak(50.0 * distance) + _peak(300.0 * distance)
 
-    def terminated(self, next_state: State) -> Tensor:
-        """Never."""
-        return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)
-
 
 class FrankaReach(FrankaReachTorque):
     """The same goal by small moves: springs pull to the present position + 0.03125 a.
@@ -105,9 +97,7 @@ class FrankaReach(FrankaReachTorque):
 class FrankaGravityReachTorque(FrankaReachTorque):
     """The torque task with the real arm's inertials, under gravity; not in the paper."""
 
-    def build_scene(self) -> Scene:
-        """The robot and its ground."""
-        return franka_gravity()
+    build_scene = staticmethod(franka_gravity)
 
 
 def _peak(x: Tensor) -> Tensor:
