@@ -15,17 +15,11 @@ from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.torch_step import TorchDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
-from torchrl_nerd.envs.partial_reset import merge_reset
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition
-from torchrl_nerd.keys import (
-    ACTION,
-    FAULT,
-    OBSERVATION,
-    QPOS,
-    QVEL,
-    TRUST,
-)
+from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, QPOS, QVEL, TRUST
+from torchrl_nerd.robots import task_id
+from torchrl_nerd.settings import expect_at_least, expect_device
 from torchrl_nerd.tasks import Task
 
 MAX_SEED = 2**63
@@ -48,14 +42,14 @@ class SceneEnv(EnvBase):
     Args:
         task: reset distribution, observation, reward, end.
         dynamics: what steps the state.
-        num_envs: how many envs.
+        num_envs: how many envs step together.
         seed: of the resets.
         device: where states, observations and rewards live.
-        dump_dir: where faults leave dumps for `nerd replay`; none are written without.
+        dump_dir: where the first fault of each kind leaves a dump for `nerd replay`.
 
     Raises:
-        ValueError: no envs, a dynamics of another scene, or a folder that cannot be
-            written.
+        ValueError: no envs, no such device, a dynamics of another scene, or a folder that
+            cannot be written.
     """
 
     _supports_set_state = True
@@ -73,26 +67,27 @@ class SceneEnv(EnvBase):
         device: torch.device | str = "cpu",
         dump_dir: Path | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"expected num_envs of at least 1, got {num_envs}")
+        expect_at_least(1, num_envs=num_envs)
         if dynamics.scene.hash != task.scene.hash:
             raise ValueError(
                 f"the task is for scene '{task.scene.name}', the dynamics for "
                 f"'{dynamics.scene.name}'"
             )
-        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        super().__init__(
+            device=expect_device(str(device)), batch_size=torch.Size([num_envs])
+        )
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
+        self.model_name: str | None = None
         self.guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
         self._transition = Transition(task, dynamics)
         self._transit = self._transition.step
         self._restart = self._transition.restart
         self.recorder: FaultRecorder | None = None
         if dump_dir is not None:
-            name = type(dynamics).__name__
+            about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
             inner = self._torch_dynamics
             model = inner.model if isinstance(inner, NeRDDynamics) else None
-            where = dump_dir, self.scene.name
-            self.recorder = FaultRecorder(*where, name, model)
+            self.recorder = FaultRecorder(dump_dir, about, model)
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self.register_buffer("_episode", zeros)
@@ -104,6 +99,14 @@ class SceneEnv(EnvBase):
             value = torch.zeros(num_envs, size, dtype=torch.float64, device=self.device)
             self.register_buffer(f"_state_{key}", value)
         self._set_seed(seed)
+
+    def __repr__(self) -> str:
+        model = "" if self.model_name is None else f", model={self.model_name!r}"
+        return (
+            f"{type(self).__name__}(task={task_id(self.task)!r}, "
+            f"dynamics={type(self.dynamics).__name__}, kind={self.dynamics.kind!r}"
+            f"{model}, num_envs={self.batch_size.numel()}, device={str(self.device)!r})"
+        )
 
     def compile(self, *, warmup: int | None = None, **kwargs: Any) -> "SceneEnv":
         """Make one compiled piece of a step, and one of a reset; returns the env itself.
@@ -150,38 +153,31 @@ class SceneEnv(EnvBase):
 
     def _make_specs(self) -> None:
         rows, device = self.batch_size, self.device
+
+        def shape(width: int) -> torch.Size:
+            return torch.Size((*rows, width))
+
+        def column(num_values: int, dtype: torch.dtype) -> TensorSpec:
+            return Categorical(num_values, shape(1), device, dtype)
+
         sizes = {**self._state_sizes, "joint_torque": len(self.scene.actuated)}
         state: dict[str, TensorSpec] = {
-            key: Unbounded(
-                torch.Size((*rows, size)), dtype=torch.float64, device=device
-            )
+            key: Unbounded(shape(size), device, torch.float64)
             for key, size in sizes.items()
         }
-        column = torch.Size((*rows, 1))
         if self.guard:
-            state[TRUST] = Bounded(0.0, 1.0, column, dtype=torch.float32, device=device)
-        state[FAULT] = Categorical(
-            len(REASONS), shape=column, dtype=torch.int64, device=device
-        )
-        width = self.task.observation_size
-        state[OBSERVATION] = Unbounded(
-            torch.Size((*rows, width)), dtype=torch.float32, device=device
-        )
+            state[TRUST] = Bounded(0.0, 1.0, shape(1), device, torch.float32)
+        state[FAULT] = column(len(REASONS), torch.int64)
+        observed = shape(self.task.observation_size)
+        state[OBSERVATION] = Unbounded(observed, device, torch.float32)
         self.observation_spec = Composite(state, shape=rows, device=device)
-        num_actions = self.task.controller.num_actions
-        self.action_spec = Bounded(
-            -1.0,
-            1.0,
-            torch.Size((*rows, num_actions)),
-            dtype=torch.float32,
-            device=device,
+        actions = shape(self.task.controller.num_actions)
+        self.action_spec = Bounded(-1.0, 1.0, actions, device, torch.float32)
+        self.reward_spec = Unbounded(shape(1), device, torch.float32)
+        flags = ("done", "terminated", "truncated")
+        self.full_done_spec = Composite(
+            {name: column(2, torch.bool) for name in flags}, shape=rows, device=device
         )
-        self.reward_spec = Unbounded(column, dtype=torch.float32, device=device)
-        flags = {
-            name: Categorical(2, shape=column, dtype=torch.bool, device=device)
-            for name in ("done", "terminated", "truncated")
-        }
-        self.full_done_spec = Composite(flags, shape=rows, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
         """Begin each env's stream anew."""
@@ -221,11 +217,8 @@ class SceneEnv(EnvBase):
             old = {key: value.detach() for key, value in old.items()}
         streams = self._keys, self._episode, self._offsets
         found = self._restart(old, rows, streams, given)
-        counts = {
-            "_episode": self._episode + rows,
-            "_age": self._age.masked_fill(rows, 0),
-        }
-        result = self._hand_out(found, counts)
+        episode, age = self._episode + rows, self._age.masked_fill(rows, 0)
+        result = self._hand_out(found, {"_episode": episode, "_age": age})
         self.dynamics.reset(result, rows)
         return result
 
@@ -239,11 +232,10 @@ class SceneEnv(EnvBase):
             raise ValueError(f"set_state needs {missing} in the tensordict")
         values = {}
         for key, size in self._state_sizes.items():
-            value = given.get(key, None)
+            value, expected = given.get(key, None), (*self.batch_size, size)
             if value is None:
                 continue
-            if value.shape != (*self.batch_size, size):
-                expected = (*self.batch_size, size)
+            if value.shape != expected:
                 raise ValueError(
                     f"expected {key} of shape {expected}, got {tuple(value.shape)}"
                 )
@@ -251,22 +243,6 @@ class SceneEnv(EnvBase):
                 raise ValueError(f"expected finite {key} to set the state to")
             values[key] = value.to(torch.float64, copy=True)
         return values
-
-    def _reset_proc_data(
-        self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        """Envs that go on keep what they show: as TorchRL's, in a third of its time.
-
-        What is not the env's, such as the last action, is zero where some envs begin anew.
-        """
-        rows = None if tensordict is None else tensordict.get("_reset", None)
-        if tensordict is None or rows is None or rows.all():
-            return super()._reset_proc_data(tensordict, tensordict_reset)
-        merged = merge_reset(
-            rows.reshape(self.batch_size), tensordict, tensordict_reset
-        )
-        tensordict.pop("_reset")
-        return tensordict.update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict[ACTION]

@@ -50,8 +50,7 @@ class FaultRecorder:
 
     Args:
         folder: where; made if it is not there.
-        scene: name of the robot, for the replay.
-        dynamics: name of what stepped it.
+        about: names of the ``scene`` and of the ``dynamics``, for the replay.
         model: of a learned one; its ``features (T, F)`` go into the dump.
 
     Raises:
@@ -59,21 +58,15 @@ class FaultRecorder:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        scene: str,
-        dynamics: str,
-        model: NeRD | None = None,
+        self, folder: Path, about: dict[str, str], model: NeRD | None = None
     ) -> None:
-        self.model = model
-        self.folder = writable_folder(folder)
-        self.about = {"scene": scene, "dynamics": dynamics}
+        self.folder, self.about, self.model = writable_folder(folder), about, model
         self._steps: deque[dict[str, Tensor]] = deque(maxlen=HISTORY)
         self._written: set[int] = set()
 
     def record(
         self, state: Mapping[str, Tensor], action: Tensor, torque: Tensor, fault: Tensor
-    ) -> list[Path]:
+    ) -> None:
         """Keep a step; write what it broke for the first time.
 
         Args:
@@ -82,20 +75,18 @@ class FaultRecorder:
             torque: ``(num_envs, num_actuated)``.
             fault: ``(num_envs, 1)`` from `find_faults`.
         """
-        step = {key: value.detach().cpu().clone() for key, value in state.items()}
-        step |= {"action": action.detach().cpu().clone()}
-        step |= {"joint_torque": torque.detach().cpu().clone()}
-        self._steps.append(step)
-        found = []
+        step = {**state, "action": action, "joint_torque": torque}
+        self._steps.append({k: v.detach().cpu().clone() for k, v in step.items()})
         for kind in fault.unique().tolist():
             if kind and kind not in self._written:
                 self._written.add(kind)
-                found.append(self._write(kind, int((fault == kind).nonzero()[0, 0])))
-        return found
+                self._write(kind, int((fault == kind).nonzero()[0, 0]))
 
-    def _write(self, kind: int, row: int) -> Path:
+    def _write(self, kind: int, row: int) -> None:
         keys = self._steps[0].keys()
-        tensors = {k: torch.stack([s[k][row] for s in self._steps]) for k in keys}
+        tensors = {
+            k: torch.stack([s[k][row] for s in self._steps]) for k in keys
+        }  # (T, ...)
         if self.model is not None:
             here = {key: value.to(self.model.device) for key, value in tensors.items()}
             state, torque = (here[QPOS], here[QVEL]), here["joint_torque"]
@@ -104,4 +95,3 @@ class FaultRecorder:
         about = {**self.about, "reason": REASONS[kind], "env": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
         write_tensors(path, tensors, about)
-        return path

@@ -5,11 +5,116 @@ from typing import cast
 
 import torch
 
+from torchrl_nerd.dynamics import GuardedDynamics, Model, NeRDDynamics, dynamics_of
 from torchrl_nerd.dynamics.guarded import Guard
+from torchrl_nerd.dynamics.nerd import Inference
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.ground_truth import ENGINES, Engine, GroundTruthEnv
-from torchrl_nerd.envs.nerd import NeRDEnv
+from torchrl_nerd.envs.resolve import (
+    ENGINES,
+    Engine,
+    is_engine,
+    model_name,
+    resolve_model,
+)
+from torchrl_nerd.robots import make_task
+from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
+
+
+class GroundTruthEnv(SceneEnv):
+    """A `SceneEnv` on MuJoCo's batched rollout, dm_control's `Physics` or MuJoCo Warp.
+
+    Args:
+        task: id of a registered task, or a task.
+        engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``).
+        num_envs: how many envs step together.
+        seed: of the resets.
+        device: where all tensors live, and MuJoCo Warp runs; the others use the CPU.
+        dump_dir: see `SceneEnv`.
+
+    Raises:
+        ValueError: an unknown engine, or one that cannot step this scene.
+        ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
+
+    Examples:
+        >>> env = GroundTruthEnv("cartpole/swingup", num_envs=3)
+        >>> env.rollout(5, break_when_any_done=False)["next", "qpos"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        engine: Engine = "mujoco",
+        num_envs: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        dump_dir: Path | None = None,
+    ) -> None:
+        if not is_engine(engine):
+            raise ValueError(
+                f"unknown engine {engine!r}, expected one of {', '.join(ENGINES)}"
+            )
+        task = make_task(task) if isinstance(task, str) else task
+        dynamics = ENGINES[engine](task.scene, expect_device(str(device)))
+        super().__init__(task, dynamics, num_envs, seed, device, dump_dir)
+
+
+class NeRDEnv(SceneEnv):
+    """A `SceneEnv` on a model: learned, hybrid or analytic.
+
+    TorchRL's ``compile=True`` makes each step one compiled piece, see `SceneEnv.compile`.
+
+    Args:
+        task: id of a registered task, or a task.
+        model: a model, or the name of one, see `resolve_model`.
+        num_envs: how many envs step together.
+        seed: of the resets.
+        device: where the model and all tensors live.
+        inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
+        guard: what to do with steps far from the training data, see `GuardedDynamics`;
+            None steps all alike.
+        dump_dir: see `SceneEnv`.
+        differentiable: record gradients through every step, to actions and states, and to
+            the weights where they ask for them.
+
+    Raises:
+        ValueError: no such task or model, or an option of networks for an analytic step.
+
+    Examples:
+        >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
+        >>> env.rollout(5, break_when_any_done=False)["next", "qpos"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        model: Model | str | Path = "nerd",
+        num_envs: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        inference: Inference = "streaming",
+        guard: Guard | None = None,
+        dump_dir: Path | None = None,
+        differentiable: bool = False,
+    ) -> None:
+        task = make_task(task) if isinstance(task, str) else task
+        name = type(model).__name__
+        if not isinstance(model, Model):
+            name, model = model, resolve_model(model, task.scene)
+            name = model_name(name, task.scene)
+        dynamics = dynamics_of(
+            model.to(expect_device(str(device))),
+            differentiable=differentiable,
+            inference=inference,
+        )
+        if isinstance(dynamics, NeRDDynamics):
+            dynamics = GuardedDynamics(dynamics, guard) if guard else dynamics
+        else:
+            _refuse_network_options(name, guard, inference)
+        super().__init__(task, dynamics, num_envs, seed, device, dump_dir)
+        self.model_name = name
 
 
 def make_env(
@@ -29,37 +134,45 @@ def make_env(
         task: id of a registered task, or a task.
         dynamics: ``"nerd"`` (learned), ``"hybrid"``, ``"analytic"``, ``"mujoco"``,
             ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
-            analytic step's name, or a checkpoint folder; see `make_dynamics`.
+            analytic step's name, or a checkpoint folder.
         num_envs: how many envs step together.
         seed: of the resets.
         device: where all tensors live.
-        guard: what to do with steps that the model was not trained for, see
-            `GuardedDynamics`; ground truth has nothing to guard against.
-        dump_dir: where the first fault of each kind leaves a dump for `nerd replay`.
+        guard: see `NeRDEnv`; of learned and hybrid dynamics alone.
+        dump_dir: see `SceneEnv`.
         compile: make one compiled piece of controller, model, reward and observation, see
             `SceneEnv.compile`; engines stay as they are.
-        differentiable: record gradients through every step of a model.
+        differentiable: record gradients through every step; not of engines.
 
     Raises:
-        ValueError: unknown task or dynamics, or gradients of an engine, in one sentence.
+        ValueError: unknown task or dynamics, or an option that the dynamics does not have,
+            in one sentence.
         ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
     """
-    if dynamics in ENGINES:
+    shared = {
+        "num_envs": num_envs,
+        "seed": seed,
+        "device": device,
+        "dump_dir": dump_dir,
+    }
+    if is_engine(dynamics):
         if differentiable:
             raise ValueError(
-                f"expected learned, hybrid or analytic dynamics for gradients, got "
+                "expected learned, hybrid or analytic dynamics for gradients, got "
                 f"'{dynamics}'"
             )
-        engine = cast(Engine, dynamics)
-        return GroundTruthEnv(task, engine, num_envs, seed, device, dump_dir)
-    env = NeRDEnv(
-        task,
-        dynamics,
-        num_envs,
-        seed,
-        device,
-        guard=guard,
-        dump_dir=dump_dir,
-        differentiable=differentiable,
-    )
+        _refuse_network_options(dynamics, guard)
+        return GroundTruthEnv(task, cast(Engine, dynamics), **shared)
+    env = NeRDEnv(task, dynamics, guard=guard, differentiable=differentiable, **shared)
     return env.compile() if compile else env
+
+
+def _refuse_network_options(
+    dynamics: str | Path, guard: str | None, inference: str = "streaming"
+) -> None:
+    """Refuse what dynamics without a network would ignore."""
+    if guard is not None or inference != "streaming":
+        option = f"inference '{inference}'" if guard is None else f"guard '{guard}'"
+        raise ValueError(
+            f"expected learned or hybrid dynamics for {option}, got '{dynamics}'"
+        )

@@ -1,19 +1,50 @@
 """One name for every dynamics: what `make_env` and every command take."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import torch
 
 from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
-from torchrl_nerd.dynamics import Dynamics, Model, dynamics_of
-from torchrl_nerd.envs.ground_truth import ENGINES, GROUND_TRUTH
+from torchrl_nerd.dynamics import (
+    DMControlDynamics,
+    Dynamics,
+    Model,
+    MujocoDynamics,
+    MujocoWarpDynamics,
+)
 from torchrl_nerd.scenes import Scene, is_import
 
+Engine = Literal["mujoco", "dm_control", "mujoco_warp"]
+ENGINES: dict[str, Callable[[Scene, torch.device], Dynamics]] = {
+    "mujoco": lambda scene, device: MujocoDynamics(scene),
+    "dm_control": lambda scene, device: DMControlDynamics(scene),
+    "mujoco_warp": MujocoWarpDynamics,
+}
 KINDS = ("nerd", "hybrid", "analytic")
 """Names of the models of a scene, beside those of engines and of shipped models."""
+
+
+def is_engine(dynamics: object) -> bool:
+    """Whether that is the name of a ground-truth engine."""
+    return isinstance(dynamics, str) and dynamics in ENGINES
+
+
+def model_name(name: str | Path, scene: Scene) -> str:
+    """The model that a name stands for: ``"ant-mlp"`` for ``"nerd"`` or ``"ant"``.
+
+    What stands for nothing else, or for nothing at all, is returned as it is.
+    """
+    given, shipped = str(name), shipped_models()
+    asked = {"nerd": scene.name, "hybrid": f"{scene.name}-hybrid"}.get(given, given)
+    if asked in shipped:
+        return asked
+    is_folder = asked == given and os.path.isdir(given)
+    is_learned = f"{asked}-mlp" in shipped and not is_folder
+    return f"{asked}-mlp" if is_learned else given
 
 
 def resolve_model(name: str | Path, scene: Scene) -> Model:
@@ -27,67 +58,30 @@ def resolve_model(name: str | Path, scene: Scene) -> Model:
     Raises:
         ValueError: in one sentence, no such model, or a scene that it cannot step.
     """
-    asked = str(name)
-    if asked == "analytic":
-        return make_step(scene)
-    if asked in STEPS:
-        return make_step(scene, STEPS[asked])
-    if asked == "nerd":
-        names = shipped_models()
-        for known in (scene.name, f"{scene.name}-mlp"):
-            if known in names:
-                return from_pretrained(known, scene)
-        if is_import(scene.name):
-            return from_pretrained(scene.name, scene)
+    if not isinstance(name, str | Path):
+        raise ValueError(f"expected dynamics of {_known()}, got {name!r}")
+    found = model_name(name, scene)
+    if found == "analytic" or found in STEPS:
+        return make_step(scene, STEPS.get(found))
+    if found in shipped_models() or os.path.isdir(found):
+        return from_pretrained(found, scene)
+    if found == "nerd" and is_import(scene.name):
+        return from_pretrained(scene.name, scene)  # its refusal says how to make one
+    if found in KINDS:
+        kind = {"nerd": "learned"}.get(found, found)
         raise ValueError(
-            f"no learned model of '{scene.name}' is shipped: train one with `nerd train "
-            f"{scene.name}` and give its folder, or use dynamics 'analytic'"
+            f"no {kind} model of '{scene.name}' is shipped: train one with `nerd train "
+            f"{scene.name} --kind {kind}` and give its folder, or use dynamics 'analytic'"
         )
-    if asked == "hybrid":
-        if f"{scene.name}-hybrid" not in shipped_models():
-            raise ValueError(
-                f"no hybrid model of '{scene.name}' is shipped: expected one whose network "
-                "lowers the error of its analytic step; use dynamics 'analytic'"
-            )
-        return from_pretrained(f"{scene.name}-hybrid", scene)
-    if asked in shipped_models() or os.path.isdir(asked):
-        return from_pretrained(name, scene)
-    engines = ", ".join(GROUND_TRUTH)
-    raise ValueError(
-        f"unknown dynamics '{asked}', expected {', '.join(KINDS)}, {engines}, an analytic "
-        f"step ({', '.join(STEPS)}), a shipped model ({', '.join(shipped_models())}) or a "
-        "checkpoint folder"
+    if found in ENGINES:
+        raise ValueError(f"expected a model, got the engine '{found}'")
+    raise ValueError(f"unknown dynamics '{name}', expected {_known()}")
+
+
+def _known() -> str:
+    """All that ``dynamics=`` takes."""
+    names, steps = ", ".join((*KINDS, *ENGINES)), ", ".join(STEPS)
+    shipped = ", ".join(shipped_models())
+    return (
+        f"{names}, an analytic step ({steps}), a shipped model ({shipped}) or a folder"
     )
-
-
-def make_dynamics(
-    name: str | Path,
-    scene: Scene,
-    device: torch.device | str = "cpu",
-    compile: bool = False,
-    differentiable: bool = False,
-    **how: Any,
-) -> Dynamics:
-    """The dynamics of that name for a scene.
-
-    Args:
-        name: an engine (``"mujoco"``, ``"dm_control"``, ``"mujoco_warp"``), or a model, see
-            `resolve_model`.
-        scene: the robot.
-        device: of models and of MuJoCo Warp; the other engines run on the CPU.
-        compile: run a model through `torch.compile`.
-        differentiable: record gradients through a model's step.
-        how: further arguments of `NeRDDynamics`.
-
-    Raises:
-        ValueError: in one sentence, no such dynamics, or gradients of an engine.
-        ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
-    """
-    if name in ENGINES:
-        if differentiable:
-            raise ValueError(
-                f"expected learned, hybrid or analytic dynamics for gradients, got '{name}'"
-            )
-        return ENGINES[str(name)](scene, device)
-    model = resolve_model(name, scene)
-    return dynamics_of(model.to(device), compile, differentiable, **how)

@@ -77,6 +77,14 @@ def make_task(name: str) -> Task:
     )
 
 
+def task_id(task: Task) -> str:
+    """The id of a task, or the name of its class."""
+    if isinstance(task, SuiteTask):
+        return task.name
+    ids = (name for name, kind in TASKS.items() if kind is type(task))
+    return next(ids, type(task).__name__)
+
+
 def preset_of(name: str) -> Preset:
     """The preset of the scene of that name; one for all third-party robots."""
     return PRESETS.get(name, THIRD_PARTY)
@@ -123,4 +131,5 @@ __all__ = [
     "protocol_of",
     "recorded_protocol",
     "source_of",
+    "task_id",
 ]

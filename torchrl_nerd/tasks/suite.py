@@ -41,7 +41,7 @@ class SuiteTask(Task):
     num_uniforms = 1
 
     def __init__(self, name: str, frame_skip: int = 1) -> None:
-        self._name, self.frame_skip = name, frame_skip
+        self.name, self.frame_skip = name, frame_skip
         domain, _, task = name.removeprefix("dm_control/").partition("-")
         model = self.scene.model  # refuses what is not supported
         judge = SuiteReward(domain, task)
@@ -55,7 +55,7 @@ class SuiteTask(Task):
 
     def build_scene(self) -> Scene:
         """The suite's robot and its ground."""
-        return import_scene(self._name)
+        return import_scene(self.name)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """By the suite's ``initialize_episode``, seeded with u."""
