@@ -212,9 +212,10 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
     Tasks of the dm_control suite may share a robot: the same physics by another name.
     """
     if scene.name != card.get("scene") and scene.hash != card.get("scene_hash"):
+        is_shipped = folder.parent == PRETRAINED
+        what = f"model '{folder.name}'" if is_shipped else f"checkpoint in {folder}"
         raise ValueError(
-            f"the checkpoint in {folder} is for robot '{card.get('scene')}', "
-            f"expected '{scene.name}'"
+            f"the {what} is for robot '{card.get('scene')}', expected '{scene.name}'"
         )
     local = {
         "control_step": scene.control_step,

@@ -4,7 +4,6 @@ import pytest
 import torch
 from dynamics_helpers import (
     EnvMaker,
-    act,
     act_all,
     assert_same_motion,
     each_dynamics,
@@ -14,7 +13,6 @@ from dynamics_helpers import (
     start_at,
     unequal_keys,
 )
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 ROWS, STEPS = 5, 4
@@ -106,31 +104,3 @@ def test_automatic_resets_equal_resets_by_hand(task_id, dynamics, generator):
         for key in ("qpos", "qvel", "observation", "done"):
             assert torch.equal(state[key], by_hand[key]), key
     assert resets > 0
-
-
-def test_what_a_reset_hands_back_is_torchrls_own(task_id, generator):
-    """Of all that a tensordict may hold beside: the env merges old and new rows itself."""
-    env = EnvMaker(task_id, "streaming", generator)(ROWS)
-    env.reset()
-    now = act(env, random_actions(env, 1, generator)[0])
-    now["action"] = env.action_spec.rand()
-    now["count"] = torch.arange(1, ROWS + 1)[:, None]
-    now["flag"] = torch.ones(ROWS, 2, dtype=torch.bool)
-    nested = now.clone().set(("hidden", "state"), torch.ones(ROWS, 3, 2))
-    nested["hidden", "deep", "id"] = torch.arange(1, ROWS + 1)
-    for given in (
-        now,
-        nested,
-        nested.exclude(("hidden", "deep")),
-        now.exclude("joint_torque"),
-    ):
-        for rows in (torch.arange(ROWS) == 1, torch.ones(ROWS, dtype=torch.bool)):
-            given = given.clone().set("_reset", rows[:, None])
-            fresh = env._reset(given)
-            merge = EnvBase._reset_proc_data
-            expected = merge(env, given.clone(), fresh.clone())
-            found = env._reset_proc_data(given.clone(), fresh.clone())
-            assert set(found.keys(True)) == set(expected.keys(True))
-            for key in expected.keys(True, True):
-                assert found[key].dtype == expected[key].dtype
-                assert torch.equal(found[key], expected[key])

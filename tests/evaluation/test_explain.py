@@ -31,8 +31,8 @@ def test_the_report_adds_up_and_its_text_names_all(scene):
 @pytest.mark.parametrize(
     ("name", "step"),
     [
-        ("cartpole", "UnconstrainedStep"),
-        ("ant", "PenaltyContactStep"),
+        ("cartpole", "unconstrained"),
+        ("ant", "penalty-contact-2-outer-steps"),
         ("dm_control/cheetah-run", None),
     ],
 )

@@ -83,10 +83,10 @@ class FaultRecorder:
                 self._write(kind, int((fault == kind).nonzero()[0, 0]))
 
     def _write(self, kind: int, row: int) -> None:
-        keys = self._steps[0].keys()
+        steps = self._steps
         tensors = {
-            k: torch.stack([s[k][row] for s in self._steps]) for k in keys
-        }  # (T, ...)
+            k: torch.stack([s[k][row] for s in steps]) for k in steps[0]
+        }  # (T, n)
         if self.model is not None:
             here = {key: value.to(self.model.device) for key, value in tensors.items()}
             state, torque = (here[QPOS], here[QVEL]), here["joint_torque"]

@@ -110,7 +110,8 @@ class NeRDEnv(SceneEnv):
             inference=inference,
         )
         if isinstance(dynamics, NeRDDynamics):
-            dynamics = GuardedDynamics(dynamics, guard) if guard else dynamics
+            if guard is not None:
+                dynamics = GuardedDynamics(dynamics, guard)
         else:
             _refuse_network_options(name, guard, inference)
         super().__init__(task, dynamics, num_envs, seed, device, dump_dir)

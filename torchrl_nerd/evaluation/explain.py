@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from torchrl_nerd.analytic import make_step
+from torchrl_nerd.analytic import STEPS, default_step, make_step
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
@@ -160,8 +160,10 @@ def _terrain(scene: Scene, has_normal: bool) -> str:
 
 
 def _analytic_step(scene: Scene) -> tuple[str | None, str | None]:
-    """Name of the analytic step that steps the scene, or the reason why none does."""
+    """The step that ``dynamics="analytic"`` stands for, or the reason why there is none."""
+    config = default_step(scene)
     try:
-        return type(make_step(scene)).__name__, None
+        make_step(scene, config)
+        return next(name for name, step in STEPS.items() if step == config), None
     except ValueError as error:
         return None, str(error)

@@ -1,0 +1,92 @@
+"""Names and options of `make_env`: what they mean, and refusals in one sentence."""
+
+import pytest
+from dynamics_helpers import random_model
+
+from torchrl_nerd import GroundTruthEnv, NeRDEnv, from_pretrained, make_env
+from torchrl_nerd.envs.resolve import ENGINES
+from torchrl_nerd.robots import make_task
+
+TASK = "ant/run"
+
+
+def refusal(make) -> str:
+    with pytest.raises(ValueError) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("dynamics", ["nerd", "analytic", "mujoco", "dm_control"])
+@pytest.mark.parametrize("device", ["cuda:99", "meta", "gpu"])
+def test_a_device_that_is_not_here_is_refused(dynamics, device):
+    said = refusal(lambda: make_env(TASK, dynamics, device=device))
+    assert "expected a device that torch finds here (cpu" in said
+    assert f"got '{device}'" in said
+
+
+@pytest.mark.parametrize("dynamics", [None, 5, ["nerd"]])
+def test_dynamics_without_a_name_are_refused(dynamics):
+    said = refusal(lambda: make_env(TASK, dynamics))
+    assert "expected dynamics of nerd, hybrid" in said and f"got {dynamics!r}" in said
+
+
+def test_a_refusal_lists_all_that_there_is():
+    said = refusal(lambda: make_env(TASK, "newton"))
+    assert all(name in said for name in ("nerd", "hybrid", "analytic", *ENGINES))
+    assert "unconstrained" in said and "ant-mlp" in said
+
+
+def test_a_scene_stands_for_its_learned_model_as_it_does_in_from_pretrained():
+    env, expected = make_env(TASK, "ant"), from_pretrained("ant").state_dict()
+    weights = env.dynamics.model.state_dict()
+    assert env.model_name == make_env(TASK, "nerd").model_name == "ant-mlp"
+    assert all(weights[key].equal(value) for key, value in expected.items())
+
+
+@pytest.mark.parametrize("dynamics", ["mujoco", "dm_control", "analytic"])
+@pytest.mark.parametrize("guard", ["flag", "nonsense"])
+def test_a_guard_of_dynamics_without_a_network_is_refused(dynamics, guard):
+    said = refusal(lambda: make_env(TASK, dynamics, guard=guard))
+    assert f"learned or hybrid dynamics for guard '{guard}', got '{dynamics}'" in said
+
+
+@pytest.mark.parametrize("inference", ["window", "bogus"])
+def test_an_analytic_step_has_no_inference(inference):
+    said = refusal(lambda: NeRDEnv(TASK, "analytic", inference=inference))
+    assert f"dynamics for inference '{inference}', got 'analytic'" in said
+
+
+def test_an_engine_is_no_model_and_a_model_is_no_engine():
+    assert "got the engine 'mujoco'" in refusal(lambda: NeRDEnv(TASK, "mujoco"))
+    assert "unknown engine 'nerd'" in refusal(lambda: GroundTruthEnv(TASK, "nerd"))
+
+
+def test_a_model_of_another_robot_is_called_by_its_name():
+    said = refusal(lambda: make_env(TASK, "cartpole-mlp"))
+    assert said == "the model 'cartpole-mlp' is for robot 'cartpole', expected 'ant'"
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "expected"),
+    [
+        ("nerd", "dynamics=NeRDDynamics, kind='learned', model='ant-mlp'"),
+        ("analytic", "dynamics=AnalyticDynamics, kind='analytic', model='analytic'"),
+        ("mujoco", "dynamics=MujocoDynamics, kind='ground truth'"),
+    ],
+)
+def test_an_env_says_what_it_is(dynamics, expected):
+    said = repr(make_env(TASK, dynamics, num_envs=3))
+    assert f"(task='ant/run', {expected}, num_envs=3, device='cpu')" in said
+
+
+def test_an_env_of_ones_own_says_what_it_is(generator):
+    class Walk(type(make_task(TASK))):
+        """A task without an id."""
+
+    task = Walk()
+    said = repr(NeRDEnv(task, random_model(task.scene, generator)))
+    assert "task='Walk'" in said and "model='NeRD'" in said
+    assert "task='dm_control/pendulum-swingup'" in repr(
+        make_env("dm_control/pendulum-swingup", "mujoco")
+    )
