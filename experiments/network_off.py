@@ -7,17 +7,18 @@ outside the interval, in passive and in driven test rollouts. "Without" sets the
 of the network to zero; nothing else changes. Driven means uniform random actions.
 """
 
+import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 import tyro
+from torch import nn
 
 from torchrl_nerd import from_pretrained
 from torchrl_nerd.checkpoint import shipped_card, shipped_models
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.ablate import without_network
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.robots import protocol_of
@@ -33,6 +34,15 @@ class Options:
     """Of the initial states; no training or validation uses it."""
     json: Path | None = None
     """Write the results to this file."""
+
+
+def without_network(model: HybridNeRD) -> HybridNeRD:
+    """A copy whose network's last layer is zero: its analytic step alone."""
+    copied = copy.deepcopy(model)
+    last = [m for m in copied.network.head.modules() if isinstance(m, nn.Linear)][-1]
+    for weight in last.parameters():
+        nn.init.zeros_(weight)
+    return copied
 
 
 def measure(name: str, num_trajectories: int, seed: int) -> list[dict[str, Any]]:

@@ -4,12 +4,12 @@ from typing import cast
 
 import pytest
 import torch
+from network_off import without_network
 from tensordict import TensorDict
 
 from torchrl_nerd import from_pretrained
 from torchrl_nerd.checkpoint import shipped_card, shipped_models
 from torchrl_nerd.dynamics import AnalyticDynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.ablate import without_network
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,

@@ -3,10 +3,11 @@
 import pytest
 import torch
 from helpers import make_scene
+from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.plots import plot_traces
-from torchrl_nerd.evaluation.traces import compare_traces, energy
+from torchrl_nerd.evaluation.traces import compare_traces, mechanics
 from torchrl_nerd.robots import load_scene, protocol_of
 
 PENDULUM = """
@@ -21,16 +22,15 @@ def test_energy_of_a_pendulum_is_the_textbooks(generator):
     inertia = 0.05 + 1.3 * 0.7**2
     height = 2.0 - 0.7 * angle.cos()
     expected = 0.5 * inertia * speed**2 + 1.3 * 9.81 * height
-    assert torch.allclose(energy(scene, angle, speed), expected[:, 0])
+    states = TensorDict({"qpos": angle, "qvel": speed}, [20])
+    assert torch.allclose(mechanics(scene, states)["energy"], expected[:, 0])
 
 
 def test_energy_of_a_state_that_is_not_finite_is_nan():
     scene = make_scene(PENDULUM)
     angle = torch.tensor([[0.0], [torch.nan]], dtype=torch.float64)
-    assert energy(scene, angle, torch.zeros_like(angle)).isnan().tolist() == [
-        False,
-        True,
-    ]
+    states = TensorDict({"qpos": angle, "qvel": torch.zeros_like(angle)}, [2])
+    assert mechanics(scene, states)["energy"].isnan().tolist() == [False, True]
 
 
 @pytest.mark.parametrize("name", ["cartpole", "double_pendulum", "ant"])

@@ -1,6 +1,6 @@
 """``nerd stability``: hard cases, in MuJoCo and in a model."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,10 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
-from torchrl_nerd.evaluation.stability.plot import plot_results
 from torchrl_nerd.evaluation.stability.run import (
-    as_json,
     as_table,
     choose_cases,
+    plot_results,
     run_cases,
 )
 from torchrl_nerd.evaluation.stability.stepper import DynamicsStepper
@@ -75,14 +74,10 @@ class Stability(MeasuringCommand):
             verdict = "pass" if result.passes else "FAIL"
             tqdm.write(f"{result.case:<21}{verdict:<6}{result.seconds:>7} s")
             results.append(result)
-            found |= as_json([result])
+            found[result.case] = asdict(result)
             self.keep(found)  # hours of long cases outlive an interruption
         print()
         print(as_table(results, model.kind))
         if self.plot is not None:
-            plot_results(
-                results,
-                self.plot,
-                f"{self.scene}: hard cases",
-            )
+            plot_results(results, self.plot, f"{self.scene}: hard cases")
         return found

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import cast
 
 import mujoco
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -45,40 +44,34 @@ class Traces:
     distances: Sequence[Tensor] | None
 
 
-def trace(
-    dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive, every: int = 1
-) -> TensorDict:
-    """``qpos`` and ``qvel`` of a rollout, ``[rows, 1 + steps // every]``, start first."""
-    terrain = start.get(TERRAIN, None)
-    state: TensorDictBase = start.select(QPOS, QVEL)
-    dynamics.reset(state)
-    states = [state]
-    for step in range(steps):
-        state = dynamics.step(state, drive(step, state), terrain)
-        if (step + 1) % every == 0:
-            states.append(state.select(QPOS, QVEL))
-    return cast(TensorDict, TensorDict.stack(states, 1))
+def mechanics(scene: Scene, states: TensorDictBase) -> dict[str, Tensor]:
+    """What MuJoCo computes of each state ``[n]``; NaN where a state is not finite.
 
-
-def energy(scene: Scene, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Kinetic energy plus that of gravity and joint springs, J, ``(steps,)``.
-
-    Args:
-        scene: the robot.
-        qpos: ``(steps, nq)``.
-        qvel: ``(steps, nv)``.
+    Returns:
+        ``energy (n,)``, kinetic plus that of gravity and joint springs, J; ``com (n, 3)``,
+        m; ``momentum (n, 3)``, kg m/s; ``angular_momentum (n, 3)`` about the centre of
+        mass, kg m^2/s; ``penetration (n,)``, the deepest contact, m. In world axes.
     """
-    model, data, values = scene.model, mujoco.MjData(scene.model), []
-    for q, v in zip(qpos.cpu().numpy(), qvel.cpu().numpy(), strict=True):
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            values.append(np.nan)
-            continue
-        data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_fwdPosition(model, data)
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mass, count = float(model.body_mass.sum()), len(states)
+    sizes = {"energy": (), "com": (3,), "momentum": (3,), "angular_momentum": (3,)}
+    found = {
+        key: torch.full((count, *size), torch.nan, dtype=torch.float64)
+        for key, size in {**sizes, "penetration": ()}.items()
+    }
+    both = torch.cat((states[QPOS], states[QVEL]), -1)  # (n, nq + nv)
+    for i in torch.nonzero(both.isfinite().all(-1))[:, 0].tolist():
+        data.qpos[:], data.qvel[:] = both[i].cpu().split((model.nq, model.nv))
+        mujoco.mj_forward(model, data)
         mujoco.mj_energyPos(model, data)
         mujoco.mj_energyVel(model, data)
-        values.append(float(data.energy.sum()))
-    return torch.tensor(values, dtype=torch.float64)
+        mujoco.mj_subtreeVel(model, data)
+        found["energy"][i] = float(data.energy.sum())
+        found["com"][i] = torch.from_numpy(data.subtree_com[0])
+        found["momentum"][i] = mass * torch.from_numpy(data.subtree_linvel[0])
+        found["angular_momentum"][i] = torch.from_numpy(data.subtree_angmom[0])
+        found["penetration"][i] = max((-c.dist for c in data.contact), default=0.0)
+    return found
 
 
 def compare_traces(
@@ -92,9 +85,10 @@ def compare_traces(
     """Roll out two dynamics, the second one the ground truth; see `action_drive`."""
     scene, start = scene_of(source), initial_states(source, trajectories, seed)
     drive = action_drive(source, trajectories, steps, seed, random_actions)
-    paths = [trace(one, start, steps, drive) for one in dynamics]
+    paths = [_trace(one, start, steps, drive) for one in dynamics]
     errors = position_errors(scene, paths[1][QPOS], paths[0][QPOS])
     relative = torch.stack([e / e.nanmean().clamp_min(1e-12) for e in errors.values()])
+    # over quantities and steps: (trajectories,)
     order = relative.mean((0, 2)).nan_to_num(nan=torch.inf).argsort()
     median = int(order[trajectories // 2])
     shown = [cast(TensorDict, path[median]) for path in paths]
@@ -106,6 +100,18 @@ def compare_traces(
         scene=scene,
         seconds=scene.control_step * torch.arange(steps + 1),
         errors=errors,
-        energies=[energy(scene, p[QPOS], p[QVEL]) for p in shown],
+        energies=[mechanics(scene, path)["energy"] for path in shown],
         distances=distances,
     )
+
+
+def _trace(
+    dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive
+) -> TensorDict:
+    """``qpos`` and ``qvel`` of a rollout, ``[n, 1 + steps]``, the start first."""
+    states = [start.select(QPOS, QVEL)]
+    dynamics.reset(states[0])
+    for step in range(steps):
+        torque = drive(step, states[-1])
+        states.append(dynamics.step(states[-1], torque, start.get(TERRAIN, None)))
+    return cast(TensorDict, TensorDict.stack([s.select(QPOS, QVEL) for s in states], 1))

@@ -13,9 +13,10 @@ from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability import states
 from torchrl_nerd.evaluation.stability.stepper import DynamicsStepper, Stepper
-from torchrl_nerd.keys import QPOS
+from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.sampling import sample_torque
 
 Metrics = dict[str, float]
 """What a case measured, by name with its unit."""
@@ -45,6 +46,12 @@ class Trial:
         return self.stepper.scene
 
     @property
+    def dynamics(self) -> DynamicsStepper:
+        """The stepper, for cases that need dynamics."""
+        assert isinstance(self.stepper, DynamicsStepper)
+        return self.stepper
+
+    @property
     def model(self) -> NeRD:
         """The model, for cases that need one."""
         assert isinstance(self.stepper.dynamics, NeRDDynamics)
@@ -67,17 +74,15 @@ class Trial:
         """Up to ``count`` states at rest, see `settled_states`."""
         return states.settled_states(self.scene, count).clone()
 
-    def in_air(self, count: int) -> TensorDict:
-        """States ``[count]`` that nothing touches."""
-        return states.clear_of_ground(self.scene, self.starts(count))
+    def in_air(self, count: int, speed: float) -> TensorDict:
+        """States ``[count]`` that nothing touches, at a fraction of the training speeds."""
+        start = states.clear_of_ground(self.scene, self.starts(count))
+        return start.set(QVEL, speed * start[QVEL])
 
     def torques(self, count: int, steps: int) -> Tensor:
         """Torques in the training range, ``(count, steps, num_actuated)``."""
-        return states.uniform_torque(self.scene, count, steps, self.generator)
-
-    def uniform(self, *shape: int) -> Tensor:
-        """Numbers from U(0, 1), float64."""
-        return torch.rand(shape, generator=self.generator).double()
+        scale = torch.ones(count, 1, dtype=torch.float64)
+        return sample_torque(self.scene.sampling, scale, steps, self.generator)
 
     def normal(self, *shape: int) -> Tensor:
         """Standard normal numbers, float64."""
@@ -138,26 +143,26 @@ CASES: dict[str, Case] = {}
 
 
 def hard_case(
-    applies: Callable[[Scene], bool] = lambda scene: True,
-    tolerances: Metrics | None = None,
+    tolerances: Metrics,
     ground_truth: Metrics | None = None,
+    applies: Callable[[Scene], bool] = lambda scene: True,
     needs: Needs = "states",
 ) -> Callable[[Callable[[Trial], Metrics]], Callable[[Trial], Metrics]]:
     """Register a function as the case of its name; its docstring says the physics.
 
     Args:
-        applies: whether the case makes sense for a robot.
         tolerances: largest allowed metrics.
         ground_truth: the same for MuJoCo; by default those of the tested dynamics.
+        applies: whether the case makes sense for a robot.
         needs: what the case asks for; MuJoCo is left out where that is a model.
     """
-    allowed = tolerances or {}
-    exact = allowed if ground_truth is None else ground_truth
+    limits = tolerances if ground_truth is None else ground_truth
+    limits = {} if needs == "model" else limits
 
     def register(run: Callable[[Trial], Metrics]) -> Callable[[Trial], Metrics]:
-        name, physics = run.__name__, " ".join((run.__doc__ or "").split())
-        limits = {} if needs == "model" else exact
-        CASES[name] = Case(name, physics, run, applies, allowed, limits, needs)
+        physics = " ".join((run.__doc__ or "").split())
+        about = (run.__name__, physics, run, applies, tolerances, limits, needs)
+        CASES[run.__name__] = Case(*about)
         return run
 
     return register
@@ -173,7 +178,18 @@ def has_motors(scene: Scene) -> bool:
     return bool(len(scene.actuated))
 
 
-def has_level_ground(scene: Scene) -> bool:
-    """Whether a floating base moves over one fixed plane."""
-    plane = scene.terrain is not None and scene.terrain.fixed_plane is not None
-    return has_floating_base(scene) and plane
+def largest(value: Tensor) -> float:
+    """The largest entry; infinity if any is not finite, or there is none."""
+    is_valid = value.numel() and value.isfinite().all()
+    return float(value.max()) if is_valid else float("inf")
+
+
+def norm(x: Tensor) -> Tensor:
+    """Length of vectors ``(*batch, D)``."""
+    return torch.linalg.vector_norm(x, dim=-1)
+
+
+def relative_difference(x: Tensor, other: Tensor) -> float:
+    """Largest ``|x - other| / (1 + max |x|)`` of trajectories ``(n, steps, D)``."""
+    size = 1.0 + x.abs().amax((1, 2), keepdim=True)  # (n, 1, 1)
+    return largest(((other - x) / size).abs())

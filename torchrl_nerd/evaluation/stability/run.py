@@ -1,15 +1,21 @@
-"""All cases of a robot in MuJoCo and in the dynamics under test, as one table."""
+"""All cases of a robot in MuJoCo and in the dynamics under test: table and picture."""
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from pathlib import Path
 from zlib import crc32
 
 from torch import Generator
 
+from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
 from torchrl_nerd.evaluation.stability.case import Case, Metrics, Trial
 from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.evaluation.stability.stepper import Stepper
+
+LEAST, MOST = 1e-6, 1e6  # ratios beyond are clipped in the picture
+BAR = 0.24  # inches
+PASS, FAIL = COLORS[2], COLORS[1]
 
 
 @dataclass(frozen=True)
@@ -86,18 +92,8 @@ def run_cases(
         )
 
 
-def as_json(results: list[Result]) -> dict:
-    """Results by case."""
-    return {result.case: asdict(result) for result in results}
-
-
 def as_table(results: list[Result], kind: str = "tested") -> str:
-    """Markdown: one line per metric.
-
-    Args:
-        results: from `run_cases`.
-        kind: header of the column of the dynamics under test.
-    """
+    """Markdown: one line per metric; ``kind`` heads the tested dynamics' column."""
     lines = [
         f"| case | metric | MuJoCo | {kind} | tolerance | |",
         "|---|---|---|---|---|---|",
@@ -109,12 +105,29 @@ def as_table(results: list[Result], kind: str = "tested") -> str:
             verdict = ""
             if limit is not None and value is not None:
                 verdict = "pass" if value <= limit else "**fail**"
-            exact = result.ground_truth.get(metric)
-            cells = [_two_digits(x) for x in (exact, value, limit)]
-            lines.append(f"| {name} | {metric} | {' | '.join(cells)} | {verdict} |")
+            shown = (result.ground_truth.get(metric), value, limit)
+            cells = " | ".join("" if x is None else f"{x:.2g}" for x in shown)
+            lines.append(f"| {name} | {metric} | {cells} | {verdict} |")
             name = ""
     return "\n".join(lines) + "\n"
 
 
-def _two_digits(value: float | None) -> str:
-    return "" if value is None else f"{value:.2g}"
+def plot_results(results: list[Result], path: Path, title: str) -> None:
+    """A PNG with every metric relative to its tolerance; above one it fails."""
+    names, ratios = [], []
+    for result in results:
+        for metric, limit in result.tolerances.items():
+            names.append(f"{result.case}: {metric}")
+            value = result.tested[metric]
+            ratio = value / limit if limit else (LEAST if value == 0 else MOST)
+            ratios.append(min(max(ratio, LEAST), MOST))
+    figure, (axes,) = make_figure(1, height=BAR * len(names) + 1.2)
+    colors = [PASS if ratio <= 1.0 else FAIL for ratio in ratios]
+    axes.barh(range(len(names)), [r - LEAST for r in ratios], left=LEAST, color=colors)
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    axes.invert_yaxis()
+    axes.axvline(1.0, color="black", linewidth=1)
+    label = "metric relative to its tolerance (green: pass; smaller is better)"
+    limits = (LEAST, 10.0 * max(1.0, *ratios))
+    axes.set(xscale="log", xlim=limits, xlabel=label, title=title)
+    save_figure(figure, path)

@@ -14,7 +14,6 @@ from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import ground_geoms
-from torchrl_nerd.scenes.sampling import sample_torque
 from torchrl_nerd.scenes.terrain import POSE_PARAMETERS
 
 SETTLE, AT_REST = 5.0, 1e-3  # s; m/s and rad/s
@@ -22,21 +21,9 @@ TRIES = 8
 HIGH = 100.0  # m
 
 
-def zero_torque(scene: Scene, count: int) -> Tensor:
-    """``(count, num_actuated)``."""
-    return torch.zeros(count, len(scene.actuated), dtype=torch.float64)
-
-
 def sample_states(scene: Scene, count: int, generator: Generator) -> TensorDict:
     """States ``[count]`` from the scene's training range."""
     return TensorDict(scene.sample_initial(count, generator)[0], [count])
-
-
-def perturbed(start: TensorDict, size: float, generator: Generator) -> TensorDict:
-    """The same states with normal noise of standard deviation ``size`` on ``qvel``."""
-    qvel = start[QVEL]
-    noise = torch.randn(qvel.shape, generator=generator, dtype=qvel.dtype)
-    return start.clone().update({QVEL: qvel + size * noise})
 
 
 @cache
@@ -68,11 +55,11 @@ def settled_states(scene: Scene, count: int) -> TensorDict:
 def _drop(scene: Scene, count: int, generator: Generator) -> TensorDict:
     """The final states of those drops that end at rest."""
     start = sample_states(scene, count, generator)
-    start[QVEL] = 0.0 * start[QVEL]
+    start[QVEL].zero_()
     if scene.terrain is not None and scene.terrain.is_per_row:
         start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(count, -1)
     steps = round(SETTLE / scene.control_step)
-    torque = zero_torque(scene, count)[:, None].expand(-1, steps, -1)
+    torque = torch.zeros(count, steps, len(scene.actuated), dtype=torch.float64)
     path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None))
     for key in (QPOS, QVEL):
         start[key] = path[key][:, -1].clone()
@@ -87,27 +74,6 @@ def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
     if scene.terrain is not None and scene.terrain.is_per_row:
         start[TERRAIN][:, 3] -= HIGH
     return start
-
-
-def uniform_torque(
-    scene: Scene, count: int, steps: int, generator: Generator
-) -> Tensor:
-    """Torques in the training range, ``(count, steps, num_actuated)``."""
-    scale = torch.ones(count, 1, dtype=torch.float64)
-    return sample_torque(scene.sampling, scale, steps, generator)
-
-
-def extreme_torques(scene: Scene, count: int, steps: int) -> dict[str, Tensor]:
-    """Zero, largest and larger torques, by name ``(count, steps, num_actuated)``."""
-    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
-    full = high.expand(count, steps, -1)
-    sign = 1.0 - 2.0 * (torch.arange(steps, dtype=torch.float64) % 2.0)
-    return {
-        "zero": torch.zeros_like(full),
-        "saturated": full,
-        "1000-fold": 1000.0 * full,
-        "alternating": sign[:, None] * full,
-    }
 
 
 def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:

@@ -8,10 +8,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
-from torchrl_nerd.evaluation.stability.states import zero_torque
-from torchrl_nerd.evaluation.traces import trace
-from torchrl_nerd.keys import ACTION, QPOS, QVEL
+from torchrl_nerd.dynamics import (
+    AnalyticDynamics,
+    Dynamics,
+    MujocoDynamics,
+    NeRDDynamics,
+)
+from torchrl_nerd.keys import ACTION, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 
 
@@ -23,11 +26,13 @@ class Stepper(ABC):
     | ``scene`` | the robot |
     | ``dynamics`` | what steps it; None where only an env is known |
     | ``is_ground_truth`` | whether MuJoCo steps it |
+    | ``batch`` | states stepped together; None: as many as there are |
     """
 
     scene: Scene
-    dynamics: Dynamics | None = None
     is_ground_truth: bool
+    dynamics: Dynamics | None = None
+    batch: int | None = None
 
     def roll(
         self,
@@ -45,37 +50,70 @@ class Stepper(ABC):
             every: steps between two states that are kept.
         """
         if torque is None:
-            torque = zero_torque(self.scene, len(start))[:, None]
-        return self._roll(start, steps, torque, every)
+            torque = torch.zeros(len(start), 1, len(self.scene.actuated)).double()
+        count, parts = self.batch or len(start), []
+        for first in range(0, len(start), count):
+            # the last state fills the envs that are left over
+            index = torch.arange(first, first + count).clamp_max(len(start) - 1)
+            drive = torque[index]  # (batch, T, num_actuated)
+            state = self._reset(cast(TensorDict, start[index]))
+            kept = [state.select(QPOS, QVEL)]
+            for step in range(steps):
+                state = self._step(state, drive[:, step % drive.shape[1]])
+                if (step + 1) % every == 0:
+                    kept.append(state.select(QPOS, QVEL))
+            parts.append(torch.stack(kept, 1))
+        return cast(TensorDict, torch.cat(parts)[: len(start)])
 
     @abstractmethod
-    def _roll(
-        self, start: TensorDict, steps: int, torque: Tensor, every: int
-    ) -> TensorDict: ...
+    def _reset(self, start: TensorDict) -> TensorDictBase:
+        """The state at the start."""
+
+    @abstractmethod
+    def _step(self, state: TensorDictBase, torque: Tensor) -> TensorDictBase:
+        """The next state."""
 
 
 class DynamicsStepper(Stepper):
     """A `Dynamics`, driven by joint torques."""
 
+    dynamics: Dynamics
+
     def __init__(self, dynamics: Dynamics) -> None:
         self.dynamics, self.scene = dynamics, dynamics.scene
         self.is_ground_truth = isinstance(dynamics, MujocoDynamics)
+        self._terrain: Tensor | None = None
 
-    def _roll(
-        self, start: TensorDict, steps: int, torque: Tensor, every: int
-    ) -> TensorDict:
-        def drive(step: int, state: TensorDictBase) -> Tensor:
-            return torque[:, step % torque.shape[1]]
+    def in_scene(self, scene: Scene) -> "DynamicsStepper":
+        """The same dynamics, with the same weights, in another scene.
 
-        return trace(cast(Dynamics, self.dynamics), start, steps, drive, every)
+        Raises:
+            RuntimeError: a model that was trained on another kind of ground.
+        """
+        dynamics = self.dynamics
+        if isinstance(dynamics, AnalyticDynamics):
+            step = dynamics.analytic_step.with_terrain(scene)
+            return DynamicsStepper(AnalyticDynamics(step))
+        if not isinstance(dynamics, NeRDDynamics):
+            return DynamicsStepper(MujocoDynamics(scene))
+        model = dynamics.model.copy_for(scene)
+        model.load_state_dict(dynamics.model.state_dict())
+        return DynamicsStepper(NeRDDynamics(model.to(dynamics.model.device)))
+
+    def _reset(self, start: TensorDict) -> TensorDictBase:
+        self._terrain, state = start.get(TERRAIN, None), start.select(QPOS, QVEL)
+        self.dynamics.reset(state)
+        return state
+
+    def _step(self, state: TensorDictBase, torque: Tensor) -> TensorDictBase:
+        return self.dynamics.step(state, torque, self._terrain)
 
 
 class EnvStepper(Stepper):
     """Any `EnvBase` that has ``qpos`` and ``qvel`` and can be set to a state.
 
     A torque becomes an action by its fraction of the largest torque of the scene's
-    sampling. More states than the env has envs are stepped one batch after another; ends
-    of episodes are ignored.
+    sampling. Ends of episodes are ignored.
 
     Args:
         env: of one batch dimension; ``reset(td, set_state=True)`` sets its state, ``qpos``
@@ -89,32 +127,14 @@ class EnvStepper(Stepper):
     ) -> None:
         self.env, self.is_ground_truth = env, is_ground_truth
         self.scene = cast(Scene, env.scene if scene is None else scene)
+        self.batch = env.batch_size.numel()
 
-    def _roll(
-        self, start: TensorDict, steps: int, torque: Tensor, every: int
-    ) -> TensorDict:
-        count, parts = self.env.batch_size.numel(), []
-        for first in range(0, len(start), count):
-            # the last state fills the envs that are left over
-            index = torch.arange(first, first + count).clamp_max(len(start) - 1)
-            batch = cast(TensorDict, start[index])
-            parts.append(self._roll_batch(batch, steps, torque[index], every))
-        return cast(TensorDict, torch.cat(parts)[: len(start)])
+    def _reset(self, start: TensorDict) -> TensorDictBase:
+        return self.env.reset(start.clone(), set_state=True)
 
-    def _roll_batch(
-        self, start: TensorDict, steps: int, torque: Tensor, every: int
-    ) -> TensorDict:
-        """As many states as there are envs."""
+    def _step(self, state: TensorDictBase, torque: Tensor) -> TensorDictBase:
         largest = torch.tensor(self.scene.sampling.torque, dtype=torch.float64)
-        state = self.env.reset(start.clone(), set_state=True)
-        kept = [state.select(QPOS, QVEL)]
         action = self.env.full_action_spec[ACTION].zero()
-        for step in range(steps):
-            if action.shape[-1] == len(largest):
-                fraction = torque[:, step % torque.shape[1]] / largest
-                action = fraction.to(action.dtype)
-            state[ACTION] = action
-            state = self.env.step(state)["next"]
-            if (step + 1) % every == 0:
-                kept.append(state.select(QPOS, QVEL))
-        return cast(TensorDict, torch.stack(kept, 1))
+        if action.shape[-1] == len(largest):
+            action = (torque / largest).to(action.dtype)
+        return self.env.step(state.set(ACTION, action))["next"]

@@ -2,15 +2,11 @@
 
 from torchrl_nerd.evaluation.stability import case
 from torchrl_nerd.evaluation.stability.cases import (  # noqa: F401
+    conservation,
     contact,
-    energy,
-    gradients,
     invariance,
-    isolation,
-    limits,
     numerics,
     ood,
-    prediction,
 )
 
 CASES = dict(sorted(case.CASES.items()))
