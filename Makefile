@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu bench-check model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu bench-check results model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -73,6 +73,17 @@ test-gpu: $(STAMP) ## the tests that need a CUDA device
 
 bench-check: $(STAMP) ## whether anything got slower, against a baseline of ratios
 	$(PY) benchmarks/bench_check.py $(ARGS)
+
+# What README and the site show. Hours on two idle cores: `make results ROBOTS=cartpole`
+# measures one robot, SIZE="--num-trajectories 256" fewer trajectories.
+ROBOTS := cartpole double_pendulum ant anymal franka franka_gravity cube cube_slope cube_real
+SIZE :=
+
+results: $(STAMP) ## errors and rates of every dynamics of every robot, to results/
+	for robot in $(ROBOTS); do \
+		$(NERD) eval $$robot $(SIZE) --quiet --json results/eval_$$robot.json || exit 1; \
+		$(NERD) bench $$robot --quiet --json results/bench_$$robot.json || exit 1; \
+	done
 
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained

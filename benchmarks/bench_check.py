@@ -9,8 +9,9 @@ turns in one process; a ratio is the median over rounds, of which there are more
 spread is small. Exits with 1 and a sentence for each ratio that got worse.
 """
 
+import copy
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import quantiles
@@ -19,15 +20,20 @@ from typing import Any, cast
 import mujoco
 import torch
 import tyro
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
 from tqdm import tqdm
 
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.bench.candidates import Candidate, models
-from torchrl_nerd.evaluation.bench.rates import RateBenchmark, Sample
+from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, stepper
 from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.keys import ACTION
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.tasks import Task
 
 BASELINE = Path(__file__).with_name("bench_baseline.json")
 TOLERANCE = 0.2
@@ -61,6 +67,14 @@ class Ratio:
 
     value: float
     spread: float
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Control steps of the whole batch per second: the dynamics alone, and in the env."""
+
+    steps_per_s: float
+    env_steps_per_s: float
 
 
 def summarize(samples: list[float]) -> Ratio:
@@ -109,10 +123,62 @@ def compare(
     return said
 
 
-def runners(scene: Scene, threads: int) -> list[Candidate]:
+def candidates(scene: Scene, threads: int) -> list[Candidate]:
     """MuJoCo at the scene's own substeps, and the shipped models."""
     own = Candidate(MUJOCO, "simulator", lambda here: MujocoDynamics(here, threads))
     return [own, *models(scene, variants=("compiled", "window"))]
+
+
+def runners(task: Task, options: Options) -> dict[str, tuple[Runner, Runner]]:
+    """Of every candidate, warm: its dynamics, and its env."""
+    state = mid_states(task, options.rows, options.seed)
+    return {
+        c.name: (
+            Runner(stepper(c.make(task.scene), state)),
+            Runner(_env_stepper(c, task, options)),
+        )
+        for c in candidates(task.scene, options.threads)
+    }
+
+
+def one_round(
+    found: Mapping[str, tuple[Runner, Runner]], rows: int
+) -> dict[str, Sample]:
+    """One sample of each candidate, by its name."""
+    return {
+        name: Sample(*(rows * runner.steps_per_s() for runner in both))
+        for name, both in found.items()
+    }
+
+
+def _env_stepper(
+    candidate: Candidate, task: Task, options: Options
+) -> Callable[[int], None]:
+    """Steps of an env with random actions, through TorchRL's collector."""
+    dynamics, here = candidate.make(task.scene), copy.copy(task)
+    here.scene = dynamics.scene  # of as many substeps
+    env = SceneEnv(here, dynamics, options.rows, options.seed)
+    if getattr(dynamics, "compile", False):
+        env.compile()
+    collectors: dict[int, Collector] = {}
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set(ACTION, env.action_spec.rand())
+
+    def run(steps: int) -> None:
+        if steps not in collectors:  # made where it is not timed: see Runner
+            collectors.clear()
+            collectors[steps] = Collector(
+                env,
+                act,  # TorchRL's own random policy takes five times as long
+                frames_per_batch=options.rows * steps,
+                total_frames=-1,
+                track_traj_ids=False,
+                auto_register_policy_transforms=False,
+            )
+        next(iter(collectors[steps]))
+
+    return run
 
 
 def measure(options: Options) -> dict[str, Ratio]:
@@ -120,13 +186,11 @@ def measure(options: Options) -> dict[str, Ratio]:
     found = {}
     for task_id in options.tasks:
         task = make_task(task_id)
-        benchmark = RateBenchmark(
-            runners(task.scene, options.threads), task, options.rows, options.seed
-        )
+        chosen = runners(task, options)
         rounds: list[dict[str, float]] = []
         known: dict[str, Ratio] = {}
         for _ in tqdm(range(options.rounds), task_id, disable=None):
-            rounds.append(ratios(benchmark.round()))
+            rounds.append(ratios(one_round(chosen, options.rows)))
             if len(rounds) < LEAST_ROUNDS:
                 continue
             known = {

@@ -13,11 +13,12 @@ from pathlib import Path
 
 import torch
 import tyro
+from scaling import two_in_turn
 
 from torchrl_nerd import NeRDEnv
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.evaluation.bench.rates import Runner, two_in_turn
+from torchrl_nerd.evaluation.bench.rates import Runner
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import TASKS, make_task
 

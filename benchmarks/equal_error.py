@@ -10,18 +10,19 @@ rate, beyond its fastest point at that point's rate.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import exp, inf, isfinite, log
+from math import exp, inf, isfinite, log, nan
 from pathlib import Path
 
 import tyro
 
+from torchrl_nerd.evaluation.bench.error_table import ErrorRow
+from torchrl_nerd.evaluation.bench.rates import RateRow
 from torchrl_nerd.evaluation.bench.report import BenchReport, pareto_front
 from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.robots import load_scene
 
 RESULTS = Path(__file__).parents[1] / "results"
 VARIANT = ", compiled"  # how a model runs in this table, in float32
-RATES = ("steps_per_s", "env_steps_per_s")
 
 Point = tuple[float, float]
 """Error, and steps per second."""
@@ -41,15 +42,15 @@ class Ratio:
     | field | meaning |
     |---|---|
     | ``scene``, ``model``, ``kind``, ``batch`` | of which benchmark |
-    | ``alone``, ``in_env`` | smallest and largest over the quantities |
+    | ``low``, ``high`` | smallest and largest ratio over the quantities |
     """
 
     scene: str
     model: str
     kind: str
     batch: int
-    alone: tuple[float, float]
-    in_env: tuple[float, float]
+    low: float
+    high: float
 
 
 def rate_at(error: float, points: Mapping[str, Point]) -> float:
@@ -70,30 +71,21 @@ def ratios(report: BenchReport) -> Iterator[Ratio]:
     """Of every model of one benchmark, batch by batch."""
     for row in report.rates:
         if row.name.endswith(VARIANT):
+            found = []
+            for error in report.errors:
+                if error.name == row.name:
+                    simulators = _simulators(report, row.batch, error.quantity)
+                    rival = rate_at(error.mean, simulators)
+                    found.append(row.steps_per_s / rival if rival else inf)
             name = row.name.removesuffix(VARIANT)
-            both = (spread(report, row.batch, row.name, rate) for rate in RATES)
+            both = min(found), max(found)
             yield Ratio(report.scene, name, row.kind, row.batch, *both)
 
 
-def spread(
-    report: BenchReport, batch: int, name: str, rate: str
-) -> tuple[float, float]:
-    """Smallest and largest ratio of a model's rate over the quantities."""
-    chosen = [row for row in report.rates if row.batch == batch]
-    rates = {row.name: getattr(row, rate) for row in chosen}
-    simulators = {row.name for row in chosen if row.kind == "simulator"}
-    found = []
-    for error in report.errors:
-        if error.name != name:
-            continue
-        points = {
-            row.name: (row.mean, rates[row.name])
-            for row in report.errors
-            if row.name in simulators and row.quantity == error.quantity
-        }
-        rival = rate_at(error.mean, points)
-        found.append(rates[name] / rival if rival else inf)
-    return min(found), max(found)
+def _simulators(report: BenchReport, batch: int, quantity: str) -> dict[str, Point]:
+    kinds = {row.name: row.kind for row in report.rates}
+    points = report.points(batch, quantity)
+    return {name: p for name, p in points.items() if kinds[name] == "simulator"}
 
 
 def table(found: list[Ratio]) -> str:
@@ -104,31 +96,40 @@ def table(found: list[Ratio]) -> str:
         return scenes[x.scene].model.nv, x.scene, x.batch
 
     lines = [
-        "| scene | dofs | contact points | substeps | model | kind | batch |"
-        " at equal error | in env |",
-        "|---" * 9 + "|",
+        "| scene | dofs | contact points | substeps | model | kind | batch | ratio |",
+        "|---" * 8 + "|",
     ]
     for x in sorted(found, key=order):
         scene = scenes[x.scene]
         sizes = scene.model.nv, len(scene.contacts), scene.substeps
         cells = (x.scene, *sizes, f"`{x.model}`", x.kind, f"{x.batch:,}")
-        shown = (*cells, written(x.alone), written(x.in_env))
+        shown = (*cells, written(x))
         lines.append(f"| {' | '.join(map(str, shown))} |")
     return "\n".join(lines)
 
 
-def written(spread: tuple[float, float]) -> str:
+def written(ratio: Ratio) -> str:
     """One number, or two where quantities differ."""
-    if not isfinite(spread[1]):
+    if not isfinite(ratio.high):
         return "MuJoCo is never so accurate"
-    low, high = (f"{x:.1f}" for x in spread)
+    low, high = f"{ratio.low:.1f}", f"{ratio.high:.1f}"
     return low if low == high else f"{low} to {high}"
 
 
 def reports(folder: Path) -> dict[Path, BenchReport]:
     """Every benchmark in the folder, by its file."""
     paths = sorted(folder.glob("bench_*.json"))
-    return {p: BenchReport.from_results(read_results(p)["results"]) for p in paths}
+    return {path: read_report(path) for path in paths}
+
+
+def read_report(path: Path) -> BenchReport:
+    """The report in a file that `nerd bench --json` wrote; null is NaN there."""
+    results = read_results(path)["results"]
+    for row in results["errors"]:
+        row["mean"] = nan if row["mean"] is None else row["mean"]
+    errors = [ErrorRow(**row) for row in results["errors"]]
+    rates = [RateRow(**row) for row in results["rates"]]
+    return BenchReport(**results | {"errors": errors, "rates": rates})
 
 
 def read(folder: Path) -> list[Ratio]:

@@ -11,10 +11,9 @@ on one thread each; the processor's time counts, which other work disturbs littl
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 from typing import Any, cast
 
 import mujoco
@@ -25,10 +24,9 @@ from tensordict import TensorDict
 
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.dynamics.base import Dynamics
-from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, two_in_turn
+from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, stepper
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import QPOS, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.robots import SCENES, load_scene
@@ -95,17 +93,11 @@ def mean_contacts(scene: Scene, state: TensorDict) -> float:
     return fmean(counts)
 
 
-def stepper(dynamics: Dynamics, state: TensorDict) -> Callable[[int], None]:
-    """Steps the same states so many times."""
-    start, terrain = state.select(QPOS, QVEL), state.get(TERRAIN, None)
-    torque = torch.zeros(len(state), len(dynamics.scene.actuated)).double()
-    dynamics.reset(start)
-
-    def run(steps: int) -> None:
-        for _ in range(steps):
-            dynamics.step(start, torque, terrain)
-
-    return run
+def two_in_turn(one: Runner, other: Runner, rounds: int) -> tuple[float, float, float]:
+    """Steps per second of both, and of the first to the second: medians over rounds."""
+    samples = [(one.steps_per_s(), other.steps_per_s()) for _ in range(rounds)]
+    first, second = (median(rates) for rates in zip(*samples, strict=True))
+    return first, second, median(a / b for a, b in samples)
 
 
 def measure(scene: Scene, batch: int, options: Options) -> Point:

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import torch
 import tyro
-from scaling import stepper
+from scaling import two_in_turn
 from tyro.conf import Positional
 
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, two_in_turn
+from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, stepper
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config

@@ -326,9 +326,13 @@ def test_from_data_to_results(name, tmp_path, seed, capsys):
                     assert row["mean"] == protocol.published[key]
 
     half = tmp_path / "half.json"
-    assert main([*argv, "--bf16", "--json", str(half)]) == 0
-    rounded = read_results(half)["results"]["errors"]
-    assert rounded != content["errors"]  # of other rounding
+    assert main([*argv, "--variants", "bf16", "--json", str(half)]) == 0
+    rows = read_results(half)["results"]["errors"]
+    exact, rounded = (
+        [row["mean"] for row in rows if row["name"] == model]
+        for model in (best, f"{best}, bf16")
+    )
+    assert len(exact) == len(rounded) and exact != rounded
 
 
 @pytest.mark.slow

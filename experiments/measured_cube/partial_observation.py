@@ -136,9 +136,9 @@ def main() -> None:
     }
     results = {}
     for name, errors in found.items():
-        summary = summarize_windows(scene, errors, recording, starts)
-        results[name] = {key: asdict(value) for key, value in summary.items()}
-        print(name, {key: round(value.mean, 4) for key, value in summary.items()})
+        results[name] = summarize_windows(scene, errors, recording, starts)
+        means = {key: round(value["mean"], 4) for key, value in results[name].items()}
+        print(name, means)
     if args.json:
         how = {"case": asdict(case), "parameters": fit.step.values()}
         write_json(args.json, {**how, "errors": results})

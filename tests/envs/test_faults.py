@@ -21,7 +21,7 @@ from tensordict import TensorDict
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
 from torchrl_nerd.cli.main import main
-from torchrl_nerd.evaluation.replay import read_dump, replay
+from torchrl_nerd.cli.replay import read_dump, replay
 from torchrl_nerd.modules.nerd import NeRD
 
 ROWS, STEPS = 4, 3
@@ -154,14 +154,14 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     after = act(env, bad)
     assert after["fault"][:, 0].tolist() == [int(i == row) for i in range(ROWS)]
     (path,) = tmp_path.iterdir()
-    dump = read_dump(path)
-    assert dump.about["reason"] == "action" and dump.about["env"] == str(row)
-    assert torch.equal(dump.steps["qpos"][1:], good["qpos"][row])
-    assert ("features" in dump.steps.keys()) == isinstance(model, NeRD)
+    about, dump = read_dump(path)
+    assert about["reason"] == "action" and about["env"] == str(row)
+    assert torch.equal(dump["qpos"][1:], good["qpos"][row])
+    assert ("features" in dump.keys()) == isinstance(model, NeRD)
     if isinstance(model, NeRD):
-        given = (dump.steps[k] for k in ("qpos", "qvel", "joint_torque"))
+        given = (dump[k] for k in ("qpos", "qvel", "joint_torque"))
         features = model.features(*given, None).nan_to_num()
-        assert torch.equal(dump.steps["features"].nan_to_num(), features)
+        assert torch.equal(dump["features"].nan_to_num(), features)
     stamp = path.stat().st_mtime_ns
     act(env, bad)
     assert path.stat().st_mtime_ns == stamp

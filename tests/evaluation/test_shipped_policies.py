@@ -3,9 +3,13 @@
 import pytest
 
 from torchrl_nerd.cli import main
-from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy import (
+    load_policy,
+    make_actor,
+    shipped_policies,
+    shipped_policy,
+)
 from torchrl_nerd.evaluation.policy_transfer import transfer
-from torchrl_nerd.evaluation.shipped_policies import shipped_policies, shipped_policy
 from torchrl_nerd.robots import PPO_CONFIGS, make_task
 
 PAPER = {

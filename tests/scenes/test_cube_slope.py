@@ -1,18 +1,31 @@
 """A plane per row: as steep as said, as far below, and the ground that MuJoCo steps on."""
 
+import copy
+from dataclasses import replace
+
 import torch
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.stability.states import (
-    rotated,
-    sample_states,
-    with_rotated_ground,
-)
+from torchrl_nerd.evaluation.stability.states import rotated, sample_states
+from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.robots.cube.scene import STEEPEST
+from torchrl_nerd.scenes.contact_points import ground_geoms
 
 ROWS = 64
 SCENE, LEVEL = load_scene("cube_slope"), load_scene("cube")
+
+
+def with_rotated_ground(scene, quat):
+    """The scene with its ground rotated by a quaternion ``(4,)`` about the origin."""
+    model = copy.copy(scene.model)
+    for geom in ground_geoms(model):
+        position = torch.from_numpy(scene.model.geom_pos[geom].copy())
+        pose = torch.from_numpy(scene.model.geom_quat[geom].copy())
+        model.geom_pos[geom] = rotate(quat, position).numpy()
+        model.geom_quat[geom] = quat_multiply(quat, pose).numpy()
+        model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's frame for it
+    return replace(scene, model=model)
 
 
 def test_slopes_are_as_far_below_as_level_ground_would_be(generator):

@@ -1,6 +1,6 @@
 """``nerd bench``: speed and error of MuJoCo and of every model of a scene."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ class Bench(MeasuringCommand):
     models: tuple[str, ...] = ()
     """Names of models, or checkpoint folders; all that are shipped for it by default."""
     variants: tuple[str, ...] = ("compiled",)
-    """Other ways to run each model: compiled, guarded, window, bf16, "bf16 compiled"."""
+    """Other ways to run each model, see nerd eval: compiled, window, bf16."""
     batches: tuple[int, ...] = (1, 64, 512, 4096)
     """Trajectories stepped together."""
     num_trajectories: int = 256
@@ -71,4 +71,4 @@ class Bench(MeasuringCommand):
         print(bench_table(report))
         if self.plot is not None:
             plot_bench(report, self.plot)
-        return report.results()
+        return asdict(report)

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
+from torchrl_nerd import __version__
 from torchrl_nerd.cli.command import Command
-from torchrl_nerd.evaluation.doctor import machine, shipped_checks, versions
+from torchrl_nerd.evaluation.doctor import PACKAGES, machine, shipped_checks
+from torchrl_nerd.evaluation.results import versions
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,8 @@ class Doctor(Command):
         Raises:
             RuntimeError: a shipped model does not repeat its stored steps.
         """
-        found = {"versions": versions(), "machine": machine()}
+        packages = {"torchrl_nerd": __version__, **versions(*PACKAGES)}
+        found = {"versions": packages, "machine": machine()}
         for title, entries in found.items():
             print(title)
             for key, value in entries.items():

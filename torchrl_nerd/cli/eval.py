@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
@@ -13,7 +12,6 @@ from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional, recorded_scene
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
-from torchrl_nerd.dynamics.nerd import Inference
 from torchrl_nerd.evaluation.bench.candidates import models, mujoco_name, simulators
 from torchrl_nerd.evaluation.bench.error_table import ErrorRow, error_rows, error_table
 from torchrl_nerd.evaluation.bench.evaluation_set import cases_of, evaluation_set
@@ -60,10 +58,9 @@ class Eval(MeasuringCommand):
     """Trajectories per case."""
     seed: int = 500
     """Of the initial states; test seeds are never used in training or validation."""
-    inference: Inference = "streaming"
-    """streaming, or window: the paper's recomputation."""
-    bf16: bool = False
-    """Network in bfloat16, state in float64: for processors that multiply in it."""
+    variants: tuple[str, ...] = ()
+    """Other ways to run each model: compiled, bf16 (the network in bfloat16), or window
+    (a transformer that recomputes its history at every step, as in the paper)."""
     reference: Literal["rk4"] | None = None
     """Measure against the reference solver in place of the scene's own: MuJoCo's RK4 at
     four times its substeps."""
@@ -136,11 +133,7 @@ class Eval(MeasuringCommand):
     ) -> Iterator[list[ErrorRow]]:
         """Rows of one case and horizon after the other."""
         names = [] if self.model is None else [str(self.model)]
-        how = {
-            "inference": self.inference,
-            "dtype": torch.bfloat16 if self.bf16 else None,
-        }
-        learned = models(scene, names, self.device, **how)
+        learned = models(scene, names, self.device, self.variants)
         candidates = [*simulators(scene), *learned]
         cases, horizons = list(cases_of(protocol)), protocol.horizons
         steps = max(horizons)
@@ -173,8 +166,6 @@ class Eval(MeasuringCommand):
         protocol = recorded_protocol(self.scene)
         scene = recorded_scene(self.scene)
         model = from_pretrained(self.model or protocol.model, scene).to(self.device)
-        if self.bf16 and model.kind != "analytic":
-            model = model.to(torch.bfloat16)
         recording, split = load_recording(path, scene)
         if self.split != "all" and self.split not in split:
             expected = ", ".join(("all", *split))
@@ -187,7 +178,7 @@ class Eval(MeasuringCommand):
                 "none"
             )
         others = rivals(scene) if self.baselines else {}
-        others["model"] = dynamics_of(model, inference=self.inference)
+        others["model"] = dynamics_of(model)
         table = compare(others, scene, recording, starts, self.states)
         print(errors_as_text(table, protocol.published, self.states))
         shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}

@@ -6,11 +6,10 @@ from typing import Any
 
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policies
 from torchrl_nerd.evaluation.render.renderer import require_gl
 from torchrl_nerd.evaluation.render.side_by_side import FixedActions, roll_out_both
 from torchrl_nerd.evaluation.render.video import check_video, write_video
-from torchrl_nerd.evaluation.shipped_policies import shipped_policies
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_at_least

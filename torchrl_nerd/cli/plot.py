@@ -9,7 +9,7 @@ from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.evaluation.plots import plot_traces
-from torchrl_nerd.evaluation.render.side_by_side import model_title
+from torchrl_nerd.evaluation.policy_transfer import model_title
 from torchrl_nerd.evaluation.rollout_error import scene_of
 from torchrl_nerd.evaluation.traces import compare_traces
 from torchrl_nerd.files import folder_name
@@ -67,7 +67,7 @@ class Plot(DeviceCommand):
         is_random = case in protocol.random_actions
         args = (steps, self.trajectories, self.seed, is_random)
         traces = compare_traces(source, both, *args)
-        names = (model_title(name, scene), "MuJoCo")
+        names = (model_title(scene, name), "MuJoCo")
         title = f"{self.scene}, {case}: {names[0]} ({both[0].kind}) against MuJoCo"
         plot_traces(traces, names, title, out)
         print(f"{out}: {self.trajectories} trajectories of {steps} steps, {case}")

@@ -1,7 +1,6 @@
 """``nerd stability``: hard cases, in MuJoCo and in a model."""
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -9,14 +8,8 @@ from tqdm import tqdm
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
-from torchrl_nerd.evaluation.stability.run import (
-    as_table,
-    choose_cases,
-    plot_results,
-    run_cases,
-)
-from torchrl_nerd.evaluation.stability.stepper import DynamicsStepper
+from torchrl_nerd.dynamics import dynamics_of
+from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_cases
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.settings import SettingError
 
@@ -28,7 +21,7 @@ class Stability(MeasuringCommand):
     Every metric is graded against a tolerance. The exit status is 0 even where a case
     fails.
 
-    Example: nerd stability cartpole --json results/stability.json --plot stability.png
+    Example: nerd stability cartpole --json results/stability.json
     """
 
     scene: Positional[str]
@@ -43,15 +36,8 @@ class Stability(MeasuringCommand):
     """Fraction of long rollouts and of large batches, in (0, 1]."""
     compile: bool = False
     """Compile the model's step: long cases take a fraction of the time."""
-    plot: Path | None = None
-    """Plot every metric relative to its tolerance to this PNG."""
     quiet: bool = False
     """No progress bar."""
-
-    @property
-    def figure(self) -> Path | None:
-        """The drawing, where it was asked for."""
-        return self.plot
 
     def run(self) -> dict[str, Any]:
         """Print a verdict per case, then the table, and return the results.
@@ -64,12 +50,11 @@ class Stability(MeasuringCommand):
         cases = choose_cases(list(self.cases) or None)
         scene = load_scene(self.scene)
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
-        ground_truth = DynamicsStepper(MujocoDynamics(scene))
-        tested = DynamicsStepper(dynamics_of(model, compile=self.compile))
+        tested = dynamics_of(model, compile=self.compile)
         results, count = [], sum(case.supports(tested) for case in cases)
         found: dict[str, Any] = {"scene": self.scene, "seed": self.seed}
         found["scale"] = self.scale
-        trials = run_cases(ground_truth, tested, cases, self.seed, self.scale)
+        trials = run_cases(tested, cases, self.seed, self.scale)
         for result in tqdm(trials, "cases", count, leave=False, disable=self.quiet):
             verdict = "pass" if result.passes else "FAIL"
             tqdm.write(f"{result.case:<21}{verdict:<6}{result.seconds:>7} s")
@@ -78,6 +63,4 @@ class Stability(MeasuringCommand):
             self.keep(found)  # hours of long cases outlive an interruption
         print()
         print(as_table(results, model.kind))
-        if self.plot is not None:
-            plot_results(results, self.plot, f"{self.scene}: hard cases")
         return found

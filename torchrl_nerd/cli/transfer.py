@@ -6,9 +6,8 @@ from typing import Any
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policy
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
-from torchrl_nerd.evaluation.shipped_policies import shipped_policy
 from torchrl_nerd.robots import make_task
 
 

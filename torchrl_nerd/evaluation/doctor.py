@@ -4,13 +4,11 @@ import os
 import platform
 import shutil
 import time
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
-from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
 from torchrl_nerd.evaluation.render.renderer import find_gl
 
@@ -20,37 +18,17 @@ PACKAGES = (
 )
 
 
-def versions() -> dict[str, str]:
-    """Of Python and of every package that matters."""
-    found = {"torchrl_nerd": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
 def machine() -> dict[str, str]:
     """Devices, threads, compiler, OpenGL."""
-    cuda = "none"
-    if torch.cuda.is_available():
-        cuda = ", ".join(
-            torch.cuda.get_device_name(index)
-            for index in range(torch.cuda.device_count())
-        )
-    compiler = next(
-        filter(
-            None, map(shutil.which, (os.environ.get("CXX", "c++"), "g++", "clang++"))
-        ),
-        "none: compile=True runs eagerly",
-    )
+    gpus = map(torch.cuda.get_device_name, range(torch.cuda.device_count()))
+    compilers = (os.environ.get("CXX", "c++"), "g++", "clang++")
+    compiler = next(filter(None, map(shutil.which, compilers)), None)
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "processors": str(os.cpu_count()),
         "torch threads": str(torch.get_num_threads()),
-        "CUDA devices": cuda,
-        "C++ compiler": compiler,
+        "CUDA devices": ", ".join(gpus) or "none",
+        "C++ compiler": compiler or "none: compile=True runs eagerly",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
         "OpenGL": find_gl() or "none: nerd play cannot render",
         "display": os.environ.get("DISPLAY", "none"),

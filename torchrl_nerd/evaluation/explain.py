@@ -1,5 +1,6 @@
 """What of a scene a model sees, what is left out, and why."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 from torchrl_nerd.analytic import STEPS, default_step, make_step
@@ -72,24 +73,25 @@ class SceneReport:
         return sum(feature.width for feature in self.features)
 
     def __str__(self) -> str:
-        lines = [f"{self.scene}: {self.token_width} features a step", ""]
-        lines.append(f"{'feature':<18}{'width':>6}  meaning")
-        for feature in self.features:
-            lines.append(f"{feature.key:<18}{feature.width:>6}  {feature.meaning}")
-        lines += ["", str(self.solver)]
-        counts = {b: self.contact_bodies.count(b) for b in self.contact_bodies}
-        if counts:
-            on = ", ".join(f"{body} {count}" for body, count in counts.items())
-            lines.append(f"contact points kept, by body: {on}")
         pairs = ["-".join(pair) for pair in self.self_contacts]
         found = f"{len(pairs)} pairs of bodies, without features: {', '.join(pairs)}"
-        lines.append(f"self-contacts: {found if pairs else 'none'}")
-        lines.append(f"terrain: {self.terrain}")
-        lines.append(f"controller: {self.controller}")
-        lines.append(
-            f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}"
+        counts = Counter(self.contact_bodies).items()
+        on = ", ".join(f"{body} {count}" for body, count in counts)
+        return "\n".join(
+            [
+                f"{self.scene}: {self.token_width} features a step",
+                "",
+                f"{'feature':<18}{'width':>6}  meaning",
+                *(f"{f.key:<18}{f.width:>6}  {f.meaning}" for f in self.features),
+                "",
+                str(self.solver),
+                *([f"contact points kept, by body: {on}"] if on else []),
+                f"self-contacts: {found if pairs else 'none'}",
+                f"terrain: {self.terrain}",
+                f"controller: {self.controller}",
+                f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
+            ]
         )
-        return "\n".join(lines)
 
 
 def explain(scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> SceneReport:
@@ -103,41 +105,35 @@ def explain(scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> SceneReport
         >>> explain(load_scene("cartpole")).token_width
         7
     """
-    features = SceneFeatures(scene, config)
+    features, model = SceneFeatures(scene, config), scene.model
     sizes = {**features.robot.sizes, **features.contact.sizes}
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
-    model = scene.model
 
-    def body_of(geom: int) -> str:
-        return _body_name(scene, int(model.geom_bodyid[geom]))
+    def name(body: int) -> str:
+        return model.body(body).name or f"body {body}"
 
-    pairs = {tuple(sorted((body_of(a), body_of(b)))) for a, b in own_contacts(model)}
+    pairs = {
+        tuple(sorted(name(int(model.geom_bodyid[geom])) for geom in pair))
+        for pair in own_contacts(model)
+    }
     step, reason = _analytic_step(scene)
+    controller = scene.controller
     return SceneReport(
         scene=scene.name,
-        features=tuple(
-            Feature(str(key), width, meanings[str(key)]) for key, width in sizes.items()
-        ),
+        features=tuple(Feature(str(k), n, meanings[str(k)]) for k, n in sizes.items()),
         solver=scene.explain(),
-        contact_bodies=tuple(_body_name(scene, body) for body in scene.contacts.bodies),
+        contact_bodies=tuple(map(name, scene.contacts.bodies)),
         self_contacts=tuple((low, high) for low, high in sorted(pairs)),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
-        controller=f"{type(scene.controller).__name__}, "
-        f"{scene.controller.num_actions} actions",
+        controller=f"{type(controller).__name__}, {controller.num_actions} actions",
         analytic_step=step,
         why_no_step=reason,
     )
 
 
-def _body_name(scene: Scene, body: int) -> str:
-    return scene.model.body(body).name or f"body {body}"
-
-
 def _state_meaning(scene: Scene) -> str:
     """Parts of ``robot_state``, see `RobotCentric`."""
-    parts = []
-    if scene.base.is_floating:
-        parts.append("base velocity and gravity in the base frame")
+    parts = ["base velocity and gravity in the base frame"] * scene.base.is_floating
     parts.append("joint positions (sine and cosine of a hinge without limits)")
     parts.append("joint velocities")
     if scene.model.jnt_limited.any():
@@ -149,13 +145,12 @@ def _terrain(scene: Scene, has_normal: bool) -> str:
     terrain = scene.terrain
     if terrain is None:
         return "none that the robot can touch"
-    surfaces = terrain.surfaces
-    planes = sum(surface.kind == PLANE for surface in surfaces)
+    planes = sum(surface.kind == PLANE for surface in terrain.surfaces)
     where = "drawn for each trajectory" if terrain.is_per_row else "fixed"
     normal = "a feature" if has_normal else "no feature: it follows from the state"
     shapes = f"{planes} plane{'s' * (planes != 1)}"
-    if planes < len(surfaces):
-        shapes += f", {len(surfaces) - planes} other surfaces"
+    if planes < len(terrain.surfaces):
+        shapes += f", {len(terrain.surfaces) - planes} other surfaces"
     return f"{shapes}, {where}; the normal is {normal}"
 
 

@@ -17,6 +17,8 @@ from torchrl_nerd.robots import make_task
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
+POLICIES = Path(__file__).parents[1] / "policies"
+"""Policies that come with the package, learned in shipped models: ``make policies``."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 MOST_LAYERS, LARGEST_SIZE = 2**7, 2**14
 MIN_STD = 1e-3  # of an observation: a constant one is not blown up
@@ -65,7 +67,7 @@ class Standardize(nn.Module):
         samples = self._last_and_changes(observations.flatten(0, -2).double())
         self.count += len(samples)
         share = len(samples) / self.count
-        gap = samples.mean(0) - self.mean
+        gap = samples.mean(0) - self.mean  # (size,)
         within = samples.var(0, correction=0)
         between = share * (1.0 - share) * gap.square()
         variance = (1.0 - share) * self.std.square() + share * within + between
@@ -81,7 +83,7 @@ class Standardize(nn.Module):
     def _last_and_changes(self, observations: Tensor) -> Tensor:
         if self.frame_stack == 1:
             return observations
-        each = observations.unflatten(-1, (self.frame_stack, -1))
+        each = observations.unflatten(-1, (self.frame_stack, -1))  # (*batch, frames, D)
         return torch.cat((each[..., -1:, :], each.diff(dim=-2)), -2).flatten(-2)
 
 
@@ -165,12 +167,8 @@ def save_policy(
     """
     folder = writable_folder(folder)
     write_tensors(folder / WEIGHTS, policy.state_dict())
-    shape = {
-        "format": 1,
-        "sizes": list(policy.sizes),
-        "frame_stack": policy.frame_stack,
-    }
-    write_json(folder / CARD, {**shape, **(card or {})})
+    shape = {"sizes": list(policy.sizes), "frame_stack": policy.frame_stack}
+    write_json(folder / CARD, {"format": 1, **shape, **(card or {})})
     return folder
 
 
@@ -204,9 +202,7 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
                 f"actions, the task has {expected[0]} and {expected[1]}"
             )
     tensors = read_tensors(folder / WEIGHTS)
-    with torch.device(
-        "meta"
-    ):  # shapes alone, whatever frame_stack the sizes would take
+    with torch.device("meta"):  # shapes alone, whatever memory the sizes would take
         expected = Policy(sizes, frame_stack=frame_stack).state_dict()
     expect_fit(tensors, expected, f"weights in {folder}", f"layers of {sizes}")
     policy = Policy(sizes, frame_stack=frame_stack)
@@ -224,6 +220,28 @@ def policy_task(folder: Path) -> Task:
     if not isinstance(name, str):
         raise ValueError(f"expected the task's id in {folder / CARD}, got {name!r}")
     return make_task(name)
+
+
+def shipped_policies() -> dict[str, Path]:
+    """Task id -> folder of its policy, see `load_policy`."""
+    folders = sorted(card.parent for card in POLICIES.glob(f"*/{CARD}"))
+    return {read_json(folder / CARD)["task"]: folder for folder in folders}
+
+
+def shipped_policy(task: str) -> Path:
+    """The folder of a task's policy.
+
+    Raises:
+        ValueError: none is shipped for that task.
+    """
+    policies = shipped_policies()
+    if task not in policies:
+        names = ", ".join(policies)
+        raise ValueError(
+            f"no policy of '{task}' is shipped, only of {names}: expected a folder that "
+            "examples/ppo.py wrote"
+        )
+    return policies[task]
 
 
 def _read_card(folder: Path) -> dict[str, Any]:

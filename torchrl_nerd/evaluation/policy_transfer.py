@@ -26,6 +26,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
 GROUND_TRUTH = "mujoco"
+TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
 NORMAL_95 = 1.96  # half width of a 95% interval, in standard errors
 PAPER_NOTE = (
     "The paper's returns are of another simulator (Warp) as ground truth: compare with "
@@ -161,9 +162,14 @@ def transfer(
 def model_of(scene: Scene, name: str) -> str:
     """The model that a name of dynamics stands for in a scene."""
     if name == "nerd":
-        shipped = shipped_models(scene)
-        return scene.name if scene.name in shipped else f"{scene.name}-mlp"
+        shipped, mlp = shipped_models(scene), f"{scene.name}-mlp"
+        return mlp if mlp in shipped and scene.name not in shipped else scene.name
     return f"{scene.name}-hybrid" if name == "hybrid" else name
+
+
+def model_title(scene: Scene, name: str) -> str:
+    """`model_of`, engines by their proper names."""
+    return TITLES.get(name) or model_of(scene, name)
 
 
 def mean_returns(
@@ -180,15 +186,8 @@ def mean_returns(
 
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     """Lines for the terminal: one dynamics each, with 95% intervals."""
-    head = [
-        "dynamics",
-        "kind",
-        "model",
-        "episodes",
-        "return",
-        "std",
-        "return difference",
-    ]
+    head = ["dynamics", "kind", "model", "episodes", "return", "std"]
+    head.append("return difference")
     body = []
     for name, s in summaries.items():
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
@@ -208,15 +207,9 @@ def report_transfer(
         actor: any TorchRL policy.
         learned_in: the dynamics that the policy was trained in; measured beside the
             shipped model, MuJoCo and dm_control.
-        episodes: in each, see `transfer`.
+        episodes: in each, see `transfer`, which it raises as.
         seed: of the initial states.
         folder: of the file.
-
-    Returns:
-        Summaries by name of the dynamics.
-
-    Raises:
-        ValueError: see `transfer`, or a folder that cannot be written.
     """
     learned = ("nerd",) if shipped_models(make_task(task).scene) else ()
     everywhere = (learned_in, *learned, "mujoco", "dm_control")

@@ -6,7 +6,6 @@ of one trajectory overlap, so intervals are found by drawing trajectories again.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -26,28 +25,6 @@ BASE = {"base_position": "m", "base_orientation": "rad"}
 
 Errors = dict[str, Tensor]
 """Quantity of `position_errors` -> ``(windows, states - 1)``, m or rad."""
-
-
-@dataclass(frozen=True)
-class WindowError:
-    """Error of one quantity over all windows, m or rad.
-
-    | field | meaning |
-    |---|---|
-    | ``mean`` | along the path, over windows |
-    | ``final`` | mean at the last state |
-    | ``median`` | over windows of their mean along the path |
-    | ``p95`` | 95th percentile of the same |
-    | ``interval`` | half width of the 95% interval of the mean, over trajectories |
-    | ``first`` | the mean over windows that start their trajectory; NaN if none |
-    """
-
-    mean: float
-    final: float
-    median: float
-    p95: float
-    interval: float
-    first: float
 
 
 def window_errors(
@@ -115,22 +92,29 @@ def paired_interval(a: Tensor, b: Tensor, group: Tensor) -> tuple[float, float]:
 
 def summarize_windows(
     scene: Scene, errors: Errors, recording: Recording, starts: Tensor
-) -> dict[str, WindowError]:
-    """Summary of each quantity, by `error_key`; ``starts`` as of `window_errors`."""
+) -> dict[str, dict[str, Any]]:
+    """Summary of each quantity, m or rad; ``starts`` as of `window_errors`.
+
+    Returns:
+        By `error_key`: ``mean`` along the path and over windows; ``final``, the mean at the
+        last state; ``median`` and 95th percentile ``p95`` over windows of their mean;
+        ``interval``, half width of the mean's 95% interval over trajectories; ``first``,
+        the mean over windows that start their trajectory, NaN if none.
+    """
     group = recording.trajectory_of(starts)
     is_first = starts == recording.offsets[group]
     found = {}
     for quantity, error in errors.items():
-        mean = error.mean(1)
+        mean = error.mean(1)  # (windows,)
         low, high = paired_interval(error, torch.zeros_like(error), group)
-        found[error_key(scene, quantity)] = WindowError(
-            mean=float(mean.mean()),
-            final=float(error[:, -1].mean()),
-            median=float(mean.median()),
-            p95=float(mean.quantile(0.95)),
-            interval=0.5 * (high - low),
-            first=float(mean[is_first].mean()),
-        )
+        found[error_key(scene, quantity)] = {
+            "mean": float(mean.mean()),
+            "final": float(error[:, -1].mean()),
+            "median": float(mean.median()),
+            "p95": float(mean.quantile(0.95)),
+            "interval": 0.5 * (high - low),
+            "first": float(mean[is_first].mean()),
+        }
     return found
 
 
@@ -159,17 +143,16 @@ def compare(
         errors[name] = window_errors(dynamics, recording, starts, states)
     group, table = recording.trajectory_of(starts), {}
     for name, mine in errors.items():
-        summary = summarize_windows(scene, mine, recording, starts)
-        row: dict[str, Any] = {key: asdict(value) for key, value in summary.items()}
-        against = {
-            other: {
-                BASE.get(key, key): paired_interval(mine[key], its[key], group)
-                for key in mine
+        table[name] = summarize_windows(scene, mine, recording, starts)
+        if len(models) > 1:
+            table[name]["against"] = {
+                other: {
+                    BASE.get(key, key): paired_interval(mine[key], its[key], group)
+                    for key in mine
+                }
+                for other, its in errors.items()
+                if other not in (name, "no motion")
             }
-            for other, its in errors.items()
-            if other not in (name, "no motion")
-        }
-        table[name] = {**row, "against": against} if len(models) > 1 else row
     return table
 
 

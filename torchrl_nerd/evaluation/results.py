@@ -25,8 +25,6 @@ KEYS = {
     "seed": int | list | None,
     "results": dict | list,
 }
-PACKAGES = ("torch", "torchrl", "mujoco")
-
 
 Results = dict[str, Any] | list[dict[str, Any]]
 
@@ -57,13 +55,7 @@ def make_record(
 def write_results(
     path: Path, results: Results, seed: int | list[int] | None = None, **about: Any
 ) -> None:
-    """Write the record of `make_record` as JSON.
-
-    Args:
-        path: of the file.
-        results: what was measured.
-        seed: one or several; None where nothing is random.
-        about: ``command`` and ``device``, see `make_record`.
+    """Write the record of `make_record`, which has the same arguments, as JSON.
 
     Raises:
         ValueError: a part of another type, or a file that cannot be written.
@@ -129,8 +121,7 @@ def machine(device: str = "cpu") -> dict[str, Any]:
         "processor": _processor(),
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name(where) if is_gpu else where.type,
-        "python": platform.python_version(),
-        **{name: _version(name) for name in PACKAGES},
+        **versions("torch", "torchrl", "mujoco"),
     }
 
 
@@ -143,8 +134,12 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
+def versions(*packages: str) -> dict[str, str]:
+    """Of Python and of packages."""
+    found = {"python": platform.python_version()}
+    for name in packages:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

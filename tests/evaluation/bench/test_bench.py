@@ -1,6 +1,5 @@
 """The benchmark: a ground truth that is one, equal protocol, a front that nobody beats."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -113,11 +112,9 @@ def test_a_whole_benchmark(name, tmp_path, monkeypatch):
         speeds = report.speeds(batch)
         assert set(speeds) == expected - {"no motion"}
         assert min(speeds.values()) > 0.0
-    assert all(min(r.env_steps_per_s, r.warm_up_s) > 0.0 for r in report.rates)
+    assert all(row.warm_up_s > 0.0 for row in report.rates)
     text = bench_table(report)
     assert report.ground_truth in text and all(row in text for row in expected)
-    read = json.loads(json.dumps(report.results()))
-    assert BenchReport.from_results(read) == report
     plot_bench(report, tmp_path / "bench.png")
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
     coarse = report.errors[len({row.quantity for row in report.errors})].name
@@ -150,7 +147,7 @@ def test_a_third_party_robot_with_a_model_of_ones_own(tmp_path, monkeypatch):
     for row in report.errors:
         if row.kind == "learned":
             assert row.mean > means[mujoco_name(scene), row.quantity]
-    assert not report.published and report.speeds(2)[str(folder)] > 0.0
+    assert report.speeds(2)[str(folder)] > 0.0
 
 
 def test_what_is_left_out_is_not_measured(monkeypatch):
@@ -262,8 +259,6 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, (0,))
     with pytest.raises(ValueError, match="none without MuJoCo, cartpole, "):
         bench(scene, without=("MuJoCo", "cartpole", "no motion", "analytic"))
-    with pytest.raises(ValueError, match="robot with a task.*'gymnasium/Hopper-v5'"):
-        bench(load_scene("gymnasium/Hopper-v5"))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
         bench(scene, names=["nowhere"])
     with pytest.raises(ValueError, match="variants among compiled, .*, got 'fast'"):

@@ -6,13 +6,13 @@ from bench_check import (
     MUJOCO,
     Options,
     Ratio,
+    Sample,
     compare,
     main,
     ratios,
     summarize,
 )
 
-from torchrl_nerd.evaluation.bench.rates import Sample
 from torchrl_nerd.files import read_json
 
 SURE = {"a": Ratio(2.0, 0.0), "b": Ratio(0.5, 0.0)}

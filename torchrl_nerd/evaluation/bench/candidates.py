@@ -14,7 +14,6 @@ from torchrl_nerd.analytic import make_step
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.dynamics import (
     Dynamics,
-    GuardedDynamics,
     Model,
     MujocoDynamics,
     dynamics_of,
@@ -27,7 +26,7 @@ from torchrl_nerd.scenes import Scene
 
 KINDS = ("baseline", "simulator", "analytic", "hybrid", "learned")
 """In the order of the table."""
-VARIANTS = ("compiled", "guarded", "window", "bf16", "bf16 compiled")
+VARIANTS = ("compiled", "window", "bf16")
 """Other ways to run one model than eager streaming in float32."""
 RIVALS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -80,11 +79,9 @@ class NoMotion:
 
 def mujoco_name(scene: Scene) -> str:
     """Integrator and substeps of a scene's MuJoCo, as its row is called."""
-    integrator = mujoco.mjtIntegrator(scene.model.opt.integrator).name
-    name = {"EULER": "Euler", "IMPLICITFAST": "implicitfast"}.get(integrator[6:])
-    name = name or {"IMPLICIT": "implicit", "DISCRETE": "discrete"}.get(integrator[6:])
-    plural = "" if scene.substeps == 1 else "s"
-    return f"MuJoCo {name or 'RK4'}, {scene.substeps} substep{plural}"
+    name = mujoco.mjtIntegrator(scene.model.opt.integrator).name.removeprefix("mjINT_")
+    name = {"EULER": "Euler", "RK4": "RK4"}.get(name, name.lower())
+    return f"MuJoCo {name}, {scene.substeps} substep{'s' * (scene.substeps != 1)}"
 
 
 def simulators(scene: Scene, threads: int | None = None) -> list[Candidate]:
@@ -94,13 +91,6 @@ def simulators(scene: Scene, threads: int | None = None) -> list[Candidate]:
         scene: the robot; its own integrator and number of substeps are among them.
         threads: of MuJoCo's pool; see `MujocoDynamics`.
     """
-    settings: list[tuple[int, int | None]] = []
-    substeps = 1
-    while substeps < scene.substeps:
-        settings.append((substeps, None))
-        substeps *= 2
-    settings.append((scene.substeps, None))
-    settings += [(n, int(rival)) for rival in RIVALS.values() for n in COARSE]
 
     def candidate(substeps: int, integrator: int | None) -> Candidate:
         def make(here: Scene) -> Dynamics:
@@ -109,11 +99,11 @@ def simulators(scene: Scene, threads: int | None = None) -> list[Candidate]:
         name = mujoco_name(scene.with_substeps(substeps, integrator))
         return Candidate(name, "simulator", make)
 
-    found = [candidate(*setting) for setting in settings]
-    by_name = {
-        c.name: c for c in [Candidate("no motion", "baseline", NoMotion), *found]
-    }
-    return list(by_name.values())
+    doubling = [2**k for k in range((scene.substeps - 1).bit_length())]
+    found = [Candidate("no motion", "baseline", NoMotion)]
+    found += [candidate(n, None) for n in (*doubling, scene.substeps)]
+    found += [candidate(n, int(rival)) for rival in RIVALS.values() for n in COARSE]
+    return list({c.name: c for c in found}.values())
 
 
 def models(
@@ -121,8 +111,6 @@ def models(
     names: Sequence[str] = (),
     device: torch.device | str = "cpu",
     variants: Sequence[str] = (),
-    inference: str = "streaming",
-    dtype: torch.dtype | None = None,
 ) -> list[Candidate]:
     """Models of a scene: the analytic step first, then hybrid ones, then learned ones.
 
@@ -131,23 +119,19 @@ def models(
         names: shipped models or checkpoint folders; all that are shipped by default.
         device: where they compute.
         variants: which of `VARIANTS` to add to each.
-        inference: of learned and hybrid models, see `NeRDDynamics`.
-        dtype: of the networks; float32 by default.
 
     Raises:
         ValueError: an unknown variant; see `resolve_model`.
     """
-    for variant in variants:
-        if variant not in VARIANTS:
-            known = ", ".join(VARIANTS)
-            raise ValueError(f"expected variants among {known}, got '{variant}'")
+    unknown = [variant for variant in variants if variant not in VARIANTS]
+    if unknown:
+        known = ", ".join(VARIANTS)
+        raise ValueError(f"expected variants among {known}, got '{unknown[0]}'")
     found: list[Candidate] = []
     own = ["analytic"] if _has_step(scene) else []
     for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
         model = resolve_model(name, scene).to(device)
-        if dtype is not None and isinstance(model, NeRD):
-            model = model.to(dtype)
-        found.append(_candidate(name, model, inference=inference))
+        found.append(_candidate(name, model))
         found += _variants(name, model, variants)
     return sorted(found, key=lambda c: KINDS.index(c.kind))
 
@@ -169,24 +153,15 @@ def _variants(name: str, model: Model, variants: Sequence[str]) -> Iterator[Cand
             yield _candidate(label, model, compile=True)
         elif not isinstance(model, NeRD):
             continue
-        elif variant == "guarded":
-            yield _candidate(label, model, GuardedDynamics)
-        elif variant == "window":
-            if isinstance(model.network, CausalTransformer):
-                yield _candidate(label, model, inference="window")
-        else:
-            half = copy.deepcopy(model).to(torch.bfloat16)
-            yield _candidate(label, half, compile=variant.endswith("compiled"))
+        elif variant == "bf16":
+            yield _candidate(label, copy.deepcopy(model).to(torch.bfloat16))
+        elif isinstance(model.network, CausalTransformer):
+            yield _candidate(label, model, inference="window")
 
 
-def _candidate(
-    name: str,
-    model: Model,
-    wrap: Callable[[Any], Dynamics] = lambda dynamics: dynamics,
-    **how: Any,
-) -> Candidate:
+def _candidate(name: str, model: Model, **how: Any) -> Candidate:
     def make(scene: Scene) -> Dynamics:
         here = model if scene is model.scene else model.with_terrain(scene)
-        return wrap(dynamics_of(here, **how))
+        return dynamics_of(here, **how)
 
     return Candidate(name, model.kind, make)

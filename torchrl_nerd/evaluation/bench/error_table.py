@@ -6,7 +6,7 @@ from math import isfinite
 
 from torch import Tensor
 
-from torchrl_nerd.evaluation.rollout_error import ErrorSummary, summarize, unit_of
+from torchrl_nerd.evaluation.rollout_error import summarize, unit_of
 from torchrl_nerd.scenes import Scene
 
 PAPER = "paper (NeRD)"
@@ -61,32 +61,25 @@ def error_rows(
         quantities: Iterable[str] = ()
         for (name, kind), by_name in errors.items():
             quantities = by_name.keys()
-            part = {k: e[:, :horizon] for k, e in by_name.items()}
+            part = {k: e[:, :horizon] for k, e in by_name.items()}  # (n, horizon)
             for quantity, error in summarize(scene, part).items():
-                yield _row(case, horizon, name, kind, quantity, error)
+                yield ErrorRow(case, horizon, name, kind, quantity, **vars(error))
         for quantity in quantities:
             mean = published.get((case, horizon, quantity))
             if mean is not None:
-                about = (quantity, unit_of(scene, quantity))
-                yield ErrorRow(
-                    case, horizon, PAPER, "published", *about, mean, None, None, None
-                )
-
-
-def _row(
-    case: str, steps: int, name: str, kind: str, quantity: str, error: ErrorSummary
-) -> ErrorRow:
-    return ErrorRow(case, steps, name, kind, quantity, **vars(error))
+                about = (case, horizon, PAPER, "published", quantity)
+                unit = unit_of(scene, quantity)
+                yield ErrorRow(*about, unit, mean, interval=None, final=None, p95=None)
 
 
 def error_table(
-    rows: Sequence[ErrorRow], rates: Mapping[str, float] | None = None
+    rows: Sequence[ErrorRow], rates: Mapping[str, Mapping[str, float]] | None = None
 ) -> str:
     """Text of the rows of one case and horizon: a line for every candidate.
 
     Args:
         rows: see `error_rows`.
-        rates: name -> control steps per second, for a last column.
+        rates: column -> name -> control steps per second.
     """
     quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
     candidates = list(dict.fromkeys((row.name, row.kind) for row in rows))
@@ -100,10 +93,10 @@ def error_table(
             [name, kind, *(cell for q, _ in shown for cell in _cells(found, name, q))]
             for name, kind in candidates
         ]
-        if rates is not None:
-            titles, head = [*titles, ""], [*head, "steps/s"]
+        for column, speeds in (rates or {}).items():
+            head.append(column)
             for line in body:
-                line.append(f"{rates[line[0]]:,.0f}" if line[0] in rates else "-")
+                line.append(f"{speeds[line[0]]:,.0f}" if line[0] in speeds else "-")
         tables.append(text_table(head, body, titles))
     return "\n\n".join(tables)
 
@@ -112,11 +105,10 @@ def _cells(
     found: Mapping[tuple[str, str], ErrorRow], name: str, quantity: str
 ) -> list[str]:
     row = found.get((name, quantity))
-    values = (row.mean, row.final, row.p95) if row else (None,) * 3
-    return [shown_error(value) for value in values]
+    return [_shown(x) for x in ((row.mean, row.final, row.p95) if row else [None] * 3)]
 
 
-def shown_error(value: float | None) -> str:
+def _shown(value: float | None) -> str:
     """Three digits; an error that is not finite is of a rollout that diverges."""
     if value is None:
         return "-"

@@ -58,10 +58,8 @@ class EvaluationSet:
             dynamics: of the same robot and terrain.
             start: other initial states ``[n]`` than the set's.
         """
-        start, steps = (
-            self.start if start is None else start,
-            self.ground_truth.shape[1],
-        )
+        start = self.start if start is None else start
+        steps = self.ground_truth.shape[1]
         path = open_loop(dynamics, start, steps, self.drive, stop_at_nan=True)
         return position_errors(self.scene, self.ground_truth, path)
 

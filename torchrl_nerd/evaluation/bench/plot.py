@@ -2,16 +2,10 @@
 
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from torchrl_nerd.evaluation.bench.report import BenchReport, pareto_front
 from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
 
-if TYPE_CHECKING:  # matplotlib is an extra
-    from matplotlib.axes import Axes
-    from matplotlib.transforms import Bbox
-
-LARGEST_SHIFT = 14  # points that a name may stand lower than its point
 MARKERS = {"simulator": "o", "analytic": "s", "hybrid": "D", "learned": "^"}
 PANELS = 3  # most quantities that are drawn: of an arm, its first and its last joint
 
@@ -43,6 +37,10 @@ def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> Non
         best = pareto_front(points)
         front = [points[name] for name in best]
         axes.plot(*zip(*front, strict=True), "-", color="0.4", label="Pareto front")
+        for name in best:  # names of the others would cover each other
+            axes.annotate(
+                name, points[name], (6, -3), textcoords="offset points", fontsize=7
+            )
         for row in report.errors:
             if row.quantity != quantity or row.kind not in ("sensitivity", "published"):
                 continue
@@ -57,29 +55,4 @@ def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> Non
         )
         axes.tick_params(which="minor", labelsize=7)  # larger ones cover each other
         axes.legend(frameon=False, fontsize=7)
-        _write_names(axes, points, best)
     save_figure(figure, path)
-
-
-def _write_names(
-    axes: "Axes", points: dict[str, tuple[float, float]], first: list[str]
-) -> None:
-    """Names beside their points, a little lower where they would cover each other.
-
-    A name for which there is no room is left out; the table has it.
-    """
-    written: list[Bbox] = []
-    others = sorted(points.keys() - set(first), key=lambda name: -points[name][1])
-    for name in [*first, *others]:
-        text = axes.annotate(
-            name, points[name], (6, -3), textcoords="offset points", fontsize=7
-        )
-        for _ in range(LARGEST_SHIFT):
-            if not any(text.get_window_extent().overlaps(other) for other in written):
-                break
-            x, y = text.get_position()
-            text.set_position((x, y - 1))
-        else:
-            text.remove()
-            continue
-        written.append(text.get_window_extent())

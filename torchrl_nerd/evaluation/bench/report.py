@@ -1,32 +1,20 @@
-"""The benchmark of a scene: error and speed of every candidate, and which to choose."""
+"""The benchmark of a scene: error and speed of every candidate."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.bench.candidates import (
-    models,
-    mujoco_name,
-    simulators,
-)
-from torchrl_nerd.evaluation.bench.error_table import (
-    PAPER,
-    ErrorRow,
-    error_rows,
-    error_table,
-    text_table,
-)
+from torchrl_nerd.evaluation.bench.candidates import models, mujoco_name, simulators
+from torchrl_nerd.evaluation.bench.error_table import ErrorRow, error_rows, error_table
 from torchrl_nerd.evaluation.bench.evaluation_set import evaluation_set
 from torchrl_nerd.evaluation.bench.rates import RateRow, rate_rows
-from torchrl_nerd.robots import EvaluationProtocol, make_task, protocol_of
+from torchrl_nerd.robots import EvaluationProtocol, protocol_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.tasks import Task
 
 FINEST = 64  # substeps of a ground truth in contact, or four times the scene's own
 PERTURBATION = 1e-4  # m and rad, of every coordinate of the initial state
@@ -36,7 +24,7 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class BenchReport:
-    """What `bench` measured.
+    """What `bench` measured; ``asdict`` of it is what JSON holds.
 
     | field | meaning |
     |---|---|
@@ -60,7 +48,7 @@ class BenchReport:
 
     @property
     def batch(self) -> int:
-        """The one that is shown first: 512, or the largest there is."""
+        """The one that is compared by: 512, or the largest there is."""
         return 512 if 512 in self.batches else max(self.batches)
 
     def speeds(self, batch: int) -> dict[str, float]:
@@ -75,38 +63,6 @@ class BenchReport:
             for row in self.errors
             if row.quantity == quantity and row.name in speeds
         }
-
-    def within(self, budget: Mapping[str, float], batch: int) -> str | None:
-        """The fastest candidate whose mean errors are all within the budget, or None."""
-        speeds = self.speeds(batch)
-        too_large = {
-            row.name
-            for row in self.errors
-            if not row.mean <= budget.get(row.quantity, float("inf"))
-        }
-        fit = [name for name in speeds if name not in too_large]
-        return max(fit, key=lambda name: speeds[name], default=None)
-
-    @property
-    def published(self) -> dict[str, float]:
-        """The paper's mean error by quantity, where it published one."""
-        return {row.quantity: row.mean for row in self.errors if row.name == PAPER}
-
-    def results(self) -> dict[str, Any]:
-        """Everything as JSON has it."""
-        return asdict(self)
-
-    @classmethod
-    def from_results(cls, results: Mapping[str, Any]) -> "BenchReport":
-        """The report whose `results` these are, as read from JSON; null is NaN."""
-        errors = [
-            ErrorRow(
-                **row | {"mean": float("nan") if row["mean"] is None else row["mean"]}
-            )
-            for row in results["errors"]
-        ]
-        rates = [RateRow(**row) for row in results["rates"]]
-        return cls(**{**results, "errors": errors, "rates": rates})
 
 
 def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -152,7 +108,7 @@ def bench(
     """Error and speed of MuJoCo and of the models of a scene on this machine.
 
     Args:
-        scene: one that has a task.
+        scene: the robot.
         batches: trajectories stepped together, for the rates.
         num_trajectories: of each case, for the errors.
         rounds: samples of each candidate's speed.
@@ -167,12 +123,11 @@ def bench(
         names: of models, see `models`.
 
     Raises:
-        ValueError: a scene without a task, a setting out of range, or no candidate left.
+        ValueError: a setting out of range, or no candidate left.
     """
     expect_at_least(1, rounds=rounds, **{f"batch {b}": b for b in batches})
     expect_at_least(2, num_trajectories=num_trajectories)
     protocol = protocol_of(scene)
-    task = _task_of(scene, protocol)
     if threads is not None:
         torch.set_num_threads(threads)
     threads = torch.get_num_threads()
@@ -207,7 +162,7 @@ def bench(
     rates = [
         row
         for batch in tqdm(batches, "rates", unit=" batches", disable=quiet)
-        for row in rate_rows(moving, task, batch, rounds, seed, device)
+        for row in rate_rows(moving, sets[-1].source, batch, rounds, seed, device)
     ]
     case = ALL if len(sets) > 1 else sets[0].case
     paper = _published(protocol, horizon, case)
@@ -215,70 +170,33 @@ def bench(
         scene=scene.name,
         steps=horizon,
         num_trajectories=num_trajectories,
-        ground_truth=mujoco_name(reference_of(task.scene)),
+        ground_truth=mujoco_name(reference_of(sets[-1].scene)),
         errors=list(error_rows(scene, case, [horizon], errors, paper)),
         rates=rates,
     )
 
 
 def bench_table(report: BenchReport) -> str:
-    """A table of errors with rates, one of all rates, and which candidate to choose.
-
-    ``*`` marks candidates that no other beats in both error and rate.
-    """
-    quantities = list(dict.fromkeys(row.quantity for row in report.errors))
-    batch = report.batch
+    """Errors with rates as text, and which candidates nothing beats in both."""
     lines = [
-        f"{report.scene}: {report.steps} steps, {report.num_trajectories} trajectories a "
-        f"case. Errors are against {report.ground_truth} (ground truth); steps/s with a "
-        f"batch of {batch}.",
+        f"{report.scene}: {report.steps} steps, {report.num_trajectories} trajectories per "
+        f"case. Ground truth: {report.ground_truth}. Rates in control steps/s.",
         "",
-        error_table(report.errors, report.speeds(batch)),
+        error_table(
+            report.errors, {f"batch {b}": report.speeds(b) for b in report.batches}
+        ),
         "",
     ]
-    fronts = {
-        b: {name for q in quantities for name in pareto_front(report.points(b, q))}
-        for b in report.batches
-    }
-    head = ["control steps/s", "kind"]
-    for b in report.batches:
-        head += [f"batch {b}", "in env"]
-    by_name: dict[tuple[str, str], list[RateRow]] = {}
-    for row in report.rates:
-        by_name.setdefault((row.name, row.kind), []).append(row)
-    body = []
-    for (name, kind), rows in by_name.items():
-        line = [name, kind]
-        for row in rows:
-            mark = "*" if name in fronts[row.batch] else " "
-            line += [f"{row.steps_per_s:,.0f}{mark}", f"{row.env_steps_per_s:,.0f}"]
-        body.append([*line, f"{max(row.warm_up_s for row in rows):.1f}"])
-    lines.append(text_table([*head, "warm-up (s)"], body))
-    if set(report.published) == set(quantities):
-        lines.append("")
-        for b in report.batches:
-            choice = report.within(report.published, b) or "none"
-            lines.append(f"fastest within the paper's error, batch {b}: {choice}")
+    for quantity in dict.fromkeys(row.quantity for row in report.errors):
+        front = pareto_front(report.points(report.batch, quantity))
+        about = f"Pareto front of {quantity} and rate, batch {report.batch}"
+        lines.append(f"{about}: {'; '.join(front)}")
     return "\n".join(lines)
 
 
 def _together(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Errors of all cases as one."""
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def _task_of(scene: Scene, protocol: EvaluationProtocol) -> Task:
-    """Whose initial states, observations, rewards and resets are timed."""
-    tasks = [case for case in protocol.cases.values() if isinstance(case, Task)]
-    if tasks:
-        return tasks[-1]
-    try:
-        return make_task(scene.name)
-    except ValueError:
-        raise ValueError(
-            f"expected a robot with a task, such as ant or dm_control/humanoid-run, got "
-            f"'{scene.name}', which has none"
-        ) from None
 
 
 def _published(

@@ -10,14 +10,13 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
+from torchrl_nerd.evaluation.policy_transfer import model_title
 from torchrl_nerd.keys import ACTION, QPOS, TERRAIN
 from torchrl_nerd.scenes import Scene
 
-TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
 FixedActions = Literal["random", "zero"]
 
 
@@ -105,18 +104,10 @@ def roll_out_both(
     return SideBySide(
         scene=envs[1].scene,
         step_size=envs[1].scene.control_step * envs[1].task.frame_skip,
-        names=[model_title(name, envs[1].scene) for name in dynamics],
+        names=[model_title(envs[1].scene, str(name)) for name in dynamics],
         kinds=[env.dynamics.kind for env in envs],
         paths=[torch.stack(path).cpu() for path in paths],
         returns=[torch.tensor(values).cumsum(0) for values in rewards],
         terrain=None if terrain is None else terrain[0].cpu(),
         ending=ending,
     )
-
-
-def model_title(dynamics: str | Path, scene: Scene) -> str:
-    """The shipped model that a name stands for, ``"ant-mlp"`` for ``"nerd"``."""
-    name = str(dynamics)
-    asked = {"nerd": scene.name, "hybrid": f"{scene.name}-hybrid"}.get(name, name)
-    found = [x for x in (asked, f"{asked}-mlp") if x in shipped_models()]
-    return TITLES.get(name, next(iter(found), name))

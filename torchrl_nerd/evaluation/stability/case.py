@@ -2,18 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Literal
+from typing import Any, cast
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
-from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.evaluation.stability import states
-from torchrl_nerd.evaluation.stability.stepper import DynamicsStepper, Stepper
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
@@ -21,8 +19,34 @@ from torchrl_nerd.scenes.sampling import sample_torque
 Metrics = dict[str, float]
 """What a case measured, by name with its unit."""
 
-Needs = Literal["states", "dynamics", "model"]
-"""What a case asks for: states alone, a `Dynamics`, or a model with a network."""
+
+def roll(
+    dynamics: Dynamics,
+    start: TensorDict,
+    steps: int,
+    torque: Tensor | None = None,
+    every: int = 1,
+) -> TensorDict:
+    """States ``[n, 1 + steps // every]``, the start first.
+
+    Args:
+        dynamics: any.
+        start: ``[n]``: ``qpos``, ``qvel`` and, where the ground varies, ``terrain``.
+        steps: control steps.
+        torque: ``(n, T, num_actuated)``, repeated after T steps; None for zero.
+        every: steps between two states that are kept.
+    """
+    if torque is None:
+        torque = torch.zeros(len(start), 1, len(dynamics.scene.actuated)).double()
+    state: TensorDictBase = start.select(QPOS, QVEL)
+    dynamics.reset(state)
+    kept = [state]
+    for step in range(steps):
+        drive = torque[:, step % torque.shape[1]]  # (n, num_actuated)
+        state = dynamics.step(state, drive, start.get(TERRAIN, None))
+        if (step + 1) % every == 0:
+            kept.append(state.select(QPOS, QVEL))
+    return cast(TensorDict, TensorDict.stack(kept, 1))
 
 
 @dataclass(frozen=True)
@@ -31,36 +55,33 @@ class Trial:
 
     | field | meaning |
     |---|---|
-    | ``stepper`` | the dynamics or the env under test |
+    | ``dynamics`` | under test |
     | ``generator`` | of starts and torques |
     | ``scale`` | fraction of long rollouts and large batches, in (0, 1] |
     """
 
-    stepper: Stepper
+    dynamics: Dynamics
     generator: Generator
     scale: float = 1.0
 
     @property
     def scene(self) -> Scene:
         """The robot."""
-        return self.stepper.scene
-
-    @property
-    def dynamics(self) -> DynamicsStepper:
-        """The stepper, for cases that need dynamics."""
-        assert isinstance(self.stepper, DynamicsStepper)
-        return self.stepper
+        return self.dynamics.scene
 
     @property
     def model(self) -> NeRD:
         """The model, for cases that need one."""
-        assert isinstance(self.stepper.dynamics, NeRDDynamics)
-        return self.stepper.dynamics.model
+        assert isinstance(self.dynamics, NeRDDynamics)
+        return self.dynamics.model
 
-    @cached_property
-    def ground_truth(self) -> Stepper:
-        """MuJoCo."""
-        return DynamicsStepper(MujocoDynamics(self.scene))
+    def roll(self, start: TensorDict, steps: int, *how: Any, **more: Any) -> TensorDict:
+        """`roll` in the dynamics under test."""
+        return roll(self.dynamics, start, steps, *how, **more)
+
+    def roll_exactly(self, start: TensorDict, steps: int, *how: Any) -> TensorDict:
+        """`roll` in MuJoCo."""
+        return roll(MujocoDynamics(self.scene), start, steps, *how)
 
     def scaled(self, count: int, least: int) -> int:
         """A number of steps or trajectories times the scale."""
@@ -93,11 +114,6 @@ class Trial:
         errors = position_errors(self.scene, path[QPOS], other[QPOS])
         return torch.stack(list(errors.values())).amax(0)
 
-    @property
-    def roll(self) -> Callable[..., TensorDict]:
-        """See `Stepper.roll`."""
-        return self.stepper.roll
-
 
 @dataclass(frozen=True)
 class Case:
@@ -111,7 +127,7 @@ class Case:
     | ``applies`` | whether it makes sense for a robot |
     | ``tolerances`` | largest allowed metrics of the tested dynamics |
     | ``ground_truth_tolerances`` | of MuJoCo: they validate the case itself |
-    | ``needs`` | what it asks for |
+    | ``needs_model`` | whether it asks for a model with a network |
 
     A metric without a tolerance is for information.
     """
@@ -122,20 +138,17 @@ class Case:
     applies: Callable[[Scene], bool] = lambda scene: True
     tolerances: Metrics = field(default_factory=dict)
     ground_truth_tolerances: Metrics = field(default_factory=dict)
-    needs: Needs = "states"
+    needs_model: bool = False
 
     def passes(self, metrics: Metrics, is_ground_truth: bool) -> bool:
         """Whether every metric with a tolerance is within it; NaN is not."""
         limits = self.ground_truth_tolerances if is_ground_truth else self.tolerances
         return all(metrics[name] <= limit for name, limit in limits.items())
 
-    def supports(self, stepper: Stepper) -> bool:
+    def supports(self, dynamics: Dynamics) -> bool:
         """Whether the case can run on it."""
-        if not self.applies(stepper.scene):
-            return False
-        if self.needs == "model":
-            return isinstance(stepper.dynamics, NeRDDynamics)
-        return self.needs == "states" or stepper.dynamics is not None
+        fits = isinstance(dynamics, NeRDDynamics) or not self.needs_model
+        return fits and self.applies(dynamics.scene)
 
 
 CASES: dict[str, Case] = {}
@@ -146,7 +159,7 @@ def hard_case(
     tolerances: Metrics,
     ground_truth: Metrics | None = None,
     applies: Callable[[Scene], bool] = lambda scene: True,
-    needs: Needs = "states",
+    needs_model: bool = False,
 ) -> Callable[[Callable[[Trial], Metrics]], Callable[[Trial], Metrics]]:
     """Register a function as the case of its name; its docstring says the physics.
 
@@ -154,14 +167,14 @@ def hard_case(
         tolerances: largest allowed metrics.
         ground_truth: the same for MuJoCo; by default those of the tested dynamics.
         applies: whether the case makes sense for a robot.
-        needs: what the case asks for; MuJoCo is left out where that is a model.
+        needs_model: whether it asks for a model with a network; MuJoCo is left out then.
     """
     limits = tolerances if ground_truth is None else ground_truth
-    limits = {} if needs == "model" else limits
+    limits = {} if needs_model else limits
 
     def register(run: Callable[[Trial], Metrics]) -> Callable[[Trial], Metrics]:
         physics = " ".join((run.__doc__ or "").split())
-        about = (run.__name__, physics, run, applies, tolerances, limits, needs)
+        about = (run.__name__, physics, run, applies, tolerances, limits, needs_model)
         CASES[run.__name__] = Case(*about)
         return run
 

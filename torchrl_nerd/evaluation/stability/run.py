@@ -1,21 +1,15 @@
-"""All cases of a robot in MuJoCo and in the dynamics under test: table and picture."""
+"""All cases of a robot in MuJoCo and in the dynamics under test, as one table."""
 
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from zlib import crc32
 
 from torch import Generator
 
-from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
+from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Metrics, Trial
 from torchrl_nerd.evaluation.stability.cases import CASES
-from torchrl_nerd.evaluation.stability.stepper import Stepper
-
-LEAST, MOST = 1e-6, 1e6  # ratios beyond are clipped in the picture
-BAR = 0.24  # inches
-PASS, FAIL = COLORS[2], COLORS[1]
 
 
 @dataclass(frozen=True)
@@ -55,30 +49,30 @@ def choose_cases(names: list[str] | None) -> list[Case]:
 
 
 def run_cases(
-    ground_truth: Stepper,
-    tested: Stepper,
+    tested: Dynamics,
     cases: list[Case],
     seed: int = 0,
     scale: float = 1.0,
+    ground_truth: Dynamics | None = None,
 ) -> Iterator[Result]:
     """Every case that applies, one after the other.
 
     Args:
-        ground_truth: MuJoCo.
-        tested: other dynamics of the same robot, or any env of it; cases that need more
-            than it offers are left out.
+        tested: any dynamics; cases of models are left out for others.
         cases: which.
         seed: of starts and torques; each case has a stream of its own, the same in both.
         scale: fraction of long rollouts and large batches, in (0, 1].
+        ground_truth: what stands beside it; by default MuJoCo.
     """
+    ground_truth = ground_truth or MujocoDynamics(tested.scene)
     for case in cases:
         if not case.supports(tested):
             continue
         began, found = time.monotonic(), []
-        for stepper in (ground_truth, tested):
+        for dynamics in (ground_truth, tested):
             stream = Generator().manual_seed(crc32(case.name.encode(), seed))
-            trial = Trial(stepper, stream, scale)
-            found.append(case.run(trial) if case.supports(stepper) else {})
+            trial = Trial(dynamics, stream, scale)
+            found.append(case.run(trial) if case.supports(dynamics) else {})
         exact, mine = found
         yield Result(
             case.name,
@@ -110,24 +104,3 @@ def as_table(results: list[Result], kind: str = "tested") -> str:
             lines.append(f"| {name} | {metric} | {cells} | {verdict} |")
             name = ""
     return "\n".join(lines) + "\n"
-
-
-def plot_results(results: list[Result], path: Path, title: str) -> None:
-    """A PNG with every metric relative to its tolerance; above one it fails."""
-    names, ratios = [], []
-    for result in results:
-        for metric, limit in result.tolerances.items():
-            names.append(f"{result.case}: {metric}")
-            value = result.tested[metric]
-            ratio = value / limit if limit else (LEAST if value == 0 else MOST)
-            ratios.append(min(max(ratio, LEAST), MOST))
-    figure, (axes,) = make_figure(1, height=BAR * len(names) + 1.2)
-    colors = [PASS if ratio <= 1.0 else FAIL for ratio in ratios]
-    axes.barh(range(len(names)), [r - LEAST for r in ratios], left=LEAST, color=colors)
-    axes.set_yticks(range(len(names)), names, fontsize=7)
-    axes.invert_yaxis()
-    axes.axvline(1.0, color="black", linewidth=1)
-    label = "metric relative to its tolerance (green: pass; smaller is better)"
-    limits = (LEAST, 10.0 * max(1.0, *ratios))
-    axes.set(xscale="log", xlim=limits, xlabel=label, title=title)
-    save_figure(figure, path)

@@ -1,7 +1,5 @@
 """Where cases start: the training range, at rest, in the air, rotated."""
 
-import copy
-from dataclasses import replace
 from functools import cache
 from typing import cast
 
@@ -13,7 +11,6 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.terrain import POSE_PARAMETERS
 
 SETTLE, AT_REST = 5.0, 1e-3  # s; m/s and rad/s
@@ -55,7 +52,7 @@ def settled_states(scene: Scene, count: int) -> TensorDict:
 def _drop(scene: Scene, count: int, generator: Generator) -> TensorDict:
     """The final states of those drops that end at rest."""
     start = sample_states(scene, count, generator)
-    start[QVEL].zero_()
+    start[QVEL] = 0.0 * start[QVEL]
     if scene.terrain is not None and scene.terrain.is_per_row:
         start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(count, -1)
     steps = round(SETTLE / scene.control_step)
@@ -79,7 +76,7 @@ def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
 def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
     """States of a floating robot, rotated about the world's origin with their ground.
 
-    Ground that all trajectories share stays; see `with_rotated_ground`.
+    Ground that all trajectories share stays.
 
     Args:
         scene: the robot.
@@ -100,15 +97,3 @@ def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
             if given.shape[-1] == POSE_PARAMETERS:
                 given[..., 3:] = quat_multiply(quat, given[..., 3:])
     return states
-
-
-def with_rotated_ground(scene: Scene, quat: Tensor) -> Scene:
-    """The scene with its ground rotated by a quaternion ``(4,)`` about the origin."""
-    model = copy.copy(scene.model)
-    for geom in ground_geoms(model):
-        position = torch.from_numpy(scene.model.geom_pos[geom].copy())
-        pose = torch.from_numpy(scene.model.geom_quat[geom].copy())
-        model.geom_pos[geom] = rotate(quat, position).numpy()
-        model.geom_quat[geom] = quat_multiply(quat, pose).numpy()
-        model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's frame for it
-    return replace(scene, model=model)

@@ -1,9 +1,6 @@
-"""Conservation: energy, momentum, and closed forms of unconstrained motion."""
+"""Conservation: energy, momentum, and the parabola of free fall."""
 
-import mujoco
-import numpy as np
 import torch
-from scipy.integrate import solve_ivp
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
@@ -15,11 +12,10 @@ from torchrl_nerd.evaluation.stability.case import (
     has_floating_base,
     largest,
     norm,
+    roll,
 )
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, sample_states
-from torchrl_nerd.evaluation.stability.stepper import DynamicsStepper
 from torchrl_nerd.evaluation.traces import mechanics
-from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
 
@@ -30,10 +26,8 @@ REFERENCE = "energy drift of the reference solver over 1,000 steps, relative"
 MISS = "position error of the centre of mass after 30 steps, m"
 LINEAR = "change of linear momentum without gravity, relative"
 ANGULAR = "change of angular momentum, relative"
-EULER = "deviation from Euler's equations after 30 steps, relative"
 FLIGHT_STEPS = 30
 SLOW = 0.3  # of the training speeds: MuJoCo's own steps lose momentum at more
-SPIN, WOBBLE = 3.0, 0.01  # rad/s about the middle axis; relative about the others
 
 
 def _is_undamped(scene: Scene) -> bool:
@@ -54,9 +48,9 @@ def energy(trial: Trial) -> Metrics:
     drift = _drift(scene, trial.roll(start, steps, every=EVERY))
     early = drift[:, : 1 + EARLY // EVERY]
     metrics = {DRIFT: largest(early.mean(0)), LATE: largest(drift.mean(0))}
-    if trial.stepper.is_ground_truth:
-        reference = DynamicsStepper(MujocoDynamics(scene.reference))
-        path = reference.roll(start, min(steps, EARLY), every=EVERY)
+    if isinstance(trial.dynamics, MujocoDynamics):
+        reference = MujocoDynamics(scene.reference)
+        path = roll(reference, start, min(steps, EARLY), every=EVERY)
         metrics[REFERENCE] = largest(_drift(scene, path).mean(0))
     return metrics
 
@@ -106,33 +100,3 @@ def momentum(trial: Trial) -> Metrics:
     angular = found["angular_momentum"] / (mass * trial.scene.model.stat.extent)
     both = {LINEAR: linear, ANGULAR: angular}
     return {name: largest(norm(p - p[:, :1]).mean(0)) for name, p in both.items()}
-
-
-def _is_one_body(scene: Scene) -> bool:
-    kinds = scene.model.jnt_type
-    return len(kinds) == 1 and kinds[0] == mujoco.mjtJoint.mjJNT_FREE
-
-
-@hard_case({EULER: 0.02}, {EULER: 5e-3}, _is_one_body)
-def tumbling(trial: Trial) -> Metrics:
-    """A body that rotates about its middle axis follows Euler's equations."""
-    scene, v = trial.scene, trial.scene.base.dof_address + 3
-    body = int(scene.model.jnt_bodyid[0])
-    inertia = scene.model.body_inertia[body]
-    axes = quat_matrix(scene.model.body_iquat[body])
-    middle = np.eye(3)[np.argsort(inertia)[1]]
-    first = SPIN * (middle + WOBBLE * trial.normal(16, 3).numpy())
-    start = trial.in_air(16, speed=0.0)
-    start[QVEL][:, v:] = torch.from_numpy(first @ axes.T)
-    path = trial.roll(start, FLIGHT_STEPS)[QVEL][..., v:].numpy() @ axes
-    times = scene.control_step * np.arange(FLIGHT_STEPS + 1)
-
-    def rate(_: float, omega: np.ndarray) -> np.ndarray:
-        return np.cross(inertia * omega, omega) / inertia
-
-    how = {"t_eval": times, "rtol": 1e-10, "atol": 1e-12}
-    exact = np.stack(  # (16, steps, 3)
-        [solve_ivp(rate, (0.0, times[-1]), omega, **how).y.T for omega in first]
-    )
-    error = norm(torch.from_numpy(path - exact))
-    return {EULER: largest(error.mean(0)) / SPIN}

@@ -12,9 +12,7 @@ from torchrl_nerd.evaluation.stability.case import (
     has_floating_base,
     largest,
 )
-from torchrl_nerd.evaluation.stability.states import rotated, with_rotated_ground
-from torchrl_nerd.evaluation.stability.stepper import Stepper
-from torchrl_nerd.geometry.rotations import rotate
+from torchrl_nerd.evaluation.stability.states import rotated
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
 
@@ -65,32 +63,17 @@ def translation(trial: Trial) -> Metrics:
     return {NEAR: max(near), FAR: far}
 
 
-def _rotated(trial: Trial, other: Stepper, quat: Tensor) -> Metrics:
-    """Difference between rotating the start and rotating the trajectory."""
-    start = trial.starts(16)
-    here = rotated(trial.scene, trial.roll(start, 10), quat[:, None])
-    there = other.roll(rotated(trial.scene, start, quat), 10)
-    worst = trial.difference(here, there).amax(1)
-    return {MEDIAN: float(worst.median()), WORST: largest(worst)}
-
-
 @hard_case({MEDIAN: 1e-4}, applies=_has_level_ground)
 def yaw(trial: Trial) -> Metrics:
     """Level ground is the same in every direction, as is MuJoCo's elliptic cone."""
+    start = trial.starts(16)
     w, z = torch.nn.functional.normalize(trial.normal(16, 2)).unbind(-1)
     zero = torch.zeros_like(w)
     quat = torch.stack((w, zero, zero, z), -1)  # (16, 4)
-    return _rotated(trial, trial.stepper, quat)
-
-
-@hard_case({MEDIAN: 1e-4}, applies=_has_level_ground, needs="dynamics")
-def tilt(trial: Trial) -> Metrics:
-    """Robot, floor and gravity rotated together move alike."""
-    quat = torch.nn.functional.normalize(trial.normal(4), dim=0)
-    scene = with_rotated_ground(trial.scene, quat)
-    gravity = torch.from_numpy(trial.scene.model.opt.gravity.copy())
-    scene.model.opt.gravity[:] = rotate(quat, gravity).numpy()
-    return _rotated(trial, trial.dynamics.in_scene(scene), quat.expand(16, 4))
+    here = rotated(trial.scene, trial.roll(start, 10), quat[:, None])
+    there = trial.roll(rotated(trial.scene, start, quat), 10)
+    worst = trial.difference(here, there).amax(1)
+    return {MEDIAN: float(worst.median()), WORST: largest(worst)}
 
 
 @hard_case({WORST: 1e-6}, applies=has_floating_base)

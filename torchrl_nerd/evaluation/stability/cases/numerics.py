@@ -52,7 +52,7 @@ def horizon(trial: Trial) -> Metrics:
     scene, steps = trial.scene, trial.scaled(100_000, KEPT) // KEPT * KEPT
     path = trial.roll(trial.starts(8), steps, trial.torques(8, 512), steps // KEPT)
     metrics = _finiteness(path) | {LEAP: 0.0}
-    if scene.base.is_floating and isinstance(trial.stepper.dynamics, NeRDDynamics):
+    if scene.base.is_floating and isinstance(trial.dynamics, NeRDDynamics):
         q, v = scene.base.qpos_address, scene.base.dof_address
         moved = path[QPOS][..., q : q + 3].diff(dim=1)
         bound = float(trial.model.training_range.speed[v])
@@ -80,9 +80,7 @@ def invalid_inputs(trial: Trial) -> Metrics:
     for value in INVALID:
         index = int(torch.randint(count, (), generator=trial.generator))
         others = torch.arange(count) != index
-        # an env refuses such a state in one sentence
-        has_dynamics = trial.stepper.dynamics is not None
-        for key in (QPOS, QVEL, "torque") if has_dynamics else ("torque",):
+        for key in (QPOS, QVEL, "torque"):
             bad, drive = start.clone(), torque.clone()
             (drive if key == "torque" else bad[key])[index] = value
             got = trial.roll(bad, 3, drive)
@@ -109,7 +107,7 @@ def batching(trial: Trial) -> Metrics:
     }
 
 
-@hard_case({NON_FINITE_GRADIENTS: 0.0, ERROR: 1e-4}, needs="model")
+@hard_case({NON_FINITE_GRADIENTS: 0.0, ERROR: 1e-4}, needs_model=True)
 def gradients(trial: Trial) -> Metrics:
     """Gradients equal finite differences and stay finite over 100 steps."""
     start = trial.starts(8)
@@ -132,8 +130,9 @@ def gradients(trial: Trial) -> Metrics:
 
     def gradient(steps: int) -> tuple[Tensor, ...]:
         leaves = [x.clone().requires_grad_() for x in first]
-        how = {"allow_unused": True, "materialize_grads": True}
-        return torch.autograd.grad(end(leaves, steps), leaves, **how)
+        return torch.autograd.grad(
+            end(leaves, steps), leaves, allow_unused=True, materialize_grads=True
+        )
 
     first, metrics = [start[QVEL], torque[:, 0]], {NON_FINITE_GRADIENTS: 0.0}
     try:

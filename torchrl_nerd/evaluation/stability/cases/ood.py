@@ -26,7 +26,7 @@ MISSED = "undetected inputs outside the training range at 1% false alarms, fract
 RATIO = "error outside the training range with fallback, relative to inside"
 
 
-@hard_case({MISSED: 0.05, RATIO: 2.0}, needs="model")
+@hard_case({MISSED: 0.05, RATIO: 2.0}, needs_model=True)
 def out_of_distribution(trial: Trial) -> Metrics:
     """Inputs unlike those of training are detected, and MuJoCo can step them."""
     model = trial.model
