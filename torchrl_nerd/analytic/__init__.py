@@ -1,10 +1,19 @@
 """Analytic steps: the equation of motion, penalty contacts and limits; no weights."""
 
+from dataclasses import asdict
+
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult
 from torchrl_nerd.analytic.free_body import FreeBodyPenaltyStep
 from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
-from torchrl_nerd.analytic.steps import STEPS, default_step, make_step, step_config
 from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
+from torchrl_nerd.configs import (
+    FreeBodyConfig,
+    PenaltyContactConfig,
+    StepConfig,
+    UnconstrainedConfig,
+)
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.settings import SettingError
 
 __all__ = [
     "STEPS",
@@ -17,3 +26,52 @@ __all__ = [
     "make_step",
     "step_config",
 ]
+
+STEPS: dict[str, StepConfig] = {
+    "unconstrained": UnconstrainedConfig(),
+    "penalty-contact": PenaltyContactConfig(),
+    "penalty-contact-2-outer-steps": PenaltyContactConfig(num_outer_steps=2),
+    "penalty-contact-1-stage": PenaltyContactConfig(num_stages=1),
+    "penalty-contact-1-stage-merged": PenaltyContactConfig(
+        num_stages=1, merged_substeps=2
+    ),
+    "penalty-contact-3-stages": PenaltyContactConfig(num_stages=3),
+}
+"""Three stages approximate the reference solver, the others the scene's own."""
+
+
+def step_config(name: str) -> StepConfig:
+    """The configuration of that name in `STEPS`.
+
+    Raises:
+        SettingError: no such step.
+    """
+    if name not in STEPS:
+        known = ", ".join(STEPS)
+        raise SettingError(f"unknown analytic step '{name}', expected one of {known}")
+    return STEPS[name]
+
+
+def default_step(scene: Scene) -> StepConfig:
+    """The step of ``dynamics="analytic"``: accurate, and cheaper than MuJoCo.
+
+    Unconstrained without a ground; else two stages, in two outer steps where the scene's
+    substeps can be halved.
+    """
+    if scene.terrain is None:
+        return UnconstrainedConfig()
+    return PenaltyContactConfig(num_outer_steps=2 - scene.substeps % 2)
+
+
+def make_step(scene: Scene, config: StepConfig | None = None) -> AnalyticStep:
+    """The step of that configuration for a scene, or its default step.
+
+    Raises:
+        ValueError: in one sentence, a scene that it cannot step.
+    """
+    config = default_step(scene) if config is None else config
+    if isinstance(config, UnconstrainedConfig):
+        return UnconstrainedStep(scene)
+    if isinstance(config, FreeBodyConfig):
+        return FreeBodyPenaltyStep(scene, **asdict(config))
+    return PenaltyContactStep(scene, **asdict(config))

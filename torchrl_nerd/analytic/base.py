@@ -28,11 +28,6 @@ class AnalyticStep(nn.Module, ABC):
     | ``scene`` | the robot and its ground |
     | ``config`` | which step it is, as a checkpoint's card stores it |
     | ``num_defects`` | K, width of ``velocity_defect``; dof after dof, repeated |
-
-    Args:
-        scene: the robot and its ground.
-        config: which step it is.
-        num_defects: K.
     """
 
     kind: ClassVar[str] = "analytic"
@@ -72,27 +67,22 @@ class AnalyticStep(nn.Module, ABC):
         """
 
 
-def unsupported_forces(scene: Scene) -> dict[str, bool]:
-    """Forces that no analytic step models, and whether the scene has them."""
-    model = scene.model
-    return {
-        "dry friction": bool(model.dof_frictionloss.any()),
-        "air or water": bool(model.opt.density or model.opt.viscosity),
-        "self-contact": len(own_contacts(model)) > 0,
-        "gravity compensation": bool(model.body_gravcomp.any()),
-    }
-
-
 def check_supported(scene: Scene) -> None:
     """Refuse a scene with forces that no analytic step models.
 
     Raises:
         ValueError: in one sentence, naming all of them.
     """
-    found = [name for name, is_there in unsupported_forces(scene).items() if is_there]
+    model = scene.model
+    forces = {
+        "dry friction": model.dof_frictionloss.any(),
+        "air or water": model.opt.density or model.opt.viscosity,
+        "self-contact": own_contacts(model),
+        "gravity compensation": model.body_gravcomp.any(),
+    }
+    found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:
         raise ValueError(
             "expected a robot moved by actuators, gravity, springs, damping, limits and "
-            f"contact with the ground alone, got scene '{scene.name}' with "
-            f"{', '.join(found)}"
+            f"contact with the ground alone, got scene '{scene.name}' with {found}"
         )

@@ -4,9 +4,8 @@ The contact law is that of `scenes.penalty_law`, plus two properties of real bod
 centre of mass that is not the body frame's origin, and friction that fades under load,
 ``mu / (1 + normal force * fading)``, as that of elastic asperities (J. F. Archard,
 "Elastic deformation and the laws of friction", 1957). A few substeps with a backward
-Euler spring are stable at any stiffness.
-Every operation is differentiable, and so are the physical parameters: a rollout through it
-fits them to recordings.
+Euler spring are stable at any stiffness. Every operation is differentiable, also in the
+physical parameters: a rollout fits them to recordings.
 """
 
 from typing import ClassVar
@@ -16,7 +15,12 @@ from torch import Tensor, nn
 
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult
 from torchrl_nerd.configs import FreeBodyConfig
-from torchrl_nerd.geometry.rotations import quat_normalize
+from torchrl_nerd.geometry.base import keep_constants
+from torchrl_nerd.geometry.rotations import (
+    quat_conjugate,
+    quat_multiply,
+    quat_normalize,
+)
 from torchrl_nerd.scenes.penalty_law import PenaltyLaw, friction_force, normal_force
 from torchrl_nerd.scenes.scene import Scene
 
@@ -41,33 +45,6 @@ SHIFTED = {
 }
 PARAMETERS = (*SCALED, *SHIFTED)
 MIN_SLIP = 1e-4  # m/s: keeps the direction of slip defined at rest
-
-# rotation matrix, row by row, from the 16 products of a quaternion's entries
-_MATRIX = torch.zeros(16, 9, dtype=torch.float64)
-for _entry, _terms in enumerate(
-    (
-        {0: 1, 5: 1, 10: -1, 15: -1},
-        {6: 2, 3: -2},
-        {7: 2, 2: 2},
-        {6: 2, 3: 2},
-        {0: 1, 5: -1, 10: 1, 15: -1},
-        {11: 2, 1: -2},
-        {7: 2, 2: -2},
-        {11: 2, 1: 2},
-        {0: 1, 5: -1, 10: -1, 15: 1},
-    )
-):
-    for _product, _factor in _terms.items():
-        _MATRIX[_product, _entry] = _factor
-# q (0, w) from the 12 products of q's and w's entries
-_SPIN = torch.zeros(12, 4, dtype=torch.float64)
-for _index, (_row, _sign) in enumerate(
-    (
-        *((1, 1), (2, 1), (3, 1), (0, -1), (3, 1), (2, -1)),
-        *((3, -1), (0, -1), (1, 1), (2, 1), (1, -1), (0, -1)),
-    )
-):
-    _SPIN[_index, _row] = _sign
 
 
 class FreeBodyPenaltyStep(AnalyticStep):
@@ -99,40 +76,35 @@ class FreeBodyPenaltyStep(AnalyticStep):
 
     def __init__(self, scene: Scene, num_substeps: int = 8) -> None:
         super().__init__(scene, FreeBodyConfig(num_substeps), num_defects=6)
-        model, name = scene.model, scene.name
+        model = scene.model
         if model.njnt != 1 or not scene.base.is_floating or len(scene.contacts) == 0:
             raise ValueError(
-                f"expected a single free body on a ground, got scene '{name}'"
+                f"expected a single free body on a ground, got scene '{scene.name}'"
             )
         body = int(model.jnt_bodyid[0])
         law = PenaltyLaw.of_bodies(model, [body])
-        values = {
-            "gravity": -model.opt.gravity[2],
-            "size": 1.0,
-            "inertia": 1.0,
-            "friction": law.friction.item(),
-            "stiffness": law.stiffness.item(),
-            "damping": law.damping.item(),
-            "slip": law.slip.item(),
-        }
+        contact = law.friction, law.stiffness, law.damping, law.slip
         self.num_substeps = num_substeps
         self.step_size = scene.control_step / num_substeps
         self.mass = float(model.body_mass[body])
-        points = torch.as_tensor(scene.contacts.positions, dtype=torch.float64)
-        inertia = torch.as_tensor(model.body_inertia[body], dtype=torch.float64)
-        reach = points.square().sum(-1).amax() / inertia.amin()
+        points, inertia = scene.contacts.positions, model.body_inertia[body]
+        reach = (points**2).sum(-1).max() / inertia.min()
         self.lightest = float(1.0 / (1.0 / self.mass + reach))  # kg, at a point
-        nominal = torch.tensor([values[key] for key in SCALED], dtype=torch.float64)
-        for key, value in (
-            ("points", points.clone()),
-            ("inertia", inertia.clone()),
-            ("nominal", nominal),
-            ("share", torch.tensor([*SCALED.values()], dtype=torch.float64)),
-            ("shift", torch.tensor([*SHIFTED.values()], dtype=torch.float64)),
-            ("matrix", _MATRIX),
-            ("spin", _SPIN),
-        ):
-            self.register_buffer(key, value.clone(), persistent=False)
+        one = torch.eye(4, dtype=torch.float64)  # the entries of a quaternion
+        turned = quat_multiply(one[1:], quat_conjugate(one)[:, None])  # (4, axis, 4)
+        turned = quat_multiply(one[:, None, None], turned)[..., 1:]  # (4, 4, axis, 3)
+        keep_constants(
+            self,
+            points=points,
+            inertia=inertia,
+            nominal=[-model.opt.gravity[2], 1.0, 1.0, *(x.item() for x in contact)],
+            share=[*SCALED.values()],
+            shift=[*SHIFTED.values()],
+            # rotation matrix, row by row, from the 16 products of a quaternion's entries
+            matrix=turned.mT.reshape(16, 9),
+            # q (0, w) from the 12 products of q's and w's entries
+            spin=quat_multiply(one[:, None], one[1:]).reshape(12, 4),
+        )
         self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
 
     def scaled(self) -> Tensor:
@@ -178,9 +150,11 @@ class FreeBodyPenaltyStep(AnalyticStep):
         soften = 1.0 + h * (kd + h * ke) / self.lightest  # backward Euler at a point
         spring, damper = ke / soften, (kd + h * ke) / soften
         slip = kf / (1.0 + h * kf / self.lightest)
-        cross = _cross_matrices(points)  # (P, 3, 3): w -> w x point
-        velocities = cross.reshape(-1, 3).mT  # (3, 3 P)
-        torques = cross.reshape(-1, 3)  # force -> point x force, (3 P, 3)
+        axes = torch.eye(3, dtype=points.dtype, device=points.device)
+        cross = torch.linalg.cross(
+            points[:, None], axes[None]
+        )  # (P, 3, 3): w -> w x point
+        cross = cross.reshape(-1, 3)  # (3 P, 3): force -> point x force
         fall = torch.zeros_like(qvel[:1, :3])
         fall[:, 2] = 1.0
         fall = fall * (h * gravity)
@@ -191,19 +165,19 @@ class FreeBodyPenaltyStep(AnalyticStep):
         by_contact = torch.zeros_like(qvel)
         for _ in range(self.num_substeps):
             linear = linear - fall
-            up = rotation[:, 2]  # of the world, in body axes
+            up = rotation[:, 2]  # (N, 3), of the world, in body axes
             in_body = (linear[:, None] @ rotation)[:, 0]
-            depth = ground - position[:, 2:] - up @ points.mT
-            moving = (angular @ velocities).unflatten(1, (-1, 3)) + in_body[:, None]
+            depth = ground - position[:, 2:] - up @ points.mT  # (N, P)
+            moving = (angular @ cross.mT).unflatten(1, (-1, 3)) + in_body[:, None]
             rising = (moving @ up[:, :, None])[..., 0]
-            sliding = moving - rising[..., None] * up[:, None]
+            sliding = moving - rising[..., None] * up[:, None]  # (N, P, 3)
             speed = (sliding.square().sum(-1) + MIN_SLIP**2).sqrt()
             normal = normal_force(spring, damper, depth, rising)
             faded = mu / (1.0 + fading * normal)
             drag = friction_force(slip, faded, normal, speed) / speed
             force = normal[..., None] * up[:, None] - drag[..., None] * sliding
             push = (rotation @ force.sum(1)[..., None])[..., 0]
-            moment = force.flatten(1) @ torques
+            moment = force.flatten(1) @ cross
             change = torch.cat(((h / self.mass) * push, h * moment / inertia), 1)
             by_contact = by_contact + change
             gyro = torch.linalg.cross(angular, inertia * angular)
@@ -219,20 +193,12 @@ class FreeBodyPenaltyStep(AnalyticStep):
         return StepResult(*after, by_contact)
 
     def _rotation(self, quat: Tensor) -> Tensor:
-        """Rotation matrices ``(rows, 3, 3)``, body to world."""
-        products = (quat[:, :, None] * quat[:, None]).flatten(1)
+        """Rotation matrices ``(N, 3, 3)``, body to world."""
+        products = (quat[:, :, None] * quat[:, None]).flatten(1)  # (N, 16)
         return (products @ self.matrix).unflatten(1, (3, 3))
 
 
 def _swing(rotation: Tensor, angular: Tensor, point: Tensor) -> Tensor:
-    """Velocity ``(rows, 3)``, world, of a point of the body beside its origin's."""
+    """Velocity ``(N, 3)``, world, of a point of the body beside its origin's."""
     moving = torch.linalg.cross(angular, point.expand_as(angular))
     return (rotation @ moving[..., None])[..., 0]
-
-
-def _cross_matrices(points: Tensor) -> Tensor:
-    """Matrices of ``w -> w x point``, ``(P, 3) -> (P, 3, 3)``."""
-    x, y, z = points.unbind(-1)
-    o = torch.zeros_like(x)
-    rows = (o, z, -y, -z, o, x, y, -x, o)
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))

@@ -6,7 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants
+from torchrl_nerd.geometry.base import (
+    BasePose,
+    JointAxes,
+    keep_constants,
+    keep_indices,
+)
 from torchrl_nerd.geometry.kinematics import PointKinematics, cross
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
 from torchrl_nerd.geometry.spd import BranchSparsity, spd_inverse
@@ -75,13 +80,8 @@ class DynamicsEvaluation(nn.Module):
         self.shape = joints.shape
         angular = range(self.num_base_dofs, 2 * self.num_base_dofs)
         dofs = [[*angular, *(2 * self.num_base_dofs + row)] for row in joints]
-        # tensors, since torch.compile guards every entry of a list
-        for name, numbers in (
-            ("joints", joints.flatten()),
-            ("jacobian_dofs", np.concatenate(dofs)),
-        ):
-            index = torch.from_numpy(np.array(numbers, dtype=np.int64))
-            self.register_buffer(name, index, persistent=False)
+        dofs = np.concatenate(dofs)
+        keep_indices(self, joints=joints.flatten(), jacobian_dofs=dofs)
         keep_constants(
             self,
             joint_weights=np.take_along_axis(weights, joints, 1)[..., None],
@@ -107,10 +107,8 @@ class DynamicsEvaluation(nn.Module):
             dtype: of the result but for the base's rotation, which is float64.
         """
         found, _ = self.kinematics(qpos, qvel)
-        sizes = self.num_points, 2 * self.num_axes
-        points, places, corners = found.split(
-            (*sizes, found.shape[-2] - sum(sizes)), -2
-        )
+        sizes = self.num_points, 2 * self.num_axes, len(self.rigid_body.bodies)
+        points, places, corners = found.split(sizes, -2)
         position, rotation = self.pose(qpos)
         distance, normal = self.ground(points, terrain, position, rotation)
         matrix, force = self.rigid_body.mass_matrix_and_force(
@@ -119,15 +117,11 @@ class DynamicsEvaluation(nn.Module):
         inverse, qacc = spd_inverse(matrix, force, self.branches)
         depth, normal = self.radii - distance.mT, rows_last(normal, 2)
         # a sphere's contact is halfway between its surface and the ground, as MuJoCo's
-        points = (
-            rows_last(points, 2) - (self.radii - 0.5 * depth.clamp_min(0.0)) * normal
-        )
+        inwards = self.radii - 0.5 * depth.clamp_min(0.0)  # (P, N), m
+        points = rows_last(points, 2) - inwards * normal
         jacobian = self._jacobian(points, rows_last(places, 2))
         parts = jacobian, normal, depth, qacc, inverse
-        jacobian, normal, depth, qacc, inverse = (
-            x.to(dtype).contiguous() for x in parts
-        )
-        return FrozenDynamics(jacobian, normal, depth, qacc, inverse, rotation)
+        return FrozenDynamics(*(x.to(dtype).contiguous() for x in parts), rotation)
 
     def point_velocity(self, jacobian: Tensor, qvel: Tensor) -> Tensor:
         """Velocities ``(3, P, N)`` of the contact points, m/s, at ``qvel (nv, N)``."""
@@ -138,7 +132,7 @@ class DynamicsEvaluation(nn.Module):
     def _jacobian(self, points: Tensor, places: Tensor) -> Tensor:
         """Contact Jacobian ``(3, P, C, N)``: velocity of each point by each of its dofs."""
         anchor, tip = places.chunk(2, 1)
-        axis, anchor = (
+        axis, anchor = (  # (3, P, C, N)
             x[:, self.joints].unflatten(1, self.shape) for x in (tip - anchor, anchor)
         )
         turning = cross(axis, points[:, :, None] - anchor)

@@ -18,9 +18,7 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.base import JointAxes, keep_constants
 
 NUM_SWEEPS = 3  # of the iteration; it starts from the forces of the solve before
-MAX_DAMPED = (
-    1.0 / 3.0
-)  # share of its speed that a limit may take from a joint per solve
+MAX_DAMPED = 1.0 / 3.0  # of its speed: what a limit may take from a joint per solve
 TINY = mujoco.mjMINVAL
 MIN_IMPEDANCE, MAX_IMPEDANCE = mujoco.mjMINIMP, mujoco.mjMAXIMP
 
@@ -95,9 +93,8 @@ class JointLimits(nn.Module):
         coupling = inverse[self.joints][:, self.joints]
         for _ in range(num_solves):
             position, velocity = qpos[self.joints], qvel[self.joints]
-            force, side = self._solve(
-                position, velocity, acceleration[self.joints], coupling, force
-            )
+            smooth = acceleration[self.joints]
+            force, side = self._solve(position, velocity, smooth, coupling, force)
             qacc = acceleration + (inverse[:, self.joints] * (side * force)).sum(1)
             qpos = qpos + step * (qvel + 0.5 * (step + lag) * qacc)
             qvel = qvel + step * qacc
@@ -134,10 +131,8 @@ class JointLimits(nn.Module):
         least, rise, width, middle, early, late = self.impedance
         x = (depth / width).clamp(0.0, 1.0)
         power = self.power if self.even_power is None else self.even_power
-        bent = torch.where(
-            x < middle, early * x**power, 1.0 - late * (1.0 - x) ** power
-        )
-        return least + rise * bent
+        end = 1.0 - late * (1.0 - x) ** power
+        return least + rise * torch.where(x < middle, early * x**power, end)
 
 
 def _impedance_parameters(solimp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -130,9 +130,8 @@ class PenaltyContactStep(AnalyticStep):
         dynamics = self.evaluation(position, velocity, *drive)
         if first:  # depths at the start, from which the substeps go on
             speed = self.integrator.to_base_frame(qvel.mT, dynamics.rotation.mT)
-            moving = self.evaluation.point_velocity(
-                dynamics.jacobian, speed.to(self.dtype)
-            )
+            speed = speed.to(self.dtype)
+            moving = self.evaluation.point_velocity(dynamics.jacobian, speed)
             rising = (moving * dynamics.normal).sum(0)
             dynamics = dynamics._replace(depth=dynamics.depth + ahead * rising)
         start = dynamics
@@ -140,9 +139,8 @@ class PenaltyContactStep(AnalyticStep):
             states = self.integrator.integrate_substeps(
                 start, dynamics, earlier, qpos, qvel, later
             )
-            position, velocity = self._moved(
-                qpos, state_at(states, later), dynamics.rotation
-            )
+            state = state_at(states, later)
+            position, velocity = self._moved(qpos, state, dynamics.rotation)
             dynamics = self.evaluation(position, velocity, *drive)
         states = self.integrator.integrate_substeps(
             start, dynamics, last - first, qpos, qvel, self.num_substeps

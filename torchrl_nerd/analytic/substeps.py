@@ -2,22 +2,35 @@
 
 MuJoCo's substeps, but for what changes little within a control step: the contact Jacobian
 and the smooth acceleration change linearly from one `FrozenDynamics` to another, and the
-mass matrix is that of the second one.
+mass matrix is that of the second one. All tensors have the batch last.
+
+A contact that slides is the point of MuJoCo's elliptic friction cone that is nearest to the
+force of spring and dampers without a cone; its normal force is a little larger than theirs.
+Source: https://mujoco.readthedocs.io/en/stable/computation/#constraint-model
 """
 
 from math import ceil
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.analytic.frozen_dynamics import DynamicsEvaluation, FrozenDynamics
-from torchrl_nerd.analytic.penalty_forces import PenaltyContactForce, PenaltyLimitForce
-from torchrl_nerd.geometry.base import JointAxes, keep_constants
+from torchrl_nerd.geometry.base import JointAxes, keep_constants, keep_indices
 from torchrl_nerd.geometry.kinematics import cross
 from torchrl_nerd.geometry.spd import matvec
+from torchrl_nerd.scenes.penalty_law import (
+    PenaltyLaw,
+    friction_force,
+    limit_forces,
+    limit_stiffness,
+    normal_force,
+)
 from torchrl_nerd.scenes.scene import Scene
+
+MIN_SLIP = 1e-6  # m/s: keeps the direction of slip defined at rest
 
 
 class SubstepState(NamedTuple):
@@ -26,17 +39,12 @@ class SubstepState(NamedTuple):
     qvel: Tensor  # (nv, N)
     moved: Tensor  # (nv, N), a tangent of qpos
 
-    def lerp(self, other: "SubstepState", share: float) -> "SubstepState":
-        """A share of the way to another one."""
-        pairs = zip(self, other, strict=True)
-        return SubstepState(*(torch.lerp(one, end, share) for one, end in pairs))
-
 
 class SubstepIntegrator(nn.Module):
     """Integrates a robot under penalty contact and limit forces.
 
     Args:
-        scene: whose contacts and limits follow the penalty law.
+        scene: whose contacts and limits follow the penalty law, with elliptic cones.
         axes: its joints.
         evaluation: what made the frozen dynamics.
         step_size: s, of a substep.
@@ -44,12 +52,14 @@ class SubstepIntegrator(nn.Module):
             Euler, 0.5 for leapfrog.
 
     Raises:
-        ValueError: contacts or limits of another law.
+        ValueError: contacts or limits of another law or cone.
     """
 
     limited_dofs: Tensor
     limited_qpos: Tensor
     scatter: Tensor
+    contact_law: Tensor
+    limit_law: Tensor
 
     def __init__(
         self,
@@ -63,21 +73,34 @@ class SubstepIntegrator(nn.Module):
         self.step_size, self.stage_offset = step_size, stage_offset
         self.evaluation = evaluation
         self.num_base_dofs = evaluation.num_base_dofs
-        self.contact = PenaltyContactForce(scene)
-        self.limit = PenaltyLimitForce(scene.model, axes)
-        limited = [2 * self.num_base_dofs + joint for joint in self.limit.joints]
+        model, points = scene.model, scene.contacts
+        if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+            raise ValueError(
+                "expected elliptic friction cones, got pyramidal ones in scene "
+                f"'{scene.name}'"
+            )
+        law = PenaltyLaw.of_bodies(model, points.bodies)
+        # share of the tangential force beyond the cone that becomes normal force
+        share = law.friction / model.opt.impratio
+        scale = 1.0 / (1.0 + law.friction * share)
+        contact = law.stiffness, law.damping, law.slip, law.friction, share, scale
+        joints = np.flatnonzero(model.jnt_limited[axes.joints])
+        ids = [axes.joints[joint] for joint in joints]
+        low, high = model.jnt_range[ids].T
+        springs = limit_stiffness(model, ids) if ids else (low, low)
+        limited = (2 * self.num_base_dofs + joints).tolist()
         dofs = [*evaluation.jacobian_dofs.tolist(), *limited]
-        scatter = np.zeros((scene.model.nv, len(dofs)))  # adds columns to their dofs
+        scatter = np.zeros((model.nv, len(dofs)))  # adds columns to their dofs
         scatter[np.array(dofs, int), range(len(dofs))] = 1.0
         addresses = evaluation.rigid_body.qpos_addresses
-        limited_qpos = [addresses[joint] for joint in self.limit.joints]
-        for name, numbers in (
-            ("limited_dofs", limited),
-            ("limited_qpos", limited_qpos),
-        ):
-            index = torch.from_numpy(np.array(numbers, dtype=np.int64))
-            self.register_buffer(name, index, persistent=False)
-        keep_constants(self, scatter=scatter)
+        limited_qpos = [addresses[joint] for joint in joints]
+        keep_indices(self, limited_dofs=limited, limited_qpos=limited_qpos)
+        keep_constants(
+            self,
+            scatter=scatter,
+            contact_law=np.stack((*contact, points.merged.sum(1)))[..., None],
+            limit_law=np.stack((*springs, low, high))[..., None],
+        )
 
     def integrate_substeps(
         self,
@@ -122,7 +145,7 @@ class SubstepIntegrator(nn.Module):
             if jacobian_rate is not None:
                 jacobian = torch.add(jacobian_0, jacobian_rate, alpha=time)
             velocity = self.evaluation.point_velocity(jacobian, speed)
-            rising = (velocity * normal).sum(0)
+            rising = (velocity * normal).sum(0)  # (P, N)
             if time:
                 depth = depth - min(1.0, time) * step * rising
             damped = speed
@@ -131,14 +154,12 @@ class SubstepIntegrator(nn.Module):
                 damped = speed + self.stage_offset * change  # extrapolated to the stage
                 velocity = self.evaluation.point_velocity(jacobian, damped)
                 rising = (velocity * normal).sum(0)
-            slip = velocity - rising * normal
-            force = self.contact(depth, rising, slip, normal)
-            limit = self.limit(
-                joints + moved[self.limited_dofs], damped[self.limited_dofs]
-            )
-            columns = (jacobian * force[:, :, None]).sum(0).flatten(0, 1)
+            force = self._contact_force(depth, rising, velocity, normal)
+            angles, rates = moved[self.limited_dofs], damped[self.limited_dofs]
+            limit = self._limit_force(joints + angles, rates)
+            columns = (jacobian * force[:, :, None]).sum(0).flatten(0, 1)  # (P C, N)
             qfrc = matvec(scatter, torch.cat((columns, limit)))
-            if self.num_base_dofs:
+            if self.num_base_dofs:  # forces on the base itself, not through its columns
                 qfrc = torch.cat((force.sum(1), qfrc[self.num_base_dofs :]))
             qacc = qacc_smooth
             if qacc_rate is not None:
@@ -155,16 +176,42 @@ class SubstepIntegrator(nn.Module):
             return qvel
         return torch.cat((_rotated(qvel[:3], rotation), qvel[3:]))
 
+    def _contact_force(
+        self, depth: Tensor, rising: Tensor, velocity: Tensor, normal: Tensor
+    ) -> Tensor:
+        """Forces ``(3, P, N)``, N, on points ``depth (P, N)`` m in the ground, else 0.
+
+        ``rising``: part of ``velocity (3, P, N)``, m/s, along the ground's ``normal``.
+        """
+        stiffness, damping, slip_damping, friction, share, scale, merged = (
+            self.contact_law.to(depth)
+        )
+        slip = velocity - rising * normal
+        slip_speed = (slip.square().sum(0) + MIN_SLIP**2).sqrt()
+        spring = stiffness * depth - damping * rising
+        stick_force = slip_damping * slip_speed
+        on_cone = (scale * (spring + share * stick_force)).clamp_min(0.0)
+        on_cone = torch.where(depth > 0.0, on_cone, 0.0)
+        pressed = normal_force(stiffness, damping, depth, rising)
+        is_sliding = stick_force > friction * spring
+        pressed = merged * torch.where(is_sliding, on_cone, pressed)
+        drag = friction_force(merged * slip_damping, friction, pressed, slip_speed)
+        return pressed * normal - (drag / slip_speed) * slip
+
+    def _limit_force(self, position: Tensor, velocity: Tensor) -> Tensor:
+        """Torques ``(L, N)``, N m or N, of the joints that have limits."""
+        stiffness, damping, low, high = self.limit_law.to(position)
+        law = stiffness, damping, low, high
+        below, above = limit_forces(*law, position, velocity)
+        return below.clamp_min(0.0) + above.clamp_max(0.0)
+
     def _composed(self, moved: Tensor, further: Tensor) -> Tensor:
         """The tangent of two displacements in sequence, to second order."""
         total = moved + further
         if not self.num_base_dofs:
             return total
-        angular = slice(self.num_base_dofs, 2 * self.num_base_dofs)
-        twist = 0.5 * cross(moved[angular], further[angular])
-        return torch.cat(
-            (total[: self.num_base_dofs], total[angular] + twist, total[6:])
-        )
+        twist = 0.5 * cross(moved[3:6], further[3:6])
+        return torch.cat((total[:3], total[3:6] + twist, total[6:]))
 
 
 def state_at(states: list[SubstepState], time: float) -> SubstepState:
@@ -172,7 +219,8 @@ def state_at(states: list[SubstepState], time: float) -> SubstepState:
     before = int(time)
     if before == time:
         return states[before]
-    return states[before].lerp(states[before + 1], time - before)
+    pairs = zip(states[before], states[before + 1], strict=True)
+    return SubstepState(*(torch.lerp(x, after, time - before) for x, after in pairs))
 
 
 def _rotated(vectors: Tensor, rotation: Tensor) -> Tensor:

@@ -14,14 +14,12 @@ from torch import Tensor
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult, check_supported
 from torchrl_nerd.analytic.joint_limits import JointLimits
 from torchrl_nerd.configs import UnconstrainedConfig
-from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants
+from torchrl_nerd.geometry.base import BasePose, JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
 from torchrl_nerd.geometry.spd import spd_inverse
 from torchrl_nerd.scenes.scene import Scene
-
-NO_FIRST_ORDER_ERROR = (int(mujoco.mjtIntegrator.mjINT_RK4),)
 
 
 class UnconstrainedStep(AnalyticStep):
@@ -44,18 +42,15 @@ class UnconstrainedStep(AnalyticStep):
         super().__init__(scene, UnconstrainedConfig(), scene.layout.nv)
         model, self.step_size = scene.model, scene.control_step
         # s: substep whose first-order error the step shares
-        is_exact = model.opt.integrator in NO_FIRST_ORDER_ERROR
-        self.lag = 0.0 if is_exact else float(model.opt.timestep)
+        has_lag = model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+        self.lag = has_lag * float(model.opt.timestep)
         axes = JointAxes.of(model, scene.base)
-        self.num_places = len(axes.bodies)
         self.rigid_body = RigidBodyDynamics(model, scene.base, axes, scene.actuated)
         bodies = axes.bodies + self.rigid_body.bodies
         positions = np.concatenate((axes.positions, self.rigid_body.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
-        self.pose, self.layout = (
-            BasePose(scene.base, scene.fixed_base_pose),
-            scene.layout,
-        )
+        self.pose = BasePose(scene.base, scene.fixed_base_pose)
+        self.layout = scene.layout
         is_limited = model.jnt_limited[axes.joints] != 0
         self.limits, self.num_solves = None, 1
         if is_limited.any() and not scene.base.is_floating:
@@ -63,10 +58,6 @@ class UnconstrainedStep(AnalyticStep):
             substep = scene.control_step / (scene.substeps // scene.reference_ratio)
             self.limits = JointLimits(model, axes, substep)
             self.num_solves = self.limits.num_solves(self.step_size)
-        low, high = model.jnt_range[axes.joints].T
-        margin = model.jnt_margin[axes.joints]
-        low = np.where(is_limited, low + margin, -np.inf)
-        keep_constants(self, low=low, high=np.where(is_limited, high - margin, np.inf))
 
     def forward(
         self,
@@ -81,10 +72,8 @@ class UnconstrainedStep(AnalyticStep):
         start = self._dynamics(*state, joint_torque, 2.0 * ahead)
         middle = self._integrate(*state, start, ahead, solves // 2)
         dynamics = self._dynamics(*middle, joint_torque, 2.0 * self.lag)
-        next_qpos, next_qvel = self._integrate(*state, dynamics, self.step_size, solves)
-        return StepResult(
-            next_qpos, next_qvel, self.step_size * (dynamics[0] - start[0])
-        )
+        after = self._integrate(*state, dynamics, self.step_size, solves)
+        return StepResult(*after, self.step_size * (dynamics[0] - start[0]))
 
     def _dynamics(
         self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, period: float
@@ -94,8 +83,8 @@ class UnconstrainedStep(AnalyticStep):
         The inverse is None where no limit needs it.
         """
         points, _ = self.kinematics(qpos, qvel)
-        count = points.shape[-2] - self.num_places
-        places, corners = points.split((self.num_places, count), -2)
+        count = len(self.rigid_body.bodies)
+        places, corners = points.split((points.shape[-2] - count, count), -2)
         _, rotation = self.pose(qpos)
         where = qpos, qvel, joint_torque, rotation, corners, places, period
         if self.limits is None:
