@@ -26,8 +26,8 @@ from torchrl_nerd.dynamics import (
     MujocoWarpDynamics,
     NeRDDynamics,
 )
-from torchrl_nerd.dynamics.nerd import Inference
-from torchrl_nerd.dynamics.warp_setup import is_warp_installed
+from torchrl_nerd.dynamics.models import Inference
+from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.hybrid import HybridNeRD

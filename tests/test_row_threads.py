@@ -11,8 +11,8 @@ from dynamics_helpers import HAS_COMPILER, random_actions, random_drive, roll
 from torch import Tensor
 
 from torchrl_nerd import NeRDEnv, from_pretrained
-from torchrl_nerd.dynamics import NeRDDynamics, torch_step
-from torchrl_nerd.row_threads import WARM, RowThreads, parts_of
+from torchrl_nerd.compiled import WARM, RowThreads, parts_of
+from torchrl_nerd.dynamics import NeRDDynamics, models
 
 TASK, ROWS, STEPS = "double_pendulum/passive", 6, 4
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
@@ -95,7 +95,7 @@ def test_a_forked_process_has_threads_of_its_own():
 
 @pytest.mark.slow
 def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
-    monkeypatch.setattr(torch_step, "MIN_WORK", 2)
+    monkeypatch.setattr(models, "MIN_WORK", 2)
     model = from_pretrained("double_pendulum-hybrid")
     drive = random_drive(model.scene, ROWS, STEPS, generator)
     dynamics = NeRDDynamics(model, compile=True)
@@ -116,7 +116,7 @@ def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
 
 def test_what_must_stay_whole_does(generator, monkeypatch):
     """Gradients, a history, one thread."""
-    monkeypatch.setattr(torch_step, "MIN_WORK", 2)
+    monkeypatch.setattr(models, "MIN_WORK", 2)
     model = from_pretrained("double_pendulum-hybrid")
     assert NeRDDynamics(model, differentiable=True).parts(ROWS) == 1
     assert NeRDDynamics(from_pretrained("cartpole")).parts(ROWS) == 1

@@ -22,8 +22,8 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.actuators import ActuatorController
 from torchrl_nerd.scenes.contact_points import ground_geoms
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.transforms import StateDelta
 
 ROWS = 20

@@ -17,7 +17,7 @@ from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
 from torchrl_nerd.geometry.spd import BranchSparsity, spd_inverse
 from torchrl_nerd.scenes.contact_points import shape_points
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.scenes.terrain_distance import TerrainDistance
+from torchrl_nerd.scenes.terrain import TerrainDistance
 
 
 class FrozenDynamics(NamedTuple):
@@ -34,12 +34,6 @@ class FrozenDynamics(NamedTuple):
 class DynamicsEvaluation(nn.Module):
     """Evaluates the `FrozenDynamics` of a robot over its ground.
 
-    | attribute | meaning |
-    |---|---|
-    | ``jacobian_dofs`` | dofs that the columns of the contact Jacobian belong to, C of each
-      of the P points, flat; a floating base's linear velocity moves every point |
-    | ``num_base_dofs`` | 3 for a floating base (its angular ones come next), else 0 |
-
     Args:
         scene: a robot of hinges and slides, on a free base or a fixed one, over a ground.
         axes: its joints.
@@ -50,7 +44,7 @@ class DynamicsEvaluation(nn.Module):
     """
 
     joints: Tensor
-    jacobian_dofs: Tensor
+    jacobian_dofs: Tensor  # of the Jacobian's columns: C of each of the P points, flat
     joint_weights: Tensor
     radii: Tensor
     is_slide: Tensor
@@ -70,6 +64,7 @@ class DynamicsEvaluation(nn.Module):
         self.kinematics = PointKinematics(model, scene.base, bodies, places)
         self.pose = BasePose(scene.base, scene.fixed_base_pose)
         self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
+        # linear ones, which move every point; the base's angular ones come next
         self.num_base_dofs = 3 * scene.base.is_floating
         # points of several bodies in one place act together, each moved by its own joints
         weights = points.merged @ axes.ancestry(shape_points(model)[0]).T
@@ -97,14 +92,9 @@ class DynamicsEvaluation(nn.Module):
         terrain: Tensor | None,
         dtype: torch.dtype,
     ) -> FrozenDynamics:
-        """The dynamics at a state.
+        """The dynamics at a state, ``qpos (N, nq)``; see `AnalyticStep.forward`.
 
-        Args:
-            qpos: ``(N, nq)``.
-            qvel: ``(N, nv)``.
-            joint_torque: ``(N, num_actuated)``.
-            terrain: ``(N, terrain.size)``; None for the scene's own ground.
-            dtype: of the result but for the base's rotation, which is float64.
+        ``dtype``: of the result but for the base's rotation, which is float64.
         """
         found, _ = self.kinematics(qpos, qvel)
         sizes = self.num_points, 2 * self.num_axes, len(self.rigid_body.bodies)
@@ -121,7 +111,8 @@ class DynamicsEvaluation(nn.Module):
         points = rows_last(points, 2) - inwards * normal
         jacobian = self._jacobian(points, rows_last(places, 2))
         parts = jacobian, normal, depth, qacc, inverse
-        return FrozenDynamics(*(x.to(dtype).contiguous() for x in parts), rotation)
+        frozen = (x.to(dtype).contiguous() for x in parts)
+        return FrozenDynamics(*frozen, rotation=rotation)
 
     def point_velocity(self, jacobian: Tensor, qvel: Tensor) -> Tensor:
         """Velocities ``(3, P, N)`` of the contact points, m/s, at ``qvel (nv, N)``."""

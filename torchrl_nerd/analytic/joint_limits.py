@@ -26,10 +26,6 @@ MIN_IMPEDANCE, MAX_IMPEDANCE = mujoco.mjMINIMP, mujoco.mjMAXIMP
 class JointLimits(nn.Module):
     """Integrates hinges and slides under joint-limit constraints; batch last.
 
-    | attribute | meaning |
-    |---|---|
-    | ``joints`` | which joints of ``axes`` have limits |
-
     Args:
         model: compiled, of a robot without a free base.
         axes: its joints.
@@ -44,6 +40,7 @@ class JointLimits(nn.Module):
     def __init__(self, model: mujoco.MjModel, axes: JointAxes, substep: float) -> None:
         super().__init__()
         self.substep = substep
+        # which joints of ``axes`` have limits
         self.joints = np.flatnonzero(model.jnt_limited[axes.joints]).tolist()
         ids = [axes.joints[joint] for joint in self.joints]
         low, high = model.jnt_range[ids].T
@@ -78,16 +75,11 @@ class JointLimits(nn.Module):
         num_solves: int,
         lag: float | Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """``qpos`` and ``qvel``, ``(J, N)``, after a time.
+        """``qpos`` and ``qvel``, ``(J, N)``, after ``period`` s.
 
-        Args:
-            qpos: ``(J, N)``, rad or m.
-            qvel: ``(J, N)``, rad/s or m/s.
-            acceleration: without the limits, ``(J, N)``, held.
-            inverse: of the mass matrix, ``(J, J, N)``, held.
-            period: that time, s.
-            num_solves: equal parts of it, in each of which the forces are solved anew.
-            lag: s, substep of semi-implicit Euler: positions move by the new velocity.
+        Held are ``acceleration (J, N)`` without the limits and ``inverse (J, J, N)`` of the
+        mass matrix. The forces are solved anew in ``num_solves`` equal parts of the period.
+        ``lag``, s: substep of semi-implicit Euler; positions move by the new velocity.
         """
         step, force = period / max(num_solves, 1), torch.zeros_like(qpos[self.joints])
         coupling = inverse[self.joints][:, self.joints]

@@ -111,18 +111,15 @@ class SubstepIntegrator(nn.Module):
         qvel: Tensor,
         num_substeps: float,
     ) -> list[SubstepState]:
-        """Integrate the substeps from the given state; return the state after each.
+        """The state at the start and after each substep, in the base frame of ``last``.
 
         Args:
             first: dynamics from which Jacobian and smooth acceleration change linearly
-            last: to these; the result is in the base frame of ``last``.
+            last: to these.
             between: time between both, in substeps; 0: they are one, nothing changes.
             qpos: at the start, ``(N, nq)``.
             qvel: at the start, ``(N, nv)``.
             num_substeps: time to reach, in substeps; rounded up.
-
-        Returns:
-            The state at the start and after each substep.
         """
         step, jacobian, normal, depth, qacc_smooth, inverse, _ = self.step_size, *last
         joints = qpos.mT[self.limited_qpos].to(qacc_smooth)

@@ -37,8 +37,8 @@ class Dynamics(Protocol):
             terrain: ``(num_envs, terrain.size)`` where the ground varies.
 
         Returns:
-            A new tensordict; envs that the physics could not step are not finite. True
-            dynamics of a model that senses forces adds ``sensordata``.
+            A new tensordict; envs that the physics could not step are not finite. The
+            ground truth of a model that senses forces adds ``sensordata``.
         """
         ...
 
@@ -51,19 +51,25 @@ def check_step(
     So does a ground that is not finite: unlike a state, it never becomes so by itself.
     """
     rows = state.batch_size[0] if state.batch_size else state[QPOS].shape[0]
-    expected = {
-        QPOS: (state[QPOS], (rows, scene.model.nq)),
-        QVEL: (state[QVEL], (rows, scene.model.nv)),
-        "joint_torque": (joint_torque, (rows, len(scene.actuated))),
-    }
     if scene.terrain is not None and scene.terrain.is_per_row:
         if terrain is None:
             raise ValueError(
                 f"scene '{scene.name}' has a ground per env: got no terrain"
             )
         scene.terrain.check(terrain, (rows, scene.terrain.size))
-    for name, (value, shape) in expected.items():
-        if tuple(value.shape) != shape:
-            raise ValueError(
-                f"expected {name} of shape {shape}, got {tuple(value.shape)}"
-            )
+    for name, value, width in (
+        (QPOS, state[QPOS], scene.model.nq),
+        (QVEL, state[QVEL], scene.model.nv),
+        ("joint_torque", joint_torque, len(scene.actuated)),
+    ):
+        got = tuple(value.shape)
+        if got != (rows, width):
+            raise ValueError(f"expected {name} of shape {(rows, width)}, got {got}")
+
+
+def ground_pose(scene: Scene, terrain: Tensor | None) -> Tensor | None:
+    """`Terrain.mocap_pose` of each env; None where the ground does not vary."""
+    ground = scene.terrain
+    if terrain is None or ground is None or not ground.is_per_row:
+        return None
+    return ground.mocap_pose(terrain.double())

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.dynamics.base import check_step, ground_pose
 from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
@@ -75,16 +75,12 @@ class DMControlDynamics:
             np.asarray(x.double().cpu())
             for x in (state[QPOS], state[QVEL], joint_torque)
         )
-        pose = None
-        ground = self.scene.terrain
-        if terrain is not None and ground is not None and ground.is_per_row:
-            pose = ground.mocap_pose(terrain.double().cpu()).numpy()
+        pose = ground_pose(self.scene, terrain)
+        poses = [None] * len(qpos) if pose is None else np.asarray(pose.cpu())
         next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
         felt = np.empty((len(qpos), self.scene.model.nsensordata))
         for row, physics in enumerate(self._rows):
-            self._place(
-                physics, qpos[row], qvel[row], None if pose is None else pose[row]
-            )
+            _place(physics, qpos[row], qvel[row], poses[row])
             physics.data.qfrc_applied[self.scene.actuated] = force[row]
             with physics.suppress_physics_errors():
                 physics.step(self.scene.substeps)
@@ -102,22 +98,19 @@ class DMControlDynamics:
             device=state.device,
         )
 
-    def _place(
-        self,
-        physics: "Physics",
-        qpos: np.ndarray,
-        qvel: np.ndarray,
-        pose: np.ndarray | None,
-    ) -> None:
-        """Put an env where it should be, unless it is there already."""
-        data, size = physics.data, 3 * physics.model.nmocap
-        is_there = np.array_equal(data.qpos, qpos) and np.array_equal(data.qvel, qvel)
+
+def _place(
+    physics: "Physics", qpos: np.ndarray, qvel: np.ndarray, pose: np.ndarray | None
+) -> None:
+    """Put an env where it should be, unless it is there already."""
+    data, size = physics.data, 3 * physics.model.nmocap
+    is_there = np.array_equal(data.qpos, qpos) and np.array_equal(data.qvel, qvel)
+    if pose is not None:
+        ground = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
+        is_there = is_there and np.array_equal(ground, pose)
+    if is_there:
+        return
+    with physics.reset_context():
+        data.qpos[:], data.qvel[:] = qpos, qvel
         if pose is not None:
-            ground = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
-            is_there = is_there and np.array_equal(ground, pose)
-        if is_there:
-            return
-        with physics.reset_context():
-            data.qpos[:], data.qvel[:] = qpos, qvel
-            if pose is not None:
-                data.mocap_pos.flat, data.mocap_quat.flat = pose[:size], pose[size:]
+            data.mocap_pos.flat, data.mocap_quat.flat = pose[:size], pose[size:]

@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_nerd.dynamics.models import NeRDDynamics
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
-from torchrl_nerd.dynamics.nerd import NeRDDynamics
 from torchrl_nerd.keys import QPOS, QVEL, TRUST
 
 Guard = Literal["flag", "truncate", "raise", "fallback"]
@@ -50,9 +50,8 @@ class GuardedDynamics:
         least_trust: float = 1.0,
         patience: int = PATIENCE,
     ) -> None:
-        if guard not in get_args(Guard):
-            expected = ", ".join(get_args(Guard))
-            raise ValueError(f"expected a guard of {expected}, got '{guard}'")
+        if guard not in (known := get_args(Guard)):
+            raise ValueError(f"expected a guard of {', '.join(known)}, got '{guard}'")
         if not 0.0 < least_trust <= 1.0:
             raise ValueError(f"expected a least_trust in (0, 1], got {least_trust}")
         if patience < 0:
@@ -92,15 +91,12 @@ class GuardedDynamics:
         trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
         rows = trust < self.least_trust
         if self.guard == "raise" and rows.any():
-            worst = float(trust.min())
             raise UntrustedError(
                 f"expected inputs like those of training, got {int(rows.sum())} of "
                 f"{len(rows)} envs beyond them, first env {int(rows.nonzero()[0])}, "
-                f"least trust {worst:.2g}"
+                f"least trust {float(trust.min()):.2g}"
             )
-        if self.ground_truth is not None:
-            rows = self._not_yet_calm(rows)
-        if self.ground_truth is not None and rows.any():
+        if self.ground_truth is not None and (rows := self._not_yet_calm(rows)).any():
             ground = None if terrain is None else terrain[rows]
             some = state.select(QPOS, QVEL)[rows]
             self.ground_truth.reset(some)  # no warm start of other envs

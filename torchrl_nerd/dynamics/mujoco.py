@@ -12,10 +12,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.dynamics.base import check_step, ground_pose
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.scenes.silence import silence_mujoco
+from torchrl_nerd.scenes.support import silence_mujoco
 
 STATE: Any = mujoco.mjtState
 CONTROL = int(
@@ -131,8 +131,8 @@ class MujocoDynamics:
         """
         qpos, qvel = (np.asarray(state[key].double().cpu()) for key in (QPOS, QVEL))
         fine = self._substeps(qpos, qvel, self._control(joint_torque, terrain))
-        timestep = self._model.opt.timestep
-        velocity = slice(1 + qpos.shape[1], 1 + qpos.shape[1] + qvel.shape[1])
+        timestep, nq, nv = self._model.opt.timestep, self._model.nq, self._model.nv
+        velocity = slice(1 + nq, 1 + nq + nv)  # of MuJoCo's state: time, qpos, qvel
         before = fine[:, -2, velocity] if fine.shape[1] > 1 else qvel
         with np.errstate(invalid="ignore"):  # infinite envs are found below
             self._warmstart = (fine[:, -1, velocity] - before) / timestep
@@ -154,12 +154,10 @@ class MujocoDynamics:
         size = mujoco.mj_stateSize(self._model, CONTROL)
         control = np.zeros((*joint_torque.shape[:-1], size))
         control[..., self.scene.actuated] = joint_torque.double().cpu().numpy()
-        ground, pose = self.scene.terrain, control[..., self._model.nv :]
-        if terrain is not None and ground is not None and ground.is_per_row:
-            pose[:] = ground.mocap_pose(terrain.double().cpu()).numpy()[:, None]
-        else:
-            data = self._data[0]
-            pose[:] = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
+        pose, data = ground_pose(self.scene, terrain), self._data[0]
+        fixed = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
+        varied = fixed if pose is None else pose.cpu().numpy()[:, None]
+        control[..., self._model.nv :] = varied
         return control
 
     def _substeps(
@@ -171,9 +169,9 @@ class MujocoDynamics:
         self._felt = np.zeros((rows, self._model.nsensordata))
         if not rows:  # MuJoCo itself would crash
             return np.zeros((0, control.shape[1] * self.scene.substeps, size))
-        start = np.zeros((rows, size))
-        start[:, 1 : 1 + qpos.shape[1]] = qpos
-        start[:, 1 + qpos.shape[1] : 1 + qpos.shape[1] + qvel.shape[1]] = qvel
+        start = np.zeros((rows, size))  # time, qpos, qvel, and what is left at zero
+        known = np.concatenate((qpos, qvel), 1)
+        start[:, 1 : 1 + known.shape[1]] = known
         if len(self._warmstart) != rows:
             self._warmstart = np.zeros((rows, self._model.nv))
         with silence_mujoco():

@@ -1,25 +1,24 @@
 """Ground truth on a GPU: all envs as one batch of MuJoCo Warp, in float32."""
 
+import sys
 from contextlib import AbstractContextManager
+from importlib.util import find_spec
 from typing import Any, cast
 
+import mujoco
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step
-from torchrl_nerd.dynamics.mujoco import feels_forces
-from torchrl_nerd.dynamics.warp_setup import (
-    import_warp,
-    largest_constraints,
-    largest_contacts,
-    warp_model,
-)
+from torchrl_nerd.dynamics.base import check_step, ground_pose
+from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
 
 LARGEST = 1e10  # m, rad, m/s, rad/s: MuJoCo's mjMAXVAL, beyond which it gives up
+CONTACTS_PER_PAIR = 8  # of two geoms, two boxes at most; MuJoCo Warp has no more
+CONTACTS_PER_HEIGHT_FIELD = 50  # of it and another geom, MuJoCo's mjMAXCONPAIR
 
 
 class MujocoWarpDynamics:
@@ -58,14 +57,18 @@ class MujocoWarpDynamics:
         self._start()
 
     def _start(self) -> None:
-        self._warp, self._engine = import_warp()
+        self._warp, self._engine = _import_warp()
         try:
             self._place = self._warp.device_from_torch(self.device)
         except (RuntimeError, ValueError) as error:
             raise ValueError(
                 f"MuJoCo Warp finds no device '{self.device}' here"
             ) from error
-        self._source = warp_model(self.scene)
+        self._source = torque_model(self.scene)
+        # a flag that Warp does not know: it never resets an env by itself
+        disabled = self._source.opt.disableflags
+        no_reset = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self._source.opt.disableflags = disabled & ~no_reset
         try:
             with self._warp.ScopedDevice(self._place):
                 self._model = self._engine.put_model(self._source)
@@ -119,21 +122,16 @@ class MujocoWarpDynamics:
             return TensorDict({key: state[key].double() for key in (QPOS, QVEL)}, [0])
         is_broken = ~self._write(state, joint_torque, terrain)
         self._advance()
-        moved = torch.cat((self._view("qpos"), self._view("qvel")), -1)
+        moved = torch.cat((self._view(QPOS), self._view(QVEL)), -1)
         is_broken |= ~(moved.abs() <= LARGEST).all(-1) | self._has_overflown()
         self._view("qacc_warmstart")[is_broken] = 0.0
         values = {
-            QPOS: self._view("qpos")
-            .double()
-            .masked_fill(is_broken[:, None], torch.nan),
-            QVEL: self._view("qvel")
-            .double()
-            .masked_fill(is_broken[:, None], torch.nan),
+            key: self._view(key).double().masked_fill(is_broken[:, None], torch.nan)
+            for key in (QPOS, QVEL)
         }
         if feels_forces(self.scene):
             values[SENSORDATA] = self._view("sensordata").double()
-        device = state[QPOS].device
-        return TensorDict(values, [self._rows]).to(device)
+        return TensorDict(values, [self._rows]).to(state[QPOS].device)
 
     def _write(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
@@ -154,12 +152,10 @@ class MujocoWarpDynamics:
         applied = self._view("qfrc_applied").zero_()
         applied[:, self.scene.actuated] = torch.where(is_sound[:, None], force, 0.0)
         self._view("overflow").zero_()
-        ground = self.scene.terrain
-        if terrain is not None and ground is not None and ground.is_per_row:
-            pose = ground.mocap_pose(terrain.to(self.device, torch.float64))
-            pos, quat = pose.split(
-                (3 * self._source.nmocap, 4 * self._source.nmocap), -1
-            )
+        pose = ground_pose(self.scene, terrain)
+        if pose is not None:
+            sizes = 3 * self._source.nmocap, 4 * self._source.nmocap
+            pos, quat = pose.to(self.device).split(sizes, -1)
             self._view("mocap_pos").copy_(pos.unflatten(-1, (-1, 3)))
             self._view("mocap_quat").copy_(quat.unflatten(-1, (-1, 4)))
         return is_sound
@@ -185,18 +181,18 @@ class MujocoWarpDynamics:
         self._rows, self._graph, self._data = rows, None, None
         if not rows:
             return
-        contacts = self.max_contacts
+        contacts, source = self.max_contacts, self._source
         if contacts is None:
-            pairs = len(self._model.nxn_geom_pair_filtered)
-            contacts = largest_contacts(self._source, pairs)
-        constraints = largest_constraints(self._source, contacts)
+            of_pair = CONTACTS_PER_HEIGHT_FIELD if source.nhfield else CONTACTS_PER_PAIR
+            contacts = of_pair * len(self._model.nxn_geom_pair_filtered)
+        constraints = _most_constraints(source, contacts)
         with self._scope():
             self._data = self._engine.make_data(
-                self._source,
+                source,
                 nworld=rows,
                 nconmax=contacts,
                 njmax=constraints,
-                njmax_nnz=constraints * self._source.nv,
+                njmax_nnz=constraints * source.nv,
             )
 
     def _advance(self) -> None:
@@ -218,3 +214,36 @@ class MujocoWarpDynamics:
     def _substeps(self) -> None:
         for _ in range(self.scene.substeps):
             self._engine.step(self._model, self._data)
+
+
+def is_warp_installed() -> bool:
+    """Whether the package mujoco-warp can be imported."""
+    return find_spec("mujoco_warp") is not None
+
+
+def _import_warp() -> tuple[Any, Any]:
+    """The modules ``warp`` and ``mujoco_warp``, without their greeting."""
+    if not is_warp_installed():
+        raise ModuleNotFoundError(
+            "dynamics 'mujoco_warp' needs the package mujoco-warp, which is not "
+            "installed: pip install 'torchrl-nerd[warp]'"
+        )
+    is_first = "warp" not in sys.modules
+    import warp
+
+    if is_first:  # whoever imported it before has chosen what it says
+        warp.config.log_level = warp.LOG_ERROR
+    import mujoco_warp
+
+    warp.init()
+    return warp, mujoco_warp
+
+
+def _most_constraints(model: mujoco.MjModel, contacts: int) -> int:
+    """How many scalar constraints an env can have with so many contacts."""
+    condim = int(max(model.geom_condim, default=1))
+    is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    each = max(1, 2 * (condim - 1)) if is_pyramid else condim
+    # a limit holds a joint at both ends at worst; friction loss acts on every dof
+    others = 2 * (model.njnt + model.ntendon) + model.nv + model.ntendon
+    return each * contacts + others

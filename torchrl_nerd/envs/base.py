@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
-from torchrl_nerd.dynamics.torch_step import TorchDynamics
+from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition

@@ -7,7 +7,7 @@ import torch
 
 from torchrl_nerd.dynamics import GuardedDynamics, Model, NeRDDynamics, dynamics_of
 from torchrl_nerd.dynamics.guarded import Guard
-from torchrl_nerd.dynamics.nerd import Inference
+from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.resolve import (
     ENGINES,

@@ -73,12 +73,7 @@ def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.n
 
 
 class BasePose(nn.Module):
-    """World position and rotation of B_t.
-
-    Args:
-        base: of the robot.
-        mount: pose of a fixed base, see `fixed_base_pose`; a floating one has its own.
-    """
+    """World position and rotation of B_t; ``mount``: `fixed_base_pose` of a fixed base."""
 
     position: Tensor
     rotation: Tensor
@@ -100,14 +95,10 @@ class BasePose(nn.Module):
 def over_ground(
     base: Base, qvel: Tensor, points: Tensor, velocity: Tensor, rotation: Tensor
 ) -> Tensor:
-    """Velocities ``(*batch, P, 3)``, m/s, of points in the world, in the axes of B_t.
+    """Velocities of points in the world, m/s, in the axes of B_t.
 
-    Args:
-        base: of the robot.
-        qvel: ``(*batch, nv)``.
-        points: ``(*batch, P, 3)``, m, in B_t.
-        velocity: relative to the base, ``(*batch, P, 3)``, m/s, in B_t.
-        rotation: of the base, ``(*batch, 3, 3)``.
+    From ``qvel (*batch, nv)``, and in B_t: positions of the ``points (*batch, P, 3)``, m,
+    and their ``velocity`` relative to the base, whose ``rotation`` is ``(*batch, 3, 3)``.
     """
     if not base.is_floating:
         return velocity
@@ -122,20 +113,13 @@ class JointAxes:
     """The J hinges and slides of a robot whose bodies have at most one joint each.
 
     The anchor and the tip of every axis are points for `PointKinematics` to find.
-
-    | field | meaning |
-    |---|---|
-    | ``joints`` | ids, in the order of their dofs |
-    | ``bodies`` | of the points: all anchors, then all tips |
-    | ``positions`` | ``(2 J, 3)``, m, in the body's frame |
-    | ``is_slide`` | ``(J,)``: 1 for a slide, 0 for a hinge |
     """
 
     model: mujoco.MjModel
-    joints: list[int]
-    bodies: list[int]
-    positions: np.ndarray
-    is_slide: np.ndarray
+    joints: list[int]  # ids, in the order of their dofs
+    bodies: list[int]  # of the points: all anchors, then all tips
+    positions: np.ndarray  # (2 J, 3), m, in the body's frame
+    is_slide: np.ndarray  # (J,): 1 for a slide, 0 for a hinge
 
     @classmethod
     def of(cls, model: mujoco.MjModel, base: Base) -> "JointAxes":

@@ -72,7 +72,7 @@ class PointKinematics(nn.Module):
         _keep(self, points=np.asarray(positions).reshape(-1, 3))
 
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions and velocities of the points relative to the base frame.
+        """Positions and velocities of the points, as seen from the base; both in B_t.
 
         Where there are fewer velocities than positions, the first positions have one.
 
@@ -81,8 +81,7 @@ class PointKinematics(nn.Module):
             qvel: ``(*moving, nv)``, float64; of no rows where only positions are wanted.
 
         Returns:
-            positions ``(*batch, P, 3)``, m, and velocities ``(*moving, P, 3)``, m/s, as
-            seen by an observer who rides on the base; both in B_t.
+            positions ``(*batch, P, 3)``, m, and velocities ``(*moving, P, 3)``, m/s.
         """
         q, v = (x.reshape(-1, x.shape[-1]).T.contiguous() for x in (qpos, qvel))
         zero, still = q.new_zeros(3, 1, 1), v.new_zeros(3, 1, min(1, v.shape[-1]))

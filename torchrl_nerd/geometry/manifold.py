@@ -28,19 +28,12 @@ FREE, BALL, SLIDE, HINGE = (
 
 @dataclass(frozen=True)
 class JointLayout:
-    """Where each joint lives in ``qpos`` and ``qvel``.
-
-    | field | meaning |
-    |---|---|
-    | ``nq``, ``nv`` | lengths of ``qpos`` and ``qvel`` |
-    | ``linear`` | (qpos address, dof address) of every entry that adds like a number |
-    | ``rotations`` | (qpos address of the quaternion, dof address), ball and free joints |
-    """
+    """Where each joint lives in ``qpos`` and ``qvel``: (qpos address, dof address)."""
 
     nq: int
     nv: int
-    linear: tuple[tuple[int, int], ...]
-    rotations: tuple[tuple[int, int], ...]
+    linear: tuple[tuple[int, int], ...]  # of every entry that adds like a number
+    rotations: tuple[tuple[int, int], ...]  # of every quaternion
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel) -> "JointLayout":

@@ -39,10 +39,8 @@ class _Inertia(NamedTuple):
 class RigidBodyDynamics(nn.Module):
     """Acceleration of a robot without contacts and limits.
 
-    | attribute | meaning |
-    |---|---|
-    | ``bodies`` | of the points that it needs: four of every body with mass |
-    | ``positions`` | ``(4 B, 3)``, m, in the body's frame |
+    It needs the points ``positions (4 B, 3)``, m, of ``bodies``: four of every body with
+    mass, in the body's frame.
 
     Args:
         model: compiled.

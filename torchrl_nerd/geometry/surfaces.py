@@ -89,17 +89,10 @@ SHAPES: dict[int, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
 def into_frame(
     points: Tensor, position: Tensor, rotation: Tensor, origin: Tensor, axes: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Points of one frame as another frame sees them.
+    """Points of the frame (position, rotation) as the frame (origin, axes) sees them.
 
-    The two frames' difference comes first, so that a robot far from the world's origin
-    loses no digits to it.
-
-    Args:
-        points: ``(*batch, P, 3)``, m, in the frame (position, rotation).
-        position: ``(*batch, 3)``, m, of the points' frame in the world.
-        rotation: ``(*batch, 3, 3)``, axes of the points' frame in the world.
-        origin: ``(*batch, 3)``, m, of the other frame in the world.
-        axes: ``(*batch, 3, 3)``, axes of the other frame in the world.
+    Both frames are given in the world, ``(*batch, 3)``, m, and ``(*batch, 3, 3)``. Their
+    difference comes first, so that a robot far from the world's origin loses no digits.
 
     Returns:
         The points, and the rotation ``(*batch, 3, 3)`` that took them there: for a normal
@@ -120,12 +113,8 @@ def height_field_distance(
     (negative distance) where it lies below the surface, at any depth. Beside the field
     nothing is inside: the solid base and the sides that MuJoCo gives it are no ground.
 
-    Args:
-        points: ``(*batch, P, 3)``, m, in the field's frame.
-        heights: ``(rows, columns)``, m; rows along y, columns along x.
-        half_x: half the field's length along x, m.
-        half_y: half the field's length along y, m.
-        reach: cells within this distance of a point (horizontally) are looked at, m.
+    ``heights (rows, columns)``, m: rows along y over ``2 half_y`` m, columns along x over
+    ``2 half_x`` m. Cells within ``reach`` of a point (horizontally) are looked at.
     """
     rows, columns = heights.shape
     dx, dy = 2.0 * half_x / (columns - 1), 2.0 * half_y / (rows - 1)

@@ -13,16 +13,10 @@ import mujoco
 import numpy as np
 
 from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.rotations import quat_matrix
 
 MARGIN_PER_RADIUS = 4.0  # paper, appendix A: xi = max(4 thickness, 0.1 m)
 MIN_MARGIN = 0.1  # m
-
-SPHERE, CAPSULE, BOX = (
-    int(mujoco.mjtGeom.mjGEOM_SPHERE),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
-    int(mujoco.mjtGeom.mjGEOM_BOX),
-)
-
 
 NO_CONTACT = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -31,22 +25,13 @@ NO_CONTACT = (
 
 @dataclass(frozen=True)
 class ContactPoints:
-    """Contact points after merging.
+    """Contact points after merging."""
 
-    | field | meaning |
-    |---|---|
-    | ``bodies`` | body id of each point |
-    | ``positions`` | ``(P, 3)``, m, body frame |
-    | ``radii`` | ``(P,)``, m: a point at this distance from the ground touches it |
-    | ``margins`` | ``(P,)``, m: xi, the distance beyond which a point has no features |
-    | ``stands_for`` | of every point that the shapes have: which one here, -1 for none |
-    """
-
-    bodies: list[int]
-    positions: np.ndarray
-    radii: np.ndarray
-    margins: np.ndarray
-    stands_for: list[int]
+    bodies: list[int]  # body id of each point
+    positions: np.ndarray  # (P, 3), m, body frame
+    radii: np.ndarray  # (P,), m: a point at this distance from the ground touches it
+    margins: np.ndarray  # (P,), m: xi, distance beyond which a point has no features
+    stands_for: list[int]  # of every point of the shapes: which one here, -1 for none
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -71,12 +56,11 @@ def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
     bodies, positions, radii = shape_points(model)
     leaders = _leaders(model, base, bodies, positions, radii)
     kept = sorted(set(leaders) - {-1})
-    radius = radii[kept]
     return ContactPoints(
         bodies=[bodies[i] for i in kept],
         positions=positions[kept],
-        radii=radius,
-        margins=np.maximum(MARGIN_PER_RADIUS * radius, MIN_MARGIN),
+        radii=radii[kept],
+        margins=np.maximum(MARGIN_PER_RADIUS * radii[kept], MIN_MARGIN),
         stands_for=[kept.index(i) if i >= 0 else -1 for i in leaders],
     )
 
@@ -90,9 +74,7 @@ def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarr
     Raises:
         ValueError: a shape is none of sphere, capsule, box.
     """
-    bodies: list[int] = []
-    positions: list[np.ndarray] = []
-    radii: list[float] = []
+    bodies, positions, radii = [], [], []
     grounds = ground_geoms(model)
     for geom in _moving_geoms(model):
         if any(_collide(model, geom, ground) for ground in grounds):
@@ -107,13 +89,13 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
     """Static or mocap shapes that something moving can touch."""
     if model.opt.disableflags & NO_CONTACT:
         return []
-    moving, grounds = _moving_geoms(model), []
-    for geom in range(model.ngeom):
-        weld = model.body_weldid[model.geom_bodyid[geom]]
-        if weld == 0 or model.body_mocapid[weld] >= 0:
-            if any(_collide(model, geom, other) for other in moving):
-                grounds.append(geom)
-    return grounds
+    moving, weld = _moving_geoms(model), model.body_weldid[model.geom_bodyid]
+    is_ground = (weld == 0) | (model.body_mocapid[weld] >= 0)
+    return [
+        geom
+        for geom in np.flatnonzero(is_ground).tolist()
+        if any(_collide(model, geom, other) for other in moving)
+    ]
 
 
 def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
@@ -137,9 +119,15 @@ def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return pairs
 
 
+def geom_label(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
+    """Name of a geom, or its number, and its kind, for messages."""
+    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+    return f"geom '{model.geom(geom).name or geom}'", kind
+
+
 def _moving_geoms(model: mujoco.MjModel) -> list[int]:
-    welds = (model.body_weldid[body] for body in model.geom_bodyid)
-    return [geom for geom, weld in enumerate(welds) if model.body_dofnum[weld]]
+    weld = model.body_weldid[model.geom_bodyid]
+    return np.flatnonzero(model.body_dofnum[weld]).tolist()
 
 
 def _collide(model: mujoco.MjModel, geom: int, other: int) -> bool:
@@ -148,22 +136,21 @@ def _collide(model: mujoco.MjModel, geom: int, other: int) -> bool:
 
 
 def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
-    size, kind = model.geom_size[geom], int(model.geom_type[geom])
-    if kind == SPHERE:
+    """Points ``(n, 3)``, m, body frame, and radius, m."""
+    size, (name, kind) = model.geom_size[geom], geom_label(model, geom)
+    if kind == "sphere":
         local, radius = np.zeros((1, 3)), size[0]
-    elif kind == CAPSULE:
+    elif kind == "capsule":
         local, radius = np.array([[0, 0, size[1]], [0, 0, -size[1]]]), size[0]
-    elif kind == BOX:
+    elif kind == "box":
         local, radius = np.array(list(product((-1, 1), repeat=3))) * size, 0.0
     else:
-        name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
         raise ValueError(
-            f"geom '{model.geom(geom).name or geom}' that can touch the ground is a "
-            f"{name}; expected sphere, capsule or box"
+            f"{name} that can touch the ground is a {kind}; expected sphere, capsule or "
+            "box"
         )
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
-    return local @ matrix.reshape(3, 3).T + model.geom_pos[geom], float(radius)
+    turn = quat_matrix(model.geom_quat[geom])
+    return local @ turn.T + model.geom_pos[geom], float(radius)
 
 
 def _leaders(
@@ -179,11 +166,8 @@ def _leaders(
     for _ in range(4):
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
         mujoco.mj_kinematics(model, data)
-        world = [
-            data.xpos[b] + data.xmat[b].reshape(3, 3) @ p
-            for b, p in zip(bodies, positions, strict=True)
-        ]
-        tracks.append(np.array(world).reshape(-1, 3))
+        turns = data.xmat[bodies].reshape(-1, 3, 3)
+        tracks.append(data.xpos[bodies] + (turns @ positions[..., None])[..., 0])
     track = np.stack(tracks, 1)  # (P, poses, 3)
     leaders: list[int] = []
     for i in range(len(bodies)):

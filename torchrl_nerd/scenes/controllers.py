@@ -3,11 +3,19 @@
 A controller is a function of the action and the state; a new one needs no new model.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+import mujoco
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
+
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+
+Row = tuple[float, ...]
+UNLIMITED = 1e300  # N or N m: finite, so that the card of a data set can hold it
 
 
 class Controller(Protocol):
@@ -31,7 +39,7 @@ class TorqueController:
         gain: N or N m per unit of action, one per actuated dof.
     """
 
-    gain: tuple[float, ...]
+    gain: Row
 
     @property
     def num_actions(self) -> int:
@@ -66,12 +74,12 @@ class PDController:
 
     qpos_addresses: tuple[int, ...]
     dof_addresses: tuple[int, ...]
-    kp: tuple[float, ...]
-    kd: tuple[float, ...]
-    scale: tuple[float, ...]
+    kp: Row
+    kd: Row
+    scale: Row
     relative_to: Literal["absolute", "default", "current"] = "absolute"
-    default: tuple[float, ...] | None = None
-    limit: tuple[float, ...] | None = None
+    default: Row | None = None
+    limit: Row | None = None
 
     def __post_init__(self) -> None:
         if self.relative_to == "default" and self.default is None:
@@ -90,10 +98,9 @@ class PDController:
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, num_actuated)``."""
-        position = qpos[..., self.qpos_addresses]
         target = action.to(qpos.dtype).clamp(-1.0, 1.0) * qpos.new_tensor(self.scale)
         if self.relative_to == "current":
-            target = target + position
+            target = target + qpos[..., self.qpos_addresses]
         elif self.relative_to == "default":
             target = target + qpos.new_tensor(self.default)
         return self.torque(target, qpos, qvel)
@@ -105,5 +112,145 @@ class PDController:
         torque = qpos.new_tensor(self.kp) * offset - qpos.new_tensor(self.kd) * velocity
         if self.limit is None:
             return torque
-        limit = qpos.new_tensor(self.limit)
-        return torch.minimum(torch.maximum(torque, -limit), limit)
+        return _clip(torque, [-limit for limit in self.limit], self.limit)
+
+
+@dataclass(frozen=True)
+class ActuatorController:
+    """The actuators of a MuJoCo model: motors, position and velocity servos.
+
+    An action of -1 to 1 spans an actuator's control range (-1 to 1 where it has none).
+    With the lengths l = ``length`` q and speeds v = ``moment`` qvel of the actuators,
+
+        force = clip((g0 + g1 l + g2 v) ctrl + b0 + b1 l + b2 v, force range)
+        torque = clip(moment^T force, torque range)
+
+    so several actuators on one joint add up. The torque is computed once and then held
+    over the control step; MuJoCo computes a servo's again at every substep. For motors
+    this is the same.
+    Source: https://mujoco.readthedocs.io/en/stable/computation/#actuation-model
+    """
+
+    dof_addresses: tuple[int, ...]  # the D driven dofs
+    qpos_addresses: tuple[int, ...]  # of the same joints
+    ctrl_low: Row  # control of each of the A actuators at action -1
+    ctrl_high: Row  # and at action 1
+    length: tuple[Row, ...]  # (A, D): gear, or gear times coefficient of a fixed tendon
+    moment: tuple[Row, ...]  # (A, D): the same, and the gears of ball joints
+    gain: tuple[Row, ...]  # (A, 3): g
+    bias: tuple[Row, ...]  # (A, 3): b
+    force_low: Row  # of each actuator
+    force_high: Row
+    torque_low: Row  # of each dof, N and N m
+    torque_high: Row
+
+    @classmethod
+    def from_model(cls, model: mujoco.MjModel) -> "ActuatorController":
+        """Read the actuators of a model that `check_supported` let pass."""
+        dofs = driven_dofs(model)
+        joints = model.dof_jntid[dofs]
+        moment = _actuator_moments(model)[:, dofs]
+        is_scalar = np.isin(model.jnt_type[joints], (HINGE, SLIDE))
+        gain, bias = model.actuator_gainprm[:, :3].copy(), model.actuator_biasprm[:, :3]
+        gain[model.actuator_gaintype != mujoco.mjtGain.mjGAIN_AFFINE, 1:] = 0.0
+        has_bias = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+        bias = np.where(has_bias[:, None], bias, 0.0)
+        is_torque_limited = model.jnt_actfrclimited[joints] * is_scalar
+        control = _ranges(model.actuator_ctrllimited, model.actuator_ctrlrange, 1.0)
+        force = model.actuator_forcelimited, model.actuator_forcerange
+        torque = is_torque_limited, model.jnt_actfrcrange[joints]
+        return cls(
+            tuple(dofs),
+            tuple(model.jnt_qposadr[joints].tolist()),
+            *control,
+            _rows(np.where(is_scalar, moment, 0.0)),
+            _rows(moment),
+            _rows(gain),
+            _rows(bias),
+            *_ranges(*force, UNLIMITED),
+            *_ranges(*torque, UNLIMITED),
+        )
+
+    @property
+    def num_actions(self) -> int:
+        """One per actuator."""
+        return len(self.ctrl_low)
+
+    @property
+    def is_motor(self) -> bool:
+        """True where no force depends on the state."""
+        pairs = zip(self.gain, self.bias, strict=True)
+        return not any(any(gain[1:] + bias) for gain, bias in pairs)
+
+    def ctrl(self, action: Tensor) -> Tensor:
+        """What MuJoCo's ``data.ctrl`` would be at an action, ``(*batch, A)``."""
+        low, high = action.new_tensor((self.ctrl_low, self.ctrl_high))
+        return torch.lerp(low, high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
+
+    def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
+        """Joint torques ``(*batch, D)``, in the dtype of qpos."""
+        shape = (self.num_actions, len(self.dof_addresses))
+        length, moment = (
+            qpos.new_tensor(x).reshape(shape) for x in (self.length, self.moment)
+        )
+        gain, bias = (  # three of (A,) each
+            qpos.new_tensor(x).reshape(self.num_actions, 3).unbind(-1)
+            for x in (self.gain, self.bias)
+        )
+        ctrl = self.ctrl(action.to(qpos.dtype))
+        stretch = qpos[..., self.qpos_addresses] @ length.mT  # (*batch, A)
+        speed = qvel[..., self.dof_addresses] @ moment.mT
+        force = (gain[0] + gain[1] * stretch + gain[2] * speed) * ctrl
+        force = force + bias[0] + bias[1] * stretch + bias[2] * speed
+        force = _clip(force, self.force_low, self.force_high)
+        return _clip(force @ moment, self.torque_low, self.torque_high)
+
+
+@dataclass(frozen=True)
+class RandomActions:
+    """Drives training trajectories of servos: a new uniform action every control step.
+
+    Uniform torques as large as a stiff servo's would throw the robot about as no servo
+    does.
+    """
+
+    controller: ActuatorController
+
+    def __call__(
+        self, qpos: Tensor, qvel: Tensor, scale: Tensor, generator: Generator
+    ) -> Tensor:
+        """Joint torques ``(rows, D)``, times each row's scale ``(rows, 1)``."""
+        size = (len(qpos), self.controller.num_actions)
+        u = torch.rand(size, dtype=torch.float64, generator=generator)
+        return scale * self.controller(2.0 * u - 1.0, qpos, qvel)
+
+
+def driven_dofs(model: mujoco.MjModel) -> list[int]:
+    """Distinct dofs that actuators act on, in the order of the actuators."""
+    _, dofs = np.nonzero(_actuator_moments(model))
+    return list(dict.fromkeys(dofs.tolist()))
+
+
+def _actuator_moments(model: mujoco.MjModel) -> np.ndarray:
+    """Generalised force per unit of actuator force ``(A, nv)``, at ``qpos0``."""
+    data, dense = mujoco.MjData(model), np.zeros((model.nu, model.nv))
+    mujoco.mj_fwdPosition(model, data)
+    if model.nu:
+        rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(dense, data.actuator_moment, *rows)
+    return dense
+
+
+def _ranges(is_limited: np.ndarray, ranges: np.ndarray, free: float) -> tuple[Row, Row]:
+    """Lower and upper limits, ``-free`` and ``free`` where there are none."""
+    limited = np.asarray(is_limited, bool)[:, None]
+    low, high = np.where(limited, ranges.reshape(-1, 2), (-free, free)).T
+    return tuple(low.tolist()), tuple(high.tolist())
+
+
+def _rows(matrix: np.ndarray) -> tuple[Row, ...]:
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def _clip(x: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
+    return torch.minimum(torch.maximum(x, x.new_tensor(low)), x.new_tensor(high))

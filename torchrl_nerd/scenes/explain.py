@@ -18,32 +18,23 @@ from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes.contact_points import ContactPoints
-from torchrl_nerd.scenes.silence import silence_mujoco
-from torchrl_nerd.scenes.support import unit_gravity
+from torchrl_nerd.scenes.support import DISABLE, silence_mujoco, unit_gravity
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
+LIMIT, CONTACT = int(DISABLE.mjDSBL_LIMIT), int(DISABLE.mjDSBL_CONTACT)
 
 Move = Callable[[mujoco.MjData, np.random.Generator], None]
 
 
 @dataclass(frozen=True)
 class Effect:
-    """How much a step of MuJoCo depends on one coordinate.
+    """How much a step of MuJoCo depends on one coordinate."""
 
-    | field | meaning |
-    |---|---|
-    | ``name`` | of the joint, or which coordinate of a floating base |
-    | ``key`` | ``qpos`` or ``qvel`` |
-    | ``address`` | in it |
-    | ``change`` | largest relative change of one control step when it alone is moved |
-    """
-
-    name: str
-    key: str
-    address: int
-    change: float
+    name: str  # of the joint, or which coordinate of a floating base
+    key: str  # "qpos" or "qvel"
+    address: int  # in it
+    change: float  # of one control step when it alone is moved: relative, at worst
 
     @property
     def is_ignored(self) -> bool:
@@ -53,59 +44,34 @@ class Effect:
 
 @dataclass(frozen=True)
 class Symmetries:
-    """Scalar coordinates (hinges and slides) that the free dynamics ignore.
+    """Scalar coordinates (hinges and slides), and which the dynamics ignore."""
 
-    | field | meaning |
-    |---|---|
-    | ``positions`` | qpos addresses |
-    | ``velocities`` | dof addresses |
-    | ``effects`` | what was measured of every hinge and slide |
-    """
+    effects: tuple[Effect, ...]
 
-    positions: frozenset[int]
-    velocities: frozenset[int]
-    effects: tuple[Effect, ...] = ()
+    @property
+    def positions(self) -> frozenset[int]:
+        """Addresses in qpos that are ignored."""
+        return self._ignored(QPOS)
+
+    @property
+    def velocities(self) -> frozenset[int]:
+        """Addresses in qvel that are ignored."""
+        return self._ignored(QVEL)
+
+    def _ignored(self, key: str) -> frozenset[int]:
+        found = (e for e in self.effects if e.key == key and e.is_ignored)
+        return frozenset(effect.address for effect in found)
 
 
 @dataclass(frozen=True)
 class SolverReport:
-    """What MuJoCo says about a scene; its text by ``print``.
-
-    | field | meaning |
-    |---|---|
-    | ``scene`` | its name |
-    | ``effects`` | of every hinge and slide, and of a floating base's pose |
-    | ``points_found`` | contact points of the robot's shapes |
-    | ``points_merged`` | of these, how many always coincide with another one |
-    | ``points_fixed`` | of these, how many no joint can move |
-    """
+    """What MuJoCo says about a scene; its text by ``print``."""
 
     scene: str
-    effects: tuple[Effect, ...]
-    points_found: int
-    points_merged: int
-    points_fixed: int
-
-    @classmethod
-    def of(
-        cls,
-        scene: str,
-        model: mujoco.MjModel,
-        base: Base,
-        substeps: int,
-        contacts: ContactPoints,
-        symmetries: "Symmetries",
-    ) -> "SolverReport":
-        """The report of a scene of that name, from its parts."""
-        fixed = contacts.stands_for.count(-1)
-        found = len(contacts.stands_for)
-        return cls(
-            scene=scene,
-            effects=base_effects(model, base, substeps) + symmetries.effects,
-            points_found=found,
-            points_merged=found - fixed - len(contacts),
-            points_fixed=fixed,
-        )
+    effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
+    points_found: int  # contact points of the robot's shapes
+    points_merged: int  # of these, how many always coincide with another one
+    points_fixed: int  # of these, how many no joint can move
 
     @property
     def points_kept(self) -> int:
@@ -134,22 +100,15 @@ def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
     One coordinate is moved and nothing else, so that only invariances of the
     dynamics pass; the ground stays where it is.
     """
-    free = _without(model, mujoco.mjtDisableBit.mjDSBL_LIMIT)
-    rng = np.random.default_rng(0)
+    free, rng = _without(model, LIMIT), np.random.default_rng(0)
     effects: list[Effect] = []
-    for joint in range(model.njnt):
-        if int(model.jnt_type[joint]) not in (SLIDE, HINGE):
-            continue
+    for joint in np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE))).tolist():
         name = model.joint(joint).name or f"joint {joint}"
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         for key, address in ((QPOS, q), (QVEL, v)):
             change = _largest_change(free, substeps, rng, _shift(key, address))
             effects.append(Effect(name, key, address, change))
-    return Symmetries(
-        frozenset(e.address for e in effects if e.key == QPOS and e.is_ignored),
-        frozenset(e.address for e in effects if e.key == QVEL and e.is_ignored),
-        tuple(effects),
-    )
+    return Symmetries(tuple(effects))
 
 
 def base_effects(
@@ -162,8 +121,8 @@ def base_effects(
     """
     if not base.is_floating:
         return ()
-    flags = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    free, rng, q = _without(model, flags), np.random.default_rng(0), base.qpos_address
+    free = _without(model, LIMIT | CONTACT)
+    rng, q = np.random.default_rng(0), base.qpos_address
     moves = {
         f"base {axis}": (q + i, _shift(QPOS, q + i)) for i, axis in enumerate("xyz")
     }
@@ -177,7 +136,7 @@ def base_effects(
 def _without(model: mujoco.MjModel, flags: int) -> mujoco.MjModel:
     """The model without some forces and without actuators: a torque is a torque."""
     free = copy.copy(model)
-    free.opt.disableflags |= flags | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    free.opt.disableflags |= flags | DISABLE.mjDSBL_ACTUATION
     return free
 
 
@@ -244,14 +203,10 @@ def _change(
     model: mujoco.MjModel, data: mujoco.MjData, substeps: int, base: Base | None
 ) -> np.ndarray:
     """Change of velocity ``(nv,)`` over one control step, in the base's axes at first."""
-    before = data.qvel.copy()
-    turn = np.eye(3)
-    if base is not None:
-        q = base.qpos_address + 3
-        turn = quat_matrix(data.qpos[q : q + 4])
+    velocity, pose = data.qvel.copy(), data.qpos.copy()
     mujoco.mj_step(model, data, substeps)
-    change = data.qvel - before
+    change = data.qvel - velocity
     if base is not None:
-        v = base.dof_address
-        change[v : v + 3] = turn.T @ change[v : v + 3]
+        q, v = base.qpos_address + 3, base.dof_address
+        change[v : v + 3] = quat_matrix(pose[q : q + 4]).T @ change[v : v + 3]
     return change

@@ -34,8 +34,8 @@ RARELY = {
 
 SOLVER = ("solver", "iterations", "noslip_iterations", "enableflags")  # no tolerances
 GROUND = (
-    *("geom_bodyid", "body_mocapid", "geom_dataid", "hfield_nrow", "hfield_ncol"),
-    *("hfield_adr",),
+    *("geom_bodyid", "body_mocapid", "geom_dataid"),
+    *("hfield_nrow", "hfield_ncol", "hfield_adr"),
 )
 """Of a ground that is more than one plane; a lone plane has nothing to say here."""
 NUMBERED = ("mesh", "hfield", "pair", "exclude")

@@ -1,66 +1,66 @@
 """Third-party robots: MJCF files, the dm_control suite, Gymnasium's MuJoCo environments.
 
-All give a compiled model and a control step; everything else is read from the model.
+All give a compiled model and a control step; the controller and the ranges of training
+follow from the model. Positions fill the joint limits (half a turn or a metre to both sides
+where there is none). Torques are the largest the actuators can give. A joint's speed is
+what its own torque reaches over half its range, less where its damping allows less, or else
+that at which what hangs on it arrives from a fall over twice its reach. A floating base
+starts anywhere above the ground up to twice the robot's reach, turned any way.
 """
 
 import ast
 import os
 import warnings
+from dataclasses import replace
 from importlib.util import find_spec
+from math import cos, pi, sin, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import mujoco
+import numpy as np
+import torch
 
-from torchrl_nerd.scenes.actuators import ActuatorController
-from torchrl_nerd.scenes.controllers import Controller
-from torchrl_nerd.scenes.ranges import default_sampling
-from torchrl_nerd.scenes.sampling import Sampling
-from torchrl_nerd.scenes.support import check_supported
+from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE
+from torchrl_nerd.scenes.contact_points import contact_points, ground_geoms
+from torchrl_nerd.scenes.controllers import ActuatorController, RandomActions
+from torchrl_nerd.scenes.sampling import BaseSampling, Sampling, uniform
 
 if TYPE_CHECKING:
     from dm_control.rl.control import Environment
 
 CONTROL_STEP = 0.02  # s, where nobody says
+FREE_SLIDE = 1.0  # m
+LEAST_REACH = 0.01  # m
+LEAST_SPEED = 1.0  # m/s or rad/s: where nothing falls and nothing pushes
+DRAWS = 4096  # of actions and states, to find the largest torques
 
 
-class Imported(NamedTuple):
-    """The fields of a `Scene`, in its order."""
-
-    name: str
-    model: mujoco.MjModel
-    substeps: int
-    controller: Controller
-    sampling: Sampling
-
-
-def import_mjcf(
-    path: str | Path, control_step: float | None = None, **ranges: Any
-) -> Imported:
-    """See `Scene.from_mjcf`.
+def read_mjcf(path: Path, control_step: float | None) -> tuple[mujoco.MjModel, int]:
+    """Model and substeps of an MJCF file, at a control step or the one nearest to 0.02 s.
 
     Raises:
-        ValueError: a control step of no whole number of timesteps; see `read_model`.
+        ValueError: in one sentence, no file, MuJoCo's complaint, or a control step of no
+            whole number of timesteps.
     """
-    model = compile_mjcf(Path(path))
+    if not path.is_file():
+        raise ValueError(f"expected an MJCF file, found none at {path}")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        complaint = " ".join(str(error).split())
+        raise ValueError(f"MuJoCo cannot compile {path}: {complaint}") from None
     timestep = model.opt.timestep
     if control_step is None:
-        control_step = timestep * max(1, round(CONTROL_STEP / timestep))
+        return model, max(1, round(CONTROL_STEP / timestep))
     substeps = round(control_step / timestep)
     if substeps < 1 or abs(substeps * timestep - control_step) > 1e-9:
         raise ValueError(
             f"expected a control step of whole timesteps of {timestep} s, "
             f"got {control_step} s"
         )
-    return read_model(str(path), model, substeps, ranges)
-
-
-def import_dm_control(domain: str, task: str, **ranges: Any) -> Imported:
-    """See `Scene.from_dm_control`."""
-    env = load_suite(domain, task)
-    model = env.physics.model.ptr
-    substeps = round(env.control_timestep() / model.opt.timestep)
-    return read_model(f"dm_control/{domain}-{task}", model, substeps, ranges)
+    return model, substeps
 
 
 def load_suite(domain: str, task: str) -> "Environment":
@@ -84,41 +84,6 @@ def load_suite(domain: str, task: str) -> "Environment":
     return suite.load(domain, task, task_kwargs={"random": 0})
 
 
-def import_gymnasium(env_id: str, **ranges: Any) -> Imported:
-    """See `Scene.from_gymnasium`."""
-    path, frame_skip = gymnasium_file(env_id)
-    return read_model(f"gymnasium/{env_id}", compile_mjcf(path), frame_skip, ranges)
-
-
-def read_model(
-    name: str, model: mujoco.MjModel, substeps: int, ranges: dict[str, Any]
-) -> Imported:
-    """A scene's parts from a compiled model.
-
-    Raises:
-        ValueError: the model has something that is not supported (named).
-    """
-    check_supported(name, model)
-    controller = ActuatorController.from_model(model)
-    sampling = default_sampling(model, controller, **ranges)
-    return Imported(name, model, substeps, controller, sampling)
-
-
-def compile_mjcf(path: Path) -> mujoco.MjModel:
-    """The model in an MJCF file.
-
-    Raises:
-        ValueError: in one sentence, no file, or MuJoCo's complaint.
-    """
-    if not path.is_file():
-        raise ValueError(f"expected an MJCF file, found none at {path}")
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        complaint = " ".join(str(error).split())
-        raise ValueError(f"MuJoCo cannot compile {path}: {complaint}") from None
-
-
 def gymnasium_file(env_id: str) -> tuple[Path, int]:
     """MJCF file and frame skip of a registered environment.
 
@@ -136,7 +101,7 @@ def gymnasium_file(env_id: str) -> tuple[Path, int]:
     if env_id not in registry:
         raise ValueError(f"unknown environment '{env_id}' of Gymnasium")
     spec = registry[env_id]
-    settings, source = _constructor_defaults(spec.entry_point)
+    settings, source = _constructor_defaults(str(spec.entry_point))
     settings |= spec.kwargs
     if not {"xml_file", "frame_skip"} <= settings.keys():
         raise ValueError(
@@ -147,27 +112,140 @@ def gymnasium_file(env_id: str) -> tuple[Path, int]:
     return source.parent / "assets" / file, int(settings["frame_skip"])
 
 
-def _constructor_defaults(entry_point: object) -> tuple[dict[str, Any], Path]:
-    """Default arguments of the class at ``module:Class``, and its source file."""
-    if not isinstance(entry_point, str):
-        return {}, Path()
+def _constructor_defaults(entry_point: str) -> tuple[dict[str, Any], Path]:
+    """Plain default arguments of the class at ``module:Class``, and its source file."""
     module, _, name = entry_point.partition(":")
     package, *rest = module.split(".")
     found = find_spec(package)
     folders = found.submodule_search_locations if found else None
     source = Path(folders[0], *rest).with_suffix(".py") if folders else Path()
-    if not source.is_file():
-        return {}, source
-    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ClassDef) and node.name == name:
-            for part in node.body:
-                if isinstance(part, ast.FunctionDef) and part.name == "__init__":
-                    return _defaults(part.args), source
-    return {}, source
+    tree = ast.parse(source.read_text(encoding="utf-8") if source.is_file() else "")
+    defaults = {}
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.ClassDef) or node.name != name:
+            continue
+        for part in node.body:
+            if isinstance(part, ast.FunctionDef) and part.name == "__init__":
+                names, values = part.args.args, part.args.defaults
+                pairs = zip(names[len(names) - len(values) :], values, strict=True)
+                plain = ((n.arg, v) for n, v in pairs if isinstance(v, ast.Constant))
+                defaults = {n: v.value for n, v in plain}
+    return defaults, source
 
 
-def _defaults(args: ast.arguments) -> dict[str, Any]:
-    """Plain default values of a function's arguments."""
-    names = [arg.arg for arg in args.args][len(args.args) - len(args.defaults) :]
-    pairs = zip(names, args.defaults, strict=True)
-    return {n: value.value for n, value in pairs if isinstance(value, ast.Constant)}
+def default_sampling(
+    model: mujoco.MjModel, controller: ActuatorController, **ranges: Any
+) -> Sampling:
+    """Sampling ranges from limits and strengths of a compiled model.
+
+    Args:
+        model: compiled.
+        controller: of its actuators.
+        ranges: fields of `Sampling` to use in place of the default ones.
+    """
+    base = Base.from_model(model)
+    skipped_q, skipped_v = (7, 6) if base.is_floating else (0, 0)
+    low, high = (tuple(x.tolist()) for x in _positions(model))
+    torque = _largest_torques(model, controller, low, high)
+    speed = _speeds(model, controller, torque).tolist()
+    sampling = Sampling(
+        qpos_low=low[skipped_q:],
+        qpos_high=high[skipped_q:],
+        qvel_low=tuple(-v for v in speed[skipped_v:]),
+        qvel_high=tuple(speed[skipped_v:]),
+        torque=tuple(torque),
+        base=_base_sampling(model, speed) if base.is_floating else None,
+        drive=None if controller.is_motor else RandomActions(controller),
+        clearance=0.0 if len(contact_points(model, base)) else None,
+    )
+    return replace(sampling, **ranges)
+
+
+def _positions(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest ``qpos``; ball joints as quaternions yet to be normalised."""
+    low, high = model.qpos0.copy(), model.qpos0.copy()
+    for joint in range(model.njnt):
+        q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
+        limits, is_limited = model.jnt_range[joint], bool(model.jnt_limited[joint])
+        if kind == BALL:  # (c, s u) with u in the unit cube turns by its limit at most
+            half = min(limits[1], pi) / 2.0 if is_limited else pi / 2.0
+            side = sin(half) / sqrt(3.0)
+            low[q : q + 4] = (cos(half), -side, -side, -side)
+            high[q : q + 4] = (cos(half), side, side, side)
+        elif kind != FREE:
+            free = pi if kind == HINGE else FREE_SLIDE
+            low[q] = limits[0] if is_limited else low[q] - free
+            high[q] = limits[1] if is_limited else high[q] + free
+    return low, high
+
+
+def _largest_torques(
+    model: mujoco.MjModel, controller: ActuatorController, low: tuple, high: tuple
+) -> list[float]:
+    """Largest torque of each driven dof, at rest and at full action to either side."""
+    generator = torch.Generator().manual_seed(0)
+    qpos = uniform(low, high, DRAWS, generator)
+    sides = uniform((-1.0,) * model.nu, (1.0,) * model.nu, DRAWS, generator).sign()
+    torque = controller(sides, qpos, qpos.new_zeros(DRAWS, model.nv))
+    return torque.abs().amax(0).tolist()
+
+
+def _speeds(
+    model: mujoco.MjModel, controller: ActuatorController, torque: list[float]
+) -> np.ndarray:
+    """Largest speed of every dof, m/s or rad/s, to three digits."""
+    gravity, reach = float(np.linalg.norm(model.opt.gravity)), _reaches(model)
+    strength = dict(zip(controller.dof_addresses, torque, strict=True))
+    speeds = np.empty(model.nv)
+    for dof in range(model.nv):
+        joint = int(model.dof_jntid[dof])
+        kind = int(model.jnt_type[joint])
+        is_linear = kind == SLIDE
+        is_linear |= kind == FREE and dof < model.jnt_dofadr[joint] + 3
+        fall = 2.0 * sqrt(gravity * reach[joint])  # over twice the reach
+        speed = fall if is_linear else fall / max(reach[joint], LEAST_REACH)
+        if dof in strength:
+            width = 2.0 * (FREE_SLIDE if kind == SLIDE else pi)
+            if model.jnt_limited[joint] and kind != BALL:
+                width = float(np.ptp(model.jnt_range[joint]))
+            pushed = sqrt(strength[dof] * width / model.dof_M0[dof])
+            if model.dof_damping[dof] > 0.0:
+                pushed = min(pushed, strength[dof] / model.dof_damping[dof])
+            speed = max(speed, pushed)
+        speeds[dof] = float(f"{max(speed, LEAST_SPEED):.3g}")
+    return speeds
+
+
+def _reaches(model: mujoco.MjModel) -> list[float]:
+    """Distance from each joint to the far end of all that hangs on it, m."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    reaches = [0.0] * model.njnt
+    for geom in range(model.ngeom):
+        body = int(model.geom_bodyid[geom])
+        while body:  # every joint between the shape and the world
+            start = int(model.body_jntadr[body])
+            for joint in range(start, start + int(model.body_jntnum[body])):
+                offset = data.geom_xpos[geom] - data.xanchor[joint]
+                reach = float(np.linalg.norm(offset) + model.geom_rbound[geom])
+                reaches[joint] = max(reaches[joint], reach)
+            body = int(model.body_parentid[body])
+    return reaches
+
+
+def _base_sampling(model: mujoco.MjModel, speed: list[float]) -> BaseSampling:
+    """Start of a floating base, whose joint is the model's first."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    heights = [float(data.geom_xpos[geom, 2]) for geom in ground_geoms(model)]
+    ground = min(heights, default=0.0)
+    linear, angular = (tuple(speed[a : a + 3]) for a in (0, 3))
+    return BaseSampling(
+        low=(0.0, 0.0, ground),
+        high=(0.0, 0.0, ground + 2.0 * _reaches(model)[0]),
+        tilt=pi,
+        linear_low=tuple(-v for v in linear),
+        linear_high=linear,
+        angular_low=tuple(-v for v in angular),
+        angular_high=angular,
+    )

@@ -100,19 +100,12 @@ def set_penalty_limit(
 
 @dataclass(frozen=True)
 class PenaltyLaw:
-    """Penalty law of each contact, read from a compiled model.
+    """Penalty law of each contact, read from a compiled model."""
 
-    | field | meaning |
-    |---|---|
-    | ``stiffness``, ``damping`` | along the normal, N/m and N s/m |
-    | ``slip`` | tangential damping below the friction limit, N s/m |
-    | ``friction`` | Coulomb coefficient |
-    """
-
-    stiffness: np.ndarray
-    damping: np.ndarray
-    slip: np.ndarray
-    friction: np.ndarray
+    stiffness: np.ndarray  # along the normal, N/m
+    damping: np.ndarray  # along the normal, N s/m
+    slip: np.ndarray  # tangential damping below the friction limit, N s/m
+    friction: np.ndarray  # Coulomb coefficient
 
     @classmethod
     def of_bodies(cls, model: mujoco.MjModel, bodies: list[int]) -> "PenaltyLaw":

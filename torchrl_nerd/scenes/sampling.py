@@ -8,7 +8,13 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from torchrl_nerd.geometry.rotations import quat_multiply, random_tilt, rotate
+from torchrl_nerd.geometry.manifold import JointLayout
+from torchrl_nerd.geometry.rotations import (
+    quat_multiply,
+    quat_normalize,
+    random_tilt,
+    rotate,
+)
 
 GroundSampler = Callable[[Tensor, Generator], Tensor]
 """``(qpos (n, nq), generator) -> terrain (n, terrain.size)``."""
@@ -19,32 +25,22 @@ Drive = Callable[[Tensor, Tensor, Tensor, Generator], Tensor]
 Starts = Callable[[int, Generator], dict[str, Tensor]]
 """``(rows, generator) -> qpos (rows, nq), qvel (rows, nv)``, perhaps ``terrain``."""
 
-Triple = tuple[float, float, float]
+Row = tuple[float, ...]
+MAX_REDRAWS = 300  # of states that are not clear of the ground
 
 
 @dataclass(frozen=True)
 class BaseSampling:
-    """Where a floating base starts.
+    """Where a floating base starts."""
 
-    | field | meaning |
-    |---|---|
-    | ``low``, ``high`` | position of the base, m, world |
-    | ``tilt`` | turned by U(-1, 1) times this angle (rad) about a random axis |
-    | ``linear_low``, ``linear_high`` | velocity of its origin, m/s, base frame |
-    | ``angular_low``, ``angular_high`` | angular velocity, rad/s, base frame |
-    | ``quat`` | the orientation that is turned, wxyz |
-
-    The axis is a normalised U(-1, 1)^3, as in the reference code.
-    """
-
-    low: Triple
-    high: Triple
-    tilt: float
-    linear_low: Triple
-    linear_high: Triple
-    angular_low: Triple
-    angular_high: Triple
-    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    low: Row  # position of the base, m, world
+    high: Row
+    tilt: float  # turned by U(-1, 1) times this angle (rad), see `random_tilt`
+    linear_low: Row  # velocity of its origin, m/s, base frame
+    linear_high: Row
+    angular_low: Row  # rad/s, base frame
+    angular_high: Row
+    quat: Row = (1.0, 0.0, 0.0, 0.0)  # the orientation that is turned, wxyz
 
     def draw(self, rows: int, generator: Generator) -> tuple[Tensor, Tensor]:
         """``qpos (rows, 7)`` and ``qvel (rows, 6)`` of the free joint, float64."""
@@ -89,11 +85,11 @@ class Sampling:
             beside a ``drive``, whose torques follow the state.
     """
 
-    qpos_low: tuple[float, ...]
-    qpos_high: tuple[float, ...]
-    qvel_low: tuple[float, ...]
-    qvel_high: tuple[float, ...]
-    torque: tuple[float, ...]
+    qpos_low: Row
+    qpos_high: Row
+    qvel_low: Row
+    qvel_high: Row
+    torque: Row
     base: BaseSampling | None = None
     ground: GroundSampler | None = None
     level_ground: GroundSampler | None = None
@@ -106,23 +102,21 @@ class Sampling:
     correlation_time: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.min_torque_scale is not None and not 0.0 < self.min_torque_scale <= 1.0:
+        least, times = self.min_torque_scale, self.correlation_time
+        if least is not None and not 0.0 < least <= 1.0:
             raise ValueError(
-                "expected a min_torque_scale above 0 and up to 1, got "
-                f"{self.min_torque_scale}"
+                f"expected a min_torque_scale above 0 and up to 1, got {least}"
             )
-        if self.correlation_time is not None:
-            low, high = self.correlation_time
-            if not 0.0 < low <= high:
-                raise ValueError(
-                    f"expected two correlation times above 0 s, the lower first, got "
-                    f"{self.correlation_time}"
-                )
-            if self.drive is not None:
-                raise ValueError(
-                    "expected a correlation time or a drive, got both: a drive's torques "
-                    "follow the state"
-                )
+        if times is not None and not 0.0 < times[0] <= times[1]:
+            raise ValueError(
+                "expected two correlation times above 0 s, the lower first, got "
+                f"{times}"
+            )
+        if times is not None and self.drive is not None:
+            raise ValueError(
+                "expected a correlation time or a drive, got both: a drive's torques "
+                "follow the state"
+            )
 
     def ranges(self) -> dict[str, Any]:
         """What cards say: every field that is set, but for functions."""
@@ -132,13 +126,80 @@ class Sampling:
         return {k: v for k, v in found.items() if v is not None and not callable(v)}
 
 
-def uniform(
-    low: tuple[float, ...], high: tuple[float, ...], rows: int, generator: Generator
-) -> Tensor:
+def draw_initial(
+    sampling: Sampling,
+    layout: JointLayout,
+    rows: int,
+    generator: Generator,
+    clearances: Callable[[Tensor], Tensor],
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Initial states and each one's torque scale ``(rows, 1)``; see `Scene.sample_initial`.
+
+    ``clearances``: of ``qpos (n, nq)``, gaps of contact points to the ground ``(n, P)``, m.
+
+    Raises:
+        ValueError: no state within the ranges is clear of the ground.
+    """
+    if sampling.starts is not None:
+        state = dict(sampling.starts(rows, generator))
+        torque_scale, _ = sample_scale(sampling, rows, generator)
+    else:
+        qpos, qvel = _draw_clear(sampling, layout, rows, generator, clearances)
+        torque_scale, speed_scale = sample_scale(sampling, rows, generator)
+        state = {"qpos": qpos, "qvel": speed_scale * qvel}
+    if sampling.ground is not None and "terrain" not in state:
+        state["terrain"] = sampling.ground(state["qpos"], generator)
+    return state, torque_scale
+
+
+def _draw_clear(
+    sampling: Sampling,
+    layout: JointLayout,
+    rows: int,
+    generator: Generator,
+    clearances: Callable[[Tensor], Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Positions and velocities within the ranges, clear of the ground."""
+    qpos, qvel = _draw(sampling, layout, rows, generator)
+    if sampling.clearance is None:
+        return qpos, qvel
+    for _ in range(MAX_REDRAWS):
+        is_low = clearances(qpos).amin(-1) < sampling.clearance
+        if not is_low.any():
+            return qpos, qvel
+        again = _draw(sampling, layout, int(is_low.sum()), generator)
+        qpos[is_low], qvel[is_low] = again
+    raise ValueError(
+        f"expected ranges with states clear of the ground, found none in {MAX_REDRAWS} "
+        "draws: give others, or clearance=None"
+    )
+
+
+def _draw(
+    sampling: Sampling, layout: JointLayout, rows: int, generator: Generator
+) -> tuple[Tensor, Tensor]:
+    """Positions and velocities within the ranges."""
+    qpos = uniform(sampling.qpos_low, sampling.qpos_high, rows, generator)
+    qvel = uniform(sampling.qvel_low, sampling.qvel_high, rows, generator)
+    if sampling.base is not None:
+        base_pos, base_vel = sampling.base.draw(rows, generator)
+        qpos, qvel = torch.cat((base_pos, qpos), -1), torch.cat((base_vel, qvel), -1)
+    for q, _ in layout.rotations:
+        qpos[:, q : q + 4] = quat_normalize(qpos[:, q : q + 4])
+    return qpos, qvel
+
+
+def uniform(low: Row, high: Row, rows: int, generator: Generator) -> Tensor:
     """Independent uniform numbers ``(rows, len(low))``, float64."""
     a, b = torch.tensor([low, high], dtype=torch.float64)
     u = torch.rand(rows, len(low), dtype=torch.float64, generator=generator)
     return a + (b - a) * u
+
+
+def log_uniform(low: float, high: float, rows: int, generator: Generator) -> Tensor:
+    """Numbers ``(rows, 1)`` that are as likely in each octave, float64."""
+    u = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
+    return low * torch.exp(u * log(high / low))
 
 
 def sample_torque(
@@ -172,14 +233,8 @@ def sample_torques(
     walk = [noise[0]]
     for kick in noise[1:]:
         walk.append(keep * walk[-1] + (1.0 - keep**2).sqrt() * kick)
-    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)
+    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)  # (rows, steps, num_actuated)
     return scale[:, None] * share * share.new_tensor(sampling.torque)
-
-
-def log_uniform(low: float, high: float, rows: int, generator: Generator) -> Tensor:
-    """Numbers ``(rows, 1)`` that are as likely in each octave, float64."""
-    u = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
-    return low * torch.exp(u * log(high / low))
 
 
 def sample_scale(
@@ -191,11 +246,10 @@ def sample_scale(
     torque 0 in the zero-torque fraction; both U(0, 1) in the low-torque one.
     """
     draw = torch.rand(2, rows, 1, dtype=torch.float64, generator=generator)
-    one = torch.ones_like(draw[0])
+    loud = one = torch.ones_like(draw[0])
     is_passive = draw[0] < sampling.zero_torque_fraction
     is_quiet = draw[0] > 1.0 - sampling.low_torque_fraction
     speed = torch.where(is_quiet | is_passive, draw[1], one)
-    loud = one
     if sampling.min_torque_scale is not None:
         loud = log_uniform(sampling.min_torque_scale, 1.0, rows, generator)
     torque = torch.where(is_passive, 0.0 * one, torch.where(is_quiet, draw[1], loud))

@@ -9,35 +9,33 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
-from torchrl_nerd.scenes.actuators import driven_dofs
 from torchrl_nerd.scenes.contact_points import (
     ContactPoints,
     contact_points,
     ground_geoms,
 )
-from torchrl_nerd.scenes.controllers import Controller
+from torchrl_nerd.scenes.controllers import ActuatorController, Controller, driven_dofs
 from torchrl_nerd.scenes.explain import (
     SolverReport,
     Symmetries,
+    base_effects,
     find_symmetries,
 )
 from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
 from torchrl_nerd.scenes.importer import (
-    Imported,
-    import_dm_control,
-    import_gymnasium,
-    import_mjcf,
+    default_sampling,
+    gymnasium_file,
+    load_suite,
+    read_mjcf,
 )
-from torchrl_nerd.scenes.initial_states import draw_initial
-from torchrl_nerd.scenes.sampling import Sampling
+from torchrl_nerd.scenes.sampling import Sampling, draw_initial
 from torchrl_nerd.scenes.support import check_supported, unit_gravity
-from torchrl_nerd.scenes.terrain import Terrain
-from torchrl_nerd.scenes.terrain_distance import TerrainDistance
+from torchrl_nerd.scenes.terrain import Terrain, TerrainDistance
 
 REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's own
 
@@ -80,14 +78,15 @@ class Scene:
         Args:
             path: the file; also the scene's name.
             control_step: s; by default the whole number of timesteps nearest to 0.02 s.
-            ranges: fields of `Sampling` to use in place of those that follow from the
-                joints' limits and the actuators' strengths.
+            ranges: fields of `Sampling` in place of those that follow from the joints'
+                limits and the actuators' strengths.
 
         Raises:
-            ValueError: in one sentence, a file that is not there or does not compile, no
-                joint, or something that is not supported (named).
+            ValueError: a file that is not there or does not compile, or a robot with
+                something not supported (named).
         """
-        return cls._from(import_mjcf(path, control_step, **ranges))
+        parts = read_mjcf(Path(path), control_step)
+        return cls._from(str(path), *parts, ranges)
 
     @classmethod
     def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":
@@ -101,7 +100,10 @@ class Scene:
         Raises:
             ValueError: no such task, or a robot with something not supported (named).
         """
-        return cls._from(import_dm_control(domain, task, **ranges))
+        env = load_suite(domain, task)
+        model = env.physics.model.ptr
+        substeps = round(env.control_timestep() / model.opt.timestep)
+        return cls._from(f"dm_control/{domain}-{task}", model, substeps, ranges)
 
     @classmethod
     def from_gymnasium(cls, env_id: str, **ranges: Any) -> "Scene":
@@ -114,11 +116,18 @@ class Scene:
         Raises:
             ValueError: no such environment, or a robot with something not supported.
         """
-        return cls._from(import_gymnasium(env_id, **ranges))
+        path, frame_skip = gymnasium_file(env_id)
+        model, _ = read_mjcf(path, None)
+        return cls._from(f"gymnasium/{env_id}", model, frame_skip, ranges)
 
     @classmethod
-    def _from(cls, parts: Imported) -> "Scene":
-        scene = cls(*parts)
+    def _from(
+        cls, name: str, model: mujoco.MjModel, substeps: int, ranges: dict[str, Any]
+    ) -> "Scene":
+        check_supported(name, model)
+        controller = ActuatorController.from_model(model)
+        sampling = default_sampling(model, controller, **ranges)
+        scene = cls(name, model, substeps, controller, sampling)
         terrain = scene.terrain  # refuses a ground without features right away
         if terrain is not None and terrain.is_per_row and not scene.sampling.ground:
             raise ValueError(
@@ -142,11 +151,7 @@ class Scene:
 
     @cached_property
     def reference(self) -> "Scene":
-        """The reference solver's scene: MuJoCo's RK4, four substeps in one of its own.
-
-        A model trained on it steps as fast as any other and does not share the error of
-        the scene's own solver.
-        """
+        """The reference solver's scene: MuJoCo's RK4, four substeps in one of its own."""
         if self.reference_ratio > 1:
             return self
         rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
@@ -194,8 +199,7 @@ class Scene:
     def terrain_distance(self) -> TerrainDistance:
         """Distance to the ground, exact wherever a contact point has features.
 
-        Raises:
-            ValueError: the scene has no ground.
+        Raises ValueError where nothing can touch a ground.
         """
         if self.terrain is None:
             raise ValueError(f"nothing in scene '{self.name}' can touch a ground")
@@ -207,12 +211,17 @@ class Scene:
         return find_symmetries(self.model, self.substeps)
 
     def explain(self) -> SolverReport:
-        """Which coordinates and contact points are kept, found by stepping MuJoCo.
-
-        `torchrl_nerd.evaluation.explain.explain` adds features and what else is left out.
-        """
-        parts = self.model, self.base, self.substeps
-        return SolverReport.of(self.name, *parts, self.contacts, self.symmetries)
+        """Which coordinates and contact points are kept, found by stepping MuJoCo."""
+        found, kept = self.contacts.stands_for, len(self.contacts)
+        fixed = found.count(-1)
+        effects = base_effects(self.model, self.base, self.substeps)
+        return SolverReport(
+            scene=self.name,
+            effects=effects + self.symmetries.effects,
+            points_found=len(found),
+            points_merged=len(found) - fixed - kept,
+            points_fixed=fixed,
+        )
 
     @cached_property
     def hash(self) -> str:
@@ -226,20 +235,17 @@ class Scene:
 
     def sample_initial(
         self, rows: int, generator: Generator
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    ) -> tuple[dict[str, Tensor], Tensor]:
         """Initial states for training, and each row's torque scale ``(rows, 1)``.
 
         Returns:
             ``qpos (rows, nq)``, ``qvel (rows, nv)`` and, where the ground varies,
             ``terrain (rows, terrain.size)``, all float64.
         """
-        return draw_initial(
-            self.sampling, self.layout, rows, generator, self.clearances
-        )
+        ranges = self.sampling, self.layout
+        return draw_initial(*ranges, rows, generator, self.clearances)
 
-    def clearances(
-        self, qpos: torch.Tensor, terrain: torch.Tensor | None = None
-    ) -> torch.Tensor:
+    def clearances(self, qpos: Tensor, terrain: Tensor | None = None) -> Tensor:
         """Gap between every contact point's shape and the ground, m, ``(*batch, P)``.
 
         Args:
@@ -248,26 +254,21 @@ class Scene:
         """
         return self._ground(qpos, terrain)[0]
 
-    def place_on_terrain(
-        self, state: dict[str, torch.Tensor], gap: torch.Tensor
-    ) -> None:
+    def place_on_terrain(self, state: dict[str, Tensor], gap: Tensor) -> None:
         """Move floating bases, in place, to ``gap (rows,)`` m over the ground.
 
-        Along its normal at the lowest contact point; fixed bases and robots without contact
-        stay.
+        Along its normal at the lowest contact point.
         """
         if self.base.is_floating and self.terrain is not None:
             qpos, q = state["qpos"], self.base.qpos_address
             gaps, normals = self._ground(qpos, state.get("terrain"))
             lowest, point = gaps.min(-1)
-            normal = normals[torch.arange(len(qpos)), point]
+            normal = normals[torch.arange(len(qpos)), point]  # (rows, 3), in B_t
             _, rotation = self.base_pose(qpos)
             up = (rotation @ normal[..., None])[..., 0]
             qpos[:, q : q + 3] += (gap - lowest)[:, None] * up
 
-    def _ground(
-        self, qpos: torch.Tensor, terrain: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _ground(self, qpos: Tensor, terrain: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gap ``(*batch, P)``, m, and the ground's normal ``(*batch, P, 3)`` in B_t."""
         if self.terrain is None:
             none = qpos.new_zeros(*qpos.shape[:-1], 0)
@@ -278,7 +279,7 @@ class Scene:
         distance, normal = ground(points, terrain, *self.base_pose(qpos))
         return distance - self._radii.to(qpos), normal
 
-    def base_pose(self, qpos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
         position, rotation = self._pose.to(qpos.device)(qpos)
         return position.to(qpos), rotation.to(qpos)
@@ -289,7 +290,7 @@ class Scene:
         return BasePose(self.base, self.fixed_base_pose)
 
     @cached_property
-    def _radii(self) -> torch.Tensor:
+    def _radii(self) -> Tensor:
         return torch.as_tensor(self.contacts.radii)
 
     @cached_property

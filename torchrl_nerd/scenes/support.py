@@ -9,6 +9,7 @@ robot's own bodies.
 
 import copy
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -18,18 +19,27 @@ from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 
 JOINT, IN_PARENT, TENDON = (
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-    int(mujoco.mjtTrn.mjTRN_TENDON),
+    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}"))
+    for kind in ("JOINT", "JOINTINPARENT", "TENDON")
 )
 GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
 BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
-AFFINE = np.array([[GAINS[1]], [BIASES[1]]], int)
-NO_ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION
+DISABLE = mujoco.mjtDisableBit
 NOTHING = -1  # where another has the type of a joint
 
 Refusal = tuple[str, Any, Callable[[int], Any] | None]
 """What, a flag of the model or one per object, and how to get an object by its index."""
+
+
+@contextmanager
+def silence_mujoco() -> Iterator[None]:
+    """Neither warnings on the terminal nor a MUJOCO_LOG.TXT in the working folder."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def check_supported(name: str, model: mujoco.MjModel) -> None:
@@ -65,19 +75,13 @@ def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
     pulls = pulls + model.tendon_armature + model.tendon_limited
     pulls = pulls + abs(model.tendon_stiffnesspoly).sum(-1)
     pulls = pulls + abs(model.tendon_dampingpoly).sum(-1)
-    yield (
-        "a tendon with a limit, spring, damping, friction or mass",
-        pulls,
-        model.tendon,
-    )
+    what = "a tendon with a limit, spring, damping, friction or mass"
+    yield what, pulls, model.tendon
     yield "an equality constraint", np.ones(model.neq), model.equality
     yield "a flexible body", model.nflex, None
     yield "a plugin", model.nplugin, None
-    yield (
-        "a surface that moves under what stands on it",
-        model.geom_surfacevel.any(),
-        None,
-    )
+    slides = model.geom_surfacevel.any()
+    yield "a surface that moves under what stands on it", slides, None
     is_static = model.body_weldid[model.geom_bodyid] == 0
     paired = is_static[model.pair_geom1] | is_static[model.pair_geom2]
     yield "a contact pair with the ground", paired, model.pair
@@ -102,18 +106,17 @@ def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
     joint_kind = np.array([_kind_of_joint(model, i) for i in range(model.nu)], int)
     yield "an actuator on no joint or fixed tendon", joint_kind == NOTHING, get
     yield "an actuator on its free joint", joint_kind == FREE, get
-    is_affine = np.stack((model.actuator_gaintype, model.actuator_biastype)) == AFFINE
-    slopes = np.stack((model.actuator_gainprm[:, 1], model.actuator_biasprm[:, 1]))
-    reads_angle = (is_affine & (slopes != 0.0)).any(0)
-    reads_angle |= model.actuator_trntype == IN_PARENT
-    yield (
-        "an actuator that reads the angle of a ball joint",
-        reads_angle & (joint_kind == BALL),
-        get,
-    )
+    reads_angle = model.actuator_trntype == IN_PARENT
+    for types, affine, slopes in (
+        (model.actuator_gaintype, GAINS[1], model.actuator_gainprm[:, 1]),
+        (model.actuator_biastype, BIASES[1], model.actuator_biasprm[:, 1]),
+    ):
+        reads_angle = reads_angle | ((types == affine) & (slopes != 0.0))
+    reads_angle = reads_angle & (joint_kind == BALL)
+    yield "an actuator that reads the angle of a ball joint", reads_angle, get
     is_off = [bool(model.opt.disableactuator & 1 << g) for g in model.actuator_group]
     yield "a disabled actuator", is_off, get
-    all_off = model.nu and model.opt.disableflags & NO_ACTUATION
+    all_off = model.nu and model.opt.disableflags & DISABLE.mjDSBL_ACTUATION
     yield "actuators that are disabled", all_off, None
     yield "gravity compensation by actuators", model.jnt_actgravcomp, model.joint
 
@@ -138,8 +141,7 @@ def unit_gravity(model: mujoco.MjModel) -> np.ndarray:
 def _moves_alike_everywhere(model: mujoco.MjModel, base: Base) -> bool:
     """True where a free flight, moved and turned about gravity, stays the same."""
     flight = copy.copy(model)
-    for bit in ("CONTACT", "ACTUATION"):
-        flight.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}")
+    flight.opt.disableflags |= DISABLE.mjDSBL_CONTACT | DISABLE.mjDSBL_ACTUATION
     rng, yaw = np.random.default_rng(0), np.append(0.8, 0.6 * unit_gravity(model))
     q, v = base.qpos_address, base.dof_address
     data = mujoco.MjData(flight)

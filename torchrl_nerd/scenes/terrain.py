@@ -13,38 +13,42 @@ from functools import cached_property
 import mujoco
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchrl_nerd.geometry.rotations import quat_conjugate, quat_multiply, rotate
-from torchrl_nerd.geometry.surfaces import PLANE_PARAMETERS, SHAPES
-
-PLANE, HEIGHT_FIELD = (
-    int(mujoco.mjtGeom.mjGEOM_PLANE),
-    int(mujoco.mjtGeom.mjGEOM_HFIELD),
+from torchrl_nerd.geometry.base import keep_constants
+from torchrl_nerd.geometry.rotations import (
+    matrix_from_quat,
+    quat_conjugate,
+    quat_matrix,
+    quat_multiply,
+    quat_normalize,
+    rotate,
 )
+from torchrl_nerd.geometry.surfaces import (
+    PLANE_PARAMETERS,
+    SHAPES,
+    height_field_distance,
+    into_frame,
+    plane_distance,
+    plane_in_frame,
+)
+from torchrl_nerd.scenes.contact_points import geom_label
+
+PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+HEIGHT_FIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 POSE_PARAMETERS = 7
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One shape of the ground.
+    """One shape of the ground, in its mocap body's frame, or in the world if fixed."""
 
-    | field | meaning |
-    |---|---|
-    | ``kind`` | MuJoCo's geom type |
-    | ``size`` | ``(3,)``, m, MuJoCo's; of a height field half x, half y and height |
-    | ``position`` | ``(3,)``, m, in its mocap body's frame, or in the world if fixed |
-    | ``rotation`` | ``(3, 3)``, its axes in the same frame |
-    | ``mocap`` | MuJoCo's number of the mocap body that carries it, -1 if fixed |
-    | ``heights`` | of a height field ``(rows, columns)``, m; else None |
-    """
-
-    kind: int
-    size: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
-    mocap: int
-    heights: np.ndarray | None
+    kind: int  # MuJoCo's geom type
+    size: np.ndarray  # (3,), m, MuJoCo's; of a height field half x, half y and height
+    position: np.ndarray  # (3,), m
+    rotation: np.ndarray  # (3, 3)
+    mocap: int  # MuJoCo's number of the mocap body that carries it, -1 if fixed
+    heights: np.ndarray | None  # of a height field (rows, columns), m
 
     @property
     def plane(self) -> np.ndarray:
@@ -57,13 +61,9 @@ class Surface:
 class Terrain:
     """One or more surfaces; for every contact point the nearest one counts.
 
-    A contact point sees all of them: filters that let a shape of the robot touch only
-    some are not looked at.
+    Every contact point sees all of them, whatever the filters of its shape say.
 
-    | field | meaning |
-    |---|---|
-    | ``surfaces`` | the shapes |
-    | ``mocap_default`` | ``(mocap bodies, 7)``: poses as the file has them |
+    ``mocap_default (mocap bodies, 7)``: poses as the file has them.
     """
 
     surfaces: tuple[Surface, ...]
@@ -108,7 +108,7 @@ class Terrain:
         for mocap in self.parameters:
             plane, pose = self.plane_of(mocap), self.mocap_default[mocap]
             if plane is not None:
-                normal = rotation_matrix(pose[3:]) @ plane.plane[:3]
+                normal = quat_matrix(pose[3:]) @ plane.plane[:3]
                 pose = np.append(normal, plane.plane[3] + normal @ pose[:3])
             parts.append(pose)
         return np.concatenate(parts)
@@ -116,10 +116,9 @@ class Terrain:
     @property
     def fixed_plane(self) -> np.ndarray | None:
         """Unit normal and offset (m) ``(4,)`` where one fixed plane is all there is."""
-        lone = self.surfaces[0] if len(self.surfaces) == 1 else None
-        if lone is None or lone.mocap >= 0 or lone.kind != PLANE:
-            return None
-        return lone.plane
+        first = self.surfaces[0]
+        is_lone = len(self.surfaces) == 1 and first.mocap < 0 and first.kind == PLANE
+        return first.plane if is_lone else None
 
     def plane_of(self, mocap: int) -> Surface | None:
         """The plane that is all of a mocap body's ground, or None."""
@@ -131,24 +130,19 @@ class Terrain:
 
         In the order of MuJoCo's state vector: all positions, then all quaternions. A
         plane is turned the shortest way from z to its normal; mocap bodies that carry no
-        ground stay where the file has them.
+        ground stay where the file has them. Raises what `check` raises.
 
         Args:
             terrain: ``(*batch, size)``.
-
-        Raises:
-            ValueError: another width, or a number that is not finite.
         """
         self.check(terrain, (*terrain.shape[:-1], self.size))
         default = torch.as_tensor(self.mocap_default).to(terrain)
         poses = list(default.expand(*terrain.shape[:-1], -1, -1).unbind(-2))
         for mocap, part in self.parameters.items():
-            plane = self.plane_of(mocap)
-            given = terrain[..., part]
+            plane, given = self.plane_of(mocap), terrain[..., part]
             poses[mocap] = given if plane is None else _plane_pose(given, plane)
-        positions = [pose[..., :3] for pose in poses]
-        quats = [pose[..., 3:] for pose in poses]
-        return torch.cat((terrain[..., :0], *positions, *quats), -1)
+        parts = [pose[..., k] for k in (slice(3), slice(3, 7)) for pose in poses]
+        return torch.cat((terrain[..., :0], *parts), -1)
 
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
         """Raise ValueError where a row's parameters are of another shape or not finite.
@@ -156,53 +150,124 @@ class Terrain:
         On an accelerator the numbers are not read, since that would synchronise it; nor in
         compiled code, which cannot raise on them.
         """
-        if tuple(terrain.shape) != shape:
-            raise ValueError(
-                f"expected terrain of shape {shape}, got {tuple(terrain.shape)}"
-            )
+        got = tuple(terrain.shape)
+        if got != shape:
+            raise ValueError(f"expected terrain of shape {shape}, got {got}")
         is_read = terrain.device.type == "cpu" and not torch.compiler.is_compiling()
-        if not is_read or math.isfinite(terrain.sum()):
-            return
-        rows = (~terrain.isfinite()).any(-1).reshape(-1).nonzero()
-        if len(rows):
+        if is_read and not terrain.isfinite().all():
+            row = int((~terrain.isfinite()).any(-1).reshape(-1).nonzero()[0])
             raise ValueError(
-                f"expected finite terrain, got NaN or infinity in env {int(rows[0])}"
+                f"expected finite terrain, got NaN or infinity in env {row}"
             )
 
 
-def rotation_matrix(quat: np.ndarray) -> np.ndarray:
-    """Rotation ``(3, 3)`` of a quaternion of any length."""
-    unit, matrix = np.array(quat, float), np.empty(9)
-    mujoco.mju_normalize4(unit)
-    mujoco.mju_quat2Mat(matrix, unit)
-    return matrix.reshape(3, 3)
+class TerrainDistance(nn.Module):
+    """Signed distance and normal of points to the nearest surface of a terrain.
 
+    Args:
+        terrain: the ground.
+        reach: m; up to here the distance to a height field is exact, see
+            `height_field_distance`. To all other surfaces it always is.
+    """
 
-def mocap_of(model: mujoco.MjModel, geom: int) -> int:
-    """Number of the mocap body that a geom is fixed to, -1 for none."""
-    return int(model.body_mocapid[model.body_weldid[model.geom_bodyid[geom]]])
+    default: Tensor
+
+    def __init__(self, terrain: Terrain, reach: float) -> None:
+        super().__init__()
+        self.terrain, self.reach = terrain, reach
+        keep_constants(self, default=terrain.default)
+        for index, surface in enumerate(terrain.surfaces):
+            for name in ("position", "rotation", "size", "plane", "heights"):
+                value = getattr(surface, name)
+                if value is not None:
+                    keep_constants(self, **{f"{name}_{index}": value})
+
+    def forward(
+        self,
+        points: Tensor,
+        terrain: Tensor | None,
+        position: Tensor,
+        rotation: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Distance and normal at points given in a frame.
+
+        Args:
+            points: ``(*batch, P, 3)``, m, in the frame.
+            terrain: ``(*batch, terrain.size)``, world; None for the file's own ground.
+            position: ``(*batch, 3)``, m, the frame's origin in the world.
+            rotation: ``(*batch, 3, 3)``, the frame's axes in the world.
+
+        Returns:
+            distance ``(*batch, P)``, m, negative inside, and unit normal
+            ``(*batch, P, 3)`` in the frame, both of the nearest surface.
+        """
+        if terrain is None:
+            terrain = self.default.expand(*points.shape[:-2], -1)
+        (distance, normal), *others = (
+            self._to_surface(index, points, terrain, position, rotation)
+            for index in range(len(self.terrain.surfaces))
+        )
+        for other_distance, other_normal in others:
+            is_nearer = (other_distance < distance)[..., None]
+            normal = torch.where(is_nearer, other_normal, normal)
+            distance = torch.minimum(other_distance, distance)
+        return distance, normal
+
+    def _to_surface(
+        self,
+        index: int,
+        points: Tensor,
+        terrain: Tensor,
+        position: Tensor,
+        rotation: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Distance and normal to one surface."""
+        surface = self.terrain.surfaces[index]
+        origin = getattr(self, f"position_{index}")
+        axes = getattr(self, f"rotation_{index}")
+        if surface.mocap >= 0:
+            row = terrain[..., self.terrain.parameters[surface.mocap]]
+            if self.terrain.plane_of(surface.mocap) is surface:
+                return plane_distance(points, plane_in_frame(row, position, rotation))
+            body = matrix_from_quat(quat_normalize(row[..., 3:]))
+            origin, axes = row[..., :3] + body @ origin, body @ axes
+        elif surface.kind == PLANE:
+            plane = getattr(self, f"plane_{index}").expand(*points.shape[:-2], -1)
+            return plane_distance(points, plane_in_frame(plane, position, rotation))
+        local, turn = into_frame(points, position, rotation, origin, axes)
+        if surface.kind == PLANE:
+            distance, normal = local[..., 2], torch.zeros_like(local)
+            normal[..., 2] = 1.0
+        elif surface.kind == HEIGHT_FIELD:
+            half_x, half_y = (float(half) for half in surface.size[:2])
+            field = getattr(self, f"heights_{index}"), half_x, half_y, self.reach
+            distance, normal = height_field_distance(local, *field)
+        else:
+            size = getattr(self, f"size_{index}")
+            distance, normal = SHAPES[surface.kind](local, size)
+        return distance, normal @ turn
 
 
 def _read_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surface:
     kind, size = int(model.geom_type[geom]), model.geom_size[geom].copy()
     if kind not in (PLANE, HEIGHT_FIELD, *SHAPES):
-        name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+        name, what = geom_label(model, geom)
         raise ValueError(
-            f"geom '{model.geom(geom).name or geom}' of the ground is a {name}; "
-            f"expected a plane, box, sphere, capsule or height field"
+            f"{name} of the ground is a {what}; expected a plane, box, sphere, capsule "
+            "or height field"
         )
     heights = None
     if kind == HEIGHT_FIELD:
         field = int(model.geom_dataid[geom])
-        rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+        shape = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
         start, size = int(model.hfield_adr[field]), model.hfield_size[field, :3].copy()
-        levels = model.hfield_data[start : start + rows * columns].astype(float)
-        heights = size[2] * levels.reshape(rows, columns)
+        levels = model.hfield_data[start : start + math.prod(shape)].astype(float)
+        heights = size[2] * levels.reshape(shape)
     position = data.geom_xpos[geom].copy()
     rotation = data.geom_xmat[geom].reshape(3, 3).copy()
-    mocap = mocap_of(model, geom)
+    body = int(model.body_weldid[model.geom_bodyid[geom]])
+    mocap = int(model.body_mocapid[body])
     if mocap >= 0:  # as the body sees it
-        body = int(model.body_weldid[model.geom_bodyid[geom]])
         turn = data.xmat[body].reshape(3, 3)
         position = turn.T @ (position - data.xpos[body])
         rotation = turn.T @ rotation

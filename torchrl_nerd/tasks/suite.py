@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.scenes import Scene, import_scene
-from torchrl_nerd.scenes.actuators import ActuatorController
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.tasks.suite_reward import SuiteReward
 from torchrl_nerd.tasks.task import State, Task
 

@@ -35,7 +35,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.scenes.terrain_distance import TerrainDistance
+from torchrl_nerd.scenes.terrain import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
 from torchrl_nerd.transforms.predicted_force import PredictedForce
 from torchrl_nerd.transforms.predicted_penetration import (

@@ -13,7 +13,7 @@ from torchrl_nerd.geometry.base import BasePose, keep_constants, over_ground
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.scenes.terrain_distance import TerrainDistance
+from torchrl_nerd.scenes.terrain import TerrainDistance
 
 MAX_TIMES = 5  # within a step
 

@@ -1,0 +1,247 @@
+"""Dynamics that torch computes: learned, hybrid and analytic models as `Dynamics`."""
+
+from collections.abc import Mapping
+from typing import Any, Literal, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_nerd.analytic import AnalyticStep
+from torchrl_nerd.compiled import Compiled, RowThreads, parts_of
+from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.nerd import NeRD, Network
+from torchrl_nerd.modules.window import WindowNetwork
+
+Inference = Literal["streaming", "window"]
+
+Model = NeRD | AnalyticStep
+"""Learned, hybrid (a `NeRD`) or analytic; ``kind`` says which."""
+
+
+def _keep_tensor_guards(guards: list[Any]) -> list[bool]:
+    """Which checks a compiled step keeps: those of tensors and of torch's own state.
+
+    The other thousand, whether the model is still made of the same parts, take a tenth of
+    a small model's time.
+    """
+    return [
+        not guard.is_global
+        and (guard.guard_type == "TENSOR_MATCH" or "self." not in guard.name)
+        for guard in guards
+    ]
+
+
+# A step of hundreds of short loops: OpenMP's second thread waits longer than it works. So
+# one thread, called from C++ (which spares Python's overhead), and envs in parts on threads
+# of their own. Compiled for each number of envs: dynamic shapes are slower and take four
+# times as long to compile.
+SINGLE_THREADED = {
+    "dynamic": False,
+    "options": {
+        "cpp.threads": 1,
+        "cpp_wrapper": True,
+        "guard_filter_fn": _keep_tensor_guards,
+    },
+}
+MIN_WORK = (
+    2048  # envs times dofs of a part: handing over less takes longer than it saves
+)
+
+
+class TorchDynamics:
+    """Steps a batch of envs with a function of tensors, eager or compiled.
+
+    A subclass gives ``_predict`` and, where it has a history, ``_memory``.
+    """
+
+    _memory: Any = None
+
+    def __init__(self, model: Model, compile: bool, differentiable: bool) -> None:
+        self.scene, self.device, self.kind = model.scene, model.device, model.kind
+        self.compile, self.differentiable = compile, differentiable
+        self.is_single_threaded = model.compile_single_threaded
+        self._rows = 0
+        self._compiled = Compiled(self._predict, **self.compile_options)
+        self._in_parts = RowThreads(self._compiled)
+
+    @property
+    def compile_options(self) -> Mapping[str, Any]:
+        """Of `torch.compile`, for a step."""
+        is_single = self.is_single_threaded and self.device.type == "cpu"
+        return SINGLE_THREADED if is_single else {}
+
+    def parts(self, rows: int) -> int:
+        """In how many parts, each on a thread of its own, a compiled step is made."""
+        is_whole = self.differentiable or self._compiled.is_eager
+        if is_whole or not self.compile_options:
+            return 1
+        return parts_of(rows, max(1, MIN_WORK // self.scene.layout.nv))
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """See `Dynamics.reset`; there is no history to empty."""
+
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`."""
+        return self.scored_step(state, joint_torque, terrain, is_scored=False)[0]
+
+    def scored_step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        is_scored: bool = True,
+    ) -> tuple[TensorDictBase, Tensor | None]:
+        """`step`, and the out-of-distribution score ``(num_envs,)`` of its input.
+
+        The score is None where it was not asked for or the dynamics has none.
+        """
+        check_step(self.scene, state, joint_torque, terrain)
+        there, here = state[QPOS].device, self.device
+        qpos, qvel = state[QPOS].to(here), state[QVEL].to(here)
+        ground = None if terrain is None else terrain.to(here)
+        self._prepare(len(qpos))
+        given = qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
+        with torch.set_grad_enabled(self.differentiable):
+            next_qpos, next_qvel, score = self._run(given)
+        after = TensorDict(
+            {QPOS: next_qpos.to(there), QVEL: next_qvel.to(there)},
+            batch_size=state.batch_size,
+            device=state.device,
+        )
+        return after, None if score is None else score.to(there)
+
+    def _prepare(self, rows: int) -> None:
+        """What a step of so many envs needs beforehand."""
+        self._rows = rows
+
+    def _run(self, given: tuple) -> tuple[Tensor, Tensor, Tensor | None]:
+        """`_predict`, eager or compiled, of all envs at once or in parts."""
+        if not self.compile:
+            return self._predict(*given)
+        parts = 1 if torch.compiler.is_compiling() else self.parts(self._rows)
+        return self._in_parts(parts, *given) if parts > 1 else self._compiled(*given)
+
+    def _predict(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        memory: Any,
+        is_scored: bool,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Next ``qpos`` and ``qvel``, the input's score; advances ``memory``."""
+        raise NotImplementedError
+
+
+class NeRDDynamics(TorchDynamics):
+    """A `NeRD` model with the history of every env.
+
+    The history is private: a ring of keys and values (streaming) or of tokens (window),
+    never a key of a tensordict, or every collector would store it.
+
+    Args:
+        model: weights, features and statistics; learned or hybrid.
+        inference: ``"streaming"`` computes one token a step; ``"window"`` recomputes the
+            last ``window`` tokens, as the paper does.
+        window: tokens recomputed in window mode (paper: h = 10).
+        compile: run through `torch.compile`; without a compiler, eager with a warning.
+        differentiable: record gradients through the step.
+
+    Raises:
+        ValueError: an unknown mode of inference, or a window below 1.
+    """
+
+    def __init__(
+        self,
+        model: NeRD,
+        inference: Inference = "streaming",
+        window: int = 10,
+        compile: bool = False,
+        differentiable: bool = False,
+    ) -> None:
+        if inference not in ("streaming", "window"):
+            raise ValueError(
+                f"expected inference 'streaming' or 'window', got '{inference}'"
+            )
+        if window < 1:
+            raise ValueError(f"expected a window of at least 1 token, got {window}")
+        self.model = model.eval()
+        network = cast(Network, model.network)
+        if inference == "window":
+            network = WindowNetwork(model.network, window, model.token_size)
+        self.network: Network = network
+        super().__init__(model, compile, differentiable)
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Empty the history of ``rows`` and leave the others bitwise as they are."""
+        count = state[QPOS].shape[0]
+        if rows is None or rows.all() or self._rows != count:
+            self._memory, self._rows = self.network.empty_memory(count), count
+        elif self._memory is not None and rows.any():
+            self._memory.clear(rows.reshape(count).to(self.device))
+
+    def _prepare(self, rows: int) -> None:
+        if self._memory is None or self._rows != rows:
+            self._rows, self._memory = rows, self.network.empty_memory(rows)
+
+    def _predict(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        memory: Any,
+        is_scored: bool,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        def network_step(token: Tensor) -> Tensor:
+            return self.network.step(token, memory)
+
+        model = self.model
+        next_qpos, next_qvel, features = model.step(
+            (qpos, qvel), joint_torque, terrain, network_step
+        )
+        score = model.ood_score(features) if is_scored else None
+        return next_qpos, next_qvel, score
+
+
+class AnalyticDynamics(TorchDynamics):
+    """An `AnalyticStep` as dynamics; it has no history. Arguments as `NeRDDynamics`'s."""
+
+    def __init__(
+        self, step: AnalyticStep, compile: bool = False, differentiable: bool = False
+    ) -> None:
+        self.analytic_step = step
+        super().__init__(step, compile, differentiable)
+
+    def _predict(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        joint_torque: Tensor,
+        terrain: Tensor | None,
+        memory: Any,
+        is_scored: bool,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        result = self.analytic_step(qpos, qvel, joint_torque, terrain)
+        return result.qpos, result.qvel, None
+
+
+def dynamics_of(
+    model: Model, compile: bool = False, differentiable: bool = False, **how: Any
+) -> NeRDDynamics | AnalyticDynamics:
+    """The dynamics of a learned, hybrid or analytic model.
+
+    ``how``: further arguments of `NeRDDynamics`; an analytic step ignores them.
+    """
+    how |= {"compile": compile, "differentiable": differentiable}
+    if isinstance(model, NeRD):
+        return NeRDDynamics(model, **how)
+    return AnalyticDynamics(model, compile, differentiable)
