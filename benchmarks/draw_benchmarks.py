@@ -6,14 +6,18 @@ A PNG in docs/figures for every ``results/bench_*.json``.
 """
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
 import tyro
 from equal_error import RESULTS, reports
 
-from torchrl_nerd.evaluation.bench.plot import plot_bench
+from torchrl_nerd.evaluation.bench.report import BenchReport, pareto_front
+from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
 
 FIGURES = RESULTS.parent / "docs" / "figures"
+MARKERS = {"simulator": "o", "analytic": "s", "hybrid": "D", "learned": "^"}
+PANELS = 3  # most quantities that are drawn: of an arm, its first and its last joint
 
 
 @dataclass
@@ -22,6 +26,54 @@ class Options:
 
     results: Path = RESULTS
     figures: Path = FIGURES
+
+
+def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> None:
+    """One panel per quantity, the Pareto front as a line.
+
+    Args:
+        report: of `bench`.
+        path: of the PNG.
+        batch: trajectories stepped together; `BenchReport.batch` by default.
+    """
+    batch = batch or report.batch
+    units = {row.quantity: row.unit for row in report.errors}
+    shown = list(units) if len(units) <= PANELS else [list(units)[0], list(units)[-1]]
+    figure, panels = make_figure(len(shown), height=4.0 * len(shown), share_x=False)
+    kinds = {row.name: row.kind for row in report.rates}
+    for axes, quantity in zip(panels, shown, strict=True):
+        points = {
+            name: point
+            for name, point in report.points(batch, quantity).items()
+            if isfinite(point[0]) and point[0] > 0.0  # a coarse step may diverge
+        }
+        for number, (kind, marker) in enumerate(MARKERS.items()):
+            chosen = [p for name, p in points.items() if kinds[name] == kind]
+            if chosen:
+                xy = zip(*chosen, strict=True)
+                axes.plot(*xy, marker, ls="", color=COLORS[number], label=kind)
+        best = pareto_front(points)
+        front = [points[name] for name in best]
+        axes.plot(*zip(*front, strict=True), "-", color="0.4", label="Pareto front")
+        for name in best:  # names of the others would cover each other
+            axes.annotate(
+                name, points[name], (6, -3), textcoords="offset points", fontsize=7
+            )
+        for row in report.errors:
+            if row.quantity != quantity or row.kind not in ("sensitivity", "published"):
+                continue
+            style = ":" if row.kind == "sensitivity" else "--"
+            axes.axvline(row.mean, ls=style, color="0.6", label=row.name)
+        axes.set(
+            title=f"{report.scene}: {quantity} (better: up and to the left)",
+            xscale="log",
+            yscale="log",
+            xlabel=f"mean error over {report.steps} steps ({units[quantity]})",
+            ylabel=f"control steps/s, batch {batch}",
+        )
+        axes.tick_params(which="minor", labelsize=7)  # larger ones cover each other
+        axes.legend(frameon=False, fontsize=7)
+    save_figure(figure, path)
 
 
 def main(options: Options) -> list[Path]:

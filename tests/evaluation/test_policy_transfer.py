@@ -1,5 +1,3 @@
-import csv
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -171,9 +169,7 @@ def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> Non
         load_policy(tmp_path, task)
 
 
-def test_a_learning_curve_is_a_figure_and_a_table(tmp_path) -> None:
+def test_a_learning_curve_is_a_figure(tmp_path) -> None:
     curve = [{"frames": 10, "nerd": 1.0}, {"frames": 20, "nerd": 2.0}]
     plot_learning_curve(curve, tmp_path / "curve.png")
-    with open(tmp_path / "curve.csv") as file:
-        assert [float(row["nerd"]) for row in csv.DictReader(file)] == [1.0, 2.0]
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")

@@ -9,10 +9,10 @@ from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.bench.candidates import NoMotion
 from torchrl_nerd.evaluation.recorded_error import (
     compare,
     error_key,
-    no_motion,
     paired_interval,
     resampled_means,
     summarize_windows,
@@ -50,7 +50,7 @@ def test_the_recording_itself_has_no_error(real_cube, recording, generator):
 
 def test_results_agree_with_their_definitions(real_cube, recording):
     starts = recording.starts(80)
-    errors = no_motion(real_cube, recording, starts)
+    errors = window_errors(NoMotion(real_cube), recording, starts)
     summary = summarize_windows(real_cube, errors, recording, starts)
     assert summary.keys() == {"position_error_m", "orientation_error_rad"}
     for error, result in zip(errors.values(), summary.values(), strict=True):
@@ -81,7 +81,7 @@ def test_the_dynamics_of_any_log_have_no_error_on_it(name, generator):
     starts = log.offsets[:-1]
     errors = window_errors(MujocoDynamics(scene), log, starts, states=6)
     assert max(float(error.max()) for error in errors.values()) < 1e-6
-    still = no_motion(scene, log, starts, states=6)
+    still = window_errors(NoMotion(scene), log, starts, states=6)
     assert all(float(error.mean()) > 1e-4 for error in still.values())
     keys = [error_key(scene, quantity) for quantity in errors]
     assert len(set(keys)) == len(keys)

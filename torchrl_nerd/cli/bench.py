@@ -1,12 +1,10 @@
 """``nerd bench``: speed and error of MuJoCo and of every model of a scene."""
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
-from torchrl_nerd.evaluation.bench.plot import plot_bench
 from torchrl_nerd.evaluation.bench.report import bench, bench_table
 from torchrl_nerd.robots import load_scene
 
@@ -17,7 +15,7 @@ class Bench(MeasuringCommand):
 
     Errors are against MuJoCo with a solver so fine that its own error no longer counts.
 
-    Example: nerd bench cartpole --json results/bench_cartpole.json --plot bench.png
+    Example: nerd bench cartpole --json results/bench_cartpole.json
 
     Example: nerd bench dm_control/cheetah-run --models runs/dm_control-cheetah-run/best
     """
@@ -42,15 +40,8 @@ class Bench(MeasuringCommand):
     """Processor threads; torch's own choice by default."""
     without: tuple[str, ...] = ()
     """Leave out candidates with one of these in their names, as in --without RK4 mlp."""
-    plot: Path | None = None
-    """Draw error against speed to this PNG."""
     quiet: bool = False
     """No progress bars."""
-
-    @property
-    def figure(self) -> Path | None:
-        """The drawing, where it was asked for."""
-        return self.plot
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""
@@ -69,6 +60,4 @@ class Bench(MeasuringCommand):
             self.models,
         )
         print(bench_table(report))
-        if self.plot is not None:
-            plot_bench(report, self.plot)
         return asdict(report)

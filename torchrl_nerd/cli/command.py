@@ -12,7 +12,7 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.files import write_json
 from torchrl_nerd.settings import expect_device
 
-SHOWN = ("json", "plot", "quiet", "dry_run")
+SHOWN = ("json", "quiet", "dry_run")
 """Options that change no result."""
 
 

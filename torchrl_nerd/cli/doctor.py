@@ -1,12 +1,25 @@
 """``nerd doctor``: what this machine has, and whether the shipped models work on it."""
 
+import os
+import platform
+import shutil
+import time
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+from tqdm import tqdm
+
 from torchrl_nerd import __version__
+from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
 from torchrl_nerd.cli.command import Command
-from torchrl_nerd.evaluation.doctor import PACKAGES, machine, shipped_checks
+from torchrl_nerd.evaluation.render.renderer import find_gl
 from torchrl_nerd.evaluation.results import versions
+
+PACKAGES = (
+    *("torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium"),
+    *("safetensors", "numpy", "mujoco-warp"),
+)
 
 
 @dataclass(frozen=True)
@@ -26,20 +39,23 @@ class Doctor(Command):
             RuntimeError: a shipped model does not repeat its stored steps.
         """
         packages = {"torchrl_nerd": __version__, **versions(*PACKAGES)}
-        found = {"versions": packages, "machine": machine()}
+        found = {"versions": packages, "machine": _machine()}
         for title, entries in found.items():
             print(title)
             for key, value in entries.items():
                 print(f"  {key:<14}{value}")
         print("shipped models: relative difference from their stored steps")
-        checks = shipped_checks(self.quiet)
-        for name, check in checks.items():
+        checks = {}
+        for name in tqdm(shipped_models(), "models", leave=False, disable=self.quiet):
+            check = checks[name] = _check(name)
             if "error" in check:
-                print(f"  {name:<28}{check['error']}")
+                tqdm.write(f"  {name:<28}{check['error']}")
                 continue
             differences = f"MuJoCo {check['mujoco']:.0e}, model {check['model']:.0e}"
             verdict = "ok" if check["agrees"] else "DIFFERS"
-            print(f"  {name:<28}{differences:<30}{check['seconds']:>5} s  {verdict}")
+            tqdm.write(
+                f"  {name:<28}{differences:<30}{check['seconds']:>5} s  {verdict}"
+            )
         wrong = [name for name, check in checks.items() if not check["agrees"]]
         if wrong:
             raise RuntimeError(
@@ -47,3 +63,36 @@ class Doctor(Command):
                 f"{', '.join(wrong)} did not"
             )
         return {**found, "models": checks}
+
+
+def _machine() -> dict[str, str]:
+    """Devices, threads, compiler, OpenGL."""
+    gpus = map(torch.cuda.get_device_name, range(torch.cuda.device_count()))
+    compilers = (os.environ.get("CXX", "c++"), "g++", "clang++")
+    compiler = next(filter(None, map(shutil.which, compilers)), None)
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processors": str(os.cpu_count()),
+        "torch threads": str(torch.get_num_threads()),
+        "CUDA devices": ", ".join(gpus) or "none",
+        "C++ compiler": compiler or "none: compile=True runs eagerly",
+        "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
+        "OpenGL": find_gl() or "none: nerd play cannot render",
+        "display": os.environ.get("DISPLAY", "none"),
+    }
+
+
+def _check(name: str) -> dict[str, Any]:
+    """Self-check of a shipped model: differences, seconds to load, or what failed."""
+    began = time.monotonic()
+    try:
+        model, check = read_checkpoint(PRETRAINED / name)
+    except ValueError as error:
+        return {"agrees": False, "error": str(error)}
+    return {
+        "agrees": check is not None and check.agrees,
+        "mujoco": None if check is None else check.mujoco,
+        "model": None if check is None else check.model,
+        "kind": model.kind,
+        "seconds": round(time.monotonic() - began, 2),
+    }

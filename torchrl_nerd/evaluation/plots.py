@@ -24,12 +24,12 @@ BAND = (0.05, 0.95)  # quantiles
 
 
 def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> None:
-    """Mean return over training as PNG, and the numbers as CSV beside it.
+    """Mean return over training as PNG.
 
     Args:
         curve: points: ``frames`` (env steps) and the mean return by name of the dynamics
             it was measured in.
-        path: of the PNG; the table has the suffix ``.csv`` instead.
+        path: of the PNG.
     """
     figure, (axes,) = make_figure(1, height=4.0)
     millions = [point["frames"] / 1e6 for point in curve]
@@ -43,11 +43,6 @@ def plot_learning_curve(curve: Sequence[Mapping[str, float]], path: Path) -> Non
     axes.set_title("Return of the policy over training", fontsize=10, loc="left")
     axes.legend(frameon=False)
     save_figure(figure, path)
-    rows = [names, *([str(point[name]) for name in names] for point in curve)]
-    text = "".join(",".join(row) + "\n" for row in rows)
-    write_atomically(
-        path.with_suffix(".csv"), lambda aside: aside.write_text(text) and None
-    )
 
 
 def plot_traces(traces: Traces, names: Sequence[str], title: str, path: Path) -> None:

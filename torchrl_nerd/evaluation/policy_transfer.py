@@ -74,7 +74,7 @@ def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
         for _ in range(env.task.horizon):
             tensordict = env.step(actor(tensordict))["next"]
             returns += torch.where(is_running, tensordict["reward"].double(), 0.0)
-            is_running &= ~tensordict["done"]
+            is_running &= ~tensordict["done"]  # (num_envs, 1)
             if not is_running.any():
                 break
     return returns.squeeze(-1)
@@ -200,16 +200,10 @@ def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
 def report_transfer(
     task: str, actor: Actor, learned_in: str, episodes: int, seed: int, folder: Path
 ) -> dict[str, ReturnSummary]:
-    """Print returns in every dynamics and write them to ``returns.json``.
+    """Print returns in every dynamics and write them to ``folder / "returns.json"``.
 
-    Args:
-        task: its id.
-        actor: any TorchRL policy.
-        learned_in: the dynamics that the policy was trained in; measured beside the
-            shipped model, MuJoCo and dm_control.
-        episodes: in each, see `transfer`, which it raises as.
-        seed: of the initial states.
-        folder: of the file.
+    The policy is measured in the dynamics that it ``learned_in``, the shipped model, MuJoCo
+    and dm_control; see `transfer`, which it raises as.
     """
     learned = ("nerd",) if shipped_models(make_task(task).scene) else ()
     everywhere = (learned_in, *learned, "mujoco", "dm_control")

@@ -14,6 +14,8 @@ from torch import Generator, Tensor
 from torchrl_nerd.analytic import make_step
 from torchrl_nerd.data.recorded import TORQUE, Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
+from torchrl_nerd.evaluation.bench.candidates import NoMotion
+from torchrl_nerd.evaluation.bench.error_table import text_table
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
@@ -40,20 +42,11 @@ def window_errors(
     """
     found = []
     for part in starts.split(PART):
-        window = recording.windows(part, states)
+        window = recording.windows(part, states)  # [windows, states]
         path = open_loop(dynamics, window[:, 0], states - 1, window[TORQUE])
-        measured = window[QPOS][:, 1:]
+        measured = window[QPOS][:, 1:]  # (windows, states - 1, nq)
         found.append(position_errors(dynamics.scene, measured, path))
     return {name: torch.cat([part[name] for part in found]) for name in found[0]}
-
-
-def no_motion(
-    scene: Scene, recording: Recording, starts: Tensor, states: int = STATES
-) -> Errors:
-    """`window_errors` of a robot that stays where it is."""
-    measured = recording.windows(starts, states)[QPOS]
-    start = measured[:, :1].expand_as(measured[:, 1:])
-    return position_errors(scene, measured[:, 1:], start)
 
 
 def error_key(scene: Scene, quantity: str, joint: str = "_error_") -> str:
@@ -74,6 +67,7 @@ def resampled_means(values: Tensor, group: Tensor, draws: int = DRAWS) -> Tensor
     counts = torch.bincount(number, minlength=len(found)).to(values)
     generator = Generator().manual_seed(0)
     pick = torch.randint(len(found), (draws, len(found)), generator=generator)
+    # sums of the drawn trajectories over their numbers of windows: (draws,)
     return sums[pick].sum(1) / counts[pick].sum(1)
 
 
@@ -85,7 +79,7 @@ def paired_interval(a: Tensor, b: Tensor, group: Tensor) -> tuple[float, float]:
         b: others, likewise.
         group: number of each window's trajectory, ``(windows,)``.
     """
-    means = resampled_means((a - b).mean(1), group)
+    means = resampled_means((a - b).mean(1), group)  # (draws,)
     low, high = means.quantile(means.new_tensor((0.025, 0.975))).tolist()
     return low, high
 
@@ -138,9 +132,10 @@ def compare(
         starts: rows of the first states.
         states: of a window.
     """
-    errors = {"no motion": no_motion(scene, recording, starts, states)}
-    for name, dynamics in models.items():
-        errors[name] = window_errors(dynamics, recording, starts, states)
+    errors = {
+        name: window_errors(dynamics, recording, starts, states)
+        for name, dynamics in {"no motion": NoMotion(scene), **models}.items()
+    }
     group, table = recording.trajectory_of(starts), {}
     for name, mine in errors.items():
         table[name] = summarize_windows(scene, mine, recording, starts)
@@ -173,14 +168,19 @@ def errors_as_text(
 ) -> str:
     """The rows of `compare` as text, published mean errors last."""
     columns = ("mean", "interval", "median", "final", "p95", "first")
-    head = f"{f'{states} states':<34}{'quantity':<19}"
-    lines = [head + "".join(f"{'+-' if c == 'interval' else c:>9}" for c in columns)]
-    for name, row in table.items():
-        for key, error in row.items():
-            if key != "against":
-                numbers = "".join(f"{error[c]:>9.4f}" for c in columns)
-                lines.append(f"{name:<34}{key.replace('_error_', ' '):<19}{numbers}")
-    for name, row in published.items():
-        for key, mean in row.items():
-            lines.append(f"{name:<34}{key.replace('_error_', ' '):<19}{mean:>9.4f}")
-    return "\n".join(lines)
+    head = [f"{states} states", "quantity", *columns]
+    rows = [
+        (name, key, [error[c] for c in columns])
+        for name, row in table.items()
+        for key, error in row.items()
+        if key != "against"
+    ]
+    rows += [
+        (n, key, [mean]) for n, row in published.items() for key, mean in row.items()
+    ]
+    body = [
+        [name, key.replace("_error_", " "), *(f"{x:.4f}" for x in values)]
+        for name, key, values in rows
+    ]
+    blank = [""] * len(columns)
+    return text_table(head, [(line + blank)[: len(head)] for line in body])

@@ -7,6 +7,7 @@ trajectories.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import mujoco
 import torch
@@ -75,6 +76,7 @@ def action_drive(
     generator = Generator().manual_seed(seed)
     shape = (steps, num_trajectories, source.controller.num_actions)
     draw = torch.rand(shape, dtype=torch.float64, generator=generator)
+    # (steps, n, num_actions), the same for every dynamics
     actions = 2.0 * draw - 1.0 if random_actions else torch.zeros_like(draw)
 
     def drive(step: int, state: TensorDictBase) -> Tensor:
@@ -120,6 +122,40 @@ def open_loop(
     return positions
 
 
+def rollout(
+    dynamics: Dynamics,
+    start: TensorDict,
+    steps: int,
+    joint_torque: Tensor | Drive | None = None,
+    every: int = 1,
+) -> TensorDict:
+    """``qpos`` and ``qvel``, ``[n, 1 + steps // every]``, the start first.
+
+    Args:
+        dynamics: any.
+        start: see `open_loop`.
+        steps: control steps.
+        joint_torque: ``(n, T, num_actuated)``, repeated after T steps; a function of step
+            and state; or None for none.
+        every: steps between two states that are kept.
+    """
+    state: TensorDictBase = start.select(QPOS, QVEL)
+    idle = torch.zeros(len(start), len(dynamics.scene.actuated)).to(state[QPOS])
+    dynamics.reset(state)
+    kept = [state]
+    for step in range(steps):
+        if callable(joint_torque):
+            torque = joint_torque(step, state)
+        elif joint_torque is None:
+            torque = idle
+        else:
+            torque = joint_torque[:, step % joint_torque.shape[1]]  # (n, num_actuated)
+        state = dynamics.step(state, torque, start.get(TERRAIN, None))
+        if (step + 1) % every == 0:
+            kept.append(state.select(QPOS, QVEL))
+    return cast(TensorDict, TensorDict.stack(kept, 1))
+
+
 def position_errors(
     scene: Scene, ground_truth: Tensor, other: Tensor
 ) -> dict[str, Tensor]:
@@ -128,31 +164,29 @@ def position_errors(
     A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
     over ``joints`` (rad); a fixed base gives one entry per joint, by name.
     """
-    model, errors = scene.model, {}
-    both = ground_truth, other
-    if scene.base.is_floating:
-        q = scene.base.qpos_address
-        offset = ground_truth[..., q : q + 3] - other[..., q : q + 3]
-        errors["base_position"] = torch.linalg.vector_norm(offset, dim=-1)
-        quats = (x[..., q + 3 : q + 7] for x in both)
-        errors["base_orientation"] = orientation_error(*quats)
-    joints = {}
+    model, both, joints = scene.model, (ground_truth, other), {}
     for joint in range(model.njnt):
         q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             continue
         if kind == mujoco.mjtJoint.mjJNT_BALL:
-            quats = (x[..., q : q + 4] for x in both)
-            joints[model.joint(joint).name] = orientation_error(*quats)
-            continue
-        error = ground_truth[..., q] - other[..., q]
-        if kind == mujoco.mjtJoint.mjJNT_HINGE:
-            error = wrap_angle(error)
-        joints[model.joint(joint).name] = error.abs()
+            error = orientation_error(*(x[..., q : q + 4] for x in both))
+        else:
+            error = ground_truth[..., q] - other[..., q]  # (n, steps)
+            is_hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
+            error = (wrap_angle(error) if is_hinge else error).abs()
+        joints[model.joint(joint).name] = error
     if not scene.base.is_floating:
         return joints
+    q = scene.base.qpos_address
+    offset = ground_truth[..., q : q + 3] - other[..., q : q + 3]
+    turn = orientation_error(*(x[..., q + 3 : q + 7] for x in both))
+    errors = {
+        "base_position": torch.linalg.vector_norm(offset, dim=-1),
+        "base_orientation": turn,
+    }
     if joints:
-        errors["joints"] = torch.stack(list(joints.values())).mean(0)
+        errors["joints"] = torch.stack(list(joints.values())).mean(0)  # (n, steps)
     return errors
 
 
@@ -193,10 +227,11 @@ def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary
     """
     summaries = {}
     for name, error in errors.items():
-        over_time = error.mean(1)
+        over_time = error.mean(1)  # (n,)
         summaries[name] = ErrorSummary(
             unit=unit_of(scene, name),
             mean=float(over_time.mean()),
+            # trajectories are independent, steps of one are not
             interval=float(1.96 * over_time.std() / len(over_time) ** 0.5),
             final=float(error[:, -1].mean()),
             p95=float(over_time.quantile(0.95)),

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.evaluation.rollout_error import (
-    Drive,
     action_drive,
     initial_states,
     position_errors,
+    rollout,
     scene_of,
 )
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
@@ -85,13 +85,13 @@ def compare_traces(
     """Roll out two dynamics, the second one the ground truth; see `action_drive`."""
     scene, start = scene_of(source), initial_states(source, trajectories, seed)
     drive = action_drive(source, trajectories, steps, seed, random_actions)
-    paths = [_trace(one, start, steps, drive) for one in dynamics]
+    paths = [rollout(one, start, steps, drive) for one in dynamics]
     errors = position_errors(scene, paths[1][QPOS], paths[0][QPOS])
     relative = torch.stack([e / e.nanmean().clamp_min(1e-12) for e in errors.values()])
     # over quantities and steps: (trajectories,)
     order = relative.mean((0, 2)).nan_to_num(nan=torch.inf).argsort()
     median = int(order[trajectories // 2])
-    shown = [cast(TensorDict, path[median]) for path in paths]
+    shown = [cast(TensorDict, path[median]) for path in paths]  # [steps + 1] each
     distances, terrain = None, start.get(TERRAIN, None)
     if scene.terrain is not None:
         ground = None if terrain is None else terrain[median].expand(steps + 1, -1)
@@ -103,15 +103,3 @@ def compare_traces(
         energies=[mechanics(scene, path)["energy"] for path in shown],
         distances=distances,
     )
-
-
-def _trace(
-    dynamics: Dynamics, start: TensorDict, steps: int, drive: Drive
-) -> TensorDict:
-    """``qpos`` and ``qvel`` of a rollout, ``[n, 1 + steps]``, the start first."""
-    states = [start.select(QPOS, QVEL)]
-    dynamics.reset(states[0])
-    for step in range(steps):
-        torque = drive(step, states[-1])
-        states.append(dynamics.step(states[-1], torque, start.get(TERRAIN, None)))
-    return cast(TensorDict, TensorDict.stack([s.select(QPOS, QVEL) for s in states], 1))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import mujoco
 import pytest
 import torch
+from draw_benchmarks import plot_bench
 from helpers import slow_but
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint, shipped_models
@@ -27,7 +28,6 @@ from torchrl_nerd.evaluation.bench.evaluation_set import (
     cases_of,
     evaluation_set,
 )
-from torchrl_nerd.evaluation.bench.plot import plot_bench
 from torchrl_nerd.evaluation.bench.rates import mid_states
 from torchrl_nerd.evaluation.bench.report import (
     PERTURBATION,

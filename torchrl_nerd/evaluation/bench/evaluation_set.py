@@ -73,7 +73,7 @@ class EvaluationSet:
         """The initial states with ``size`` (m, rad) times a normal number added to each."""
         layout, start = self.scene.layout, self.start.clone()
         shape, generator = (len(start), layout.nv), Generator().manual_seed(seed)
-        noise = torch.randn(shape, dtype=torch.float64, generator=generator)
+        noise = torch.randn(shape, dtype=torch.float64, generator=generator)  # (n, nv)
         start[QPOS] = integrate_pos(layout, start[QPOS], size * noise.to(start[QPOS]))
         return start
 

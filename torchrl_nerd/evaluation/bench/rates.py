@@ -60,18 +60,12 @@ def rate_rows(
         device: of all states.
     """
     state, scene = mid_states(source, batch, seed).to(device), scene_of(source)
-    steppers = {c.name: stepper(c.make(scene), state) for c in candidates}
-    warm_up_s = {name: _seconds(run, 2) for name, run in steppers.items()}
-    runners = {name: Runner(run) for name, run in steppers.items()}
-    samples = [
-        {name: batch * runner.steps_per_s() for name, runner in runners.items()}
-        for _ in range(rounds)
-    ]
+    runners = [Runner(stepper(c.make(scene), state)) for c in candidates]
+    samples = [[runner.steps_per_s() for runner in runners] for _ in range(rounds)]
+    found = zip(candidates, runners, zip(*samples, strict=True), strict=True)
     return [
-        RateRow(
-            c.name, c.kind, batch, median(s[c.name] for s in samples), warm_up_s[c.name]
-        )
-        for c in candidates
+        RateRow(c.name, c.kind, batch, batch * median(rates), runner.warm_up_s)
+        for c, runner, rates in found
     ]
 
 
@@ -83,6 +77,7 @@ def mid_states(source: Source, batch: int, seed: int) -> TensorDict:
     path = MujocoDynamics(scene).rollout(start.select(QPOS, QVEL), torque, terrain)
     generator = torch.Generator().manual_seed(seed)
     moment = torch.randint(MAX_STEP, (batch,), generator=generator)
+    # one moment of each trajectory: [batch]
     state = cast(TensorDict, path[torch.arange(batch), moment])
     if terrain is not None:
         state[TERRAIN] = terrain
@@ -117,7 +112,7 @@ class Runner:
     """Runs for about as long as a sample lasts.
 
     Args:
-        run: makes that many steps; two of them warm it up.
+        run: makes that many steps; two of them, ``warm_up_s`` long, warm it up.
         clock: what times it.
     """
 
@@ -125,7 +120,7 @@ class Runner:
         self, run: Callable[[int], None], clock: Clock = time.perf_counter
     ) -> None:
         self._run, self._clock = run, clock
-        _seconds(run, 2)
+        self.warm_up_s = _seconds(run, 2)
         self._length = max(2, round(2 * SAMPLE_SECONDS / _seconds(run, 2, clock)))
         run(self._length)
 

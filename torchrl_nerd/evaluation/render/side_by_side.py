@@ -90,7 +90,7 @@ def roll_out_both(
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 actions = [actor(td.clone())[ACTION] for td in shown]
         if not closed_loop:
-            actions[0] = actions[1]
+            actions[0] = actions[1]  # those of MuJoCo
         for i, (env, action) in enumerate(zip(envs, actions, strict=True)):
             td = TensorDict({ACTION: action}, env.batch_size, device=env.device)
             shown[i] = env.step(td)["next"]

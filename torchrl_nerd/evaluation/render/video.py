@@ -70,10 +70,8 @@ def write_video(
             Image.fromarray(np.vstack(list(frames))).save(aside, "PNG")
         elif path.suffix == ".gif":
             how = {"save_all": True, "duration": 1000 // FRAMES_PER_SECOND, "loop": 0}
-            images = (
-                Image.fromarray(frame).quantize(GIF_COLORS, dither=Image.Dither.NONE)
-                for frame in frames
-            )
+            shown, plain = map(Image.fromarray, frames), Image.Dither.NONE
+            images = (image.quantize(GIF_COLORS, dither=plain) for image in shown)
             next(images).save(aside, "GIF", append_images=images, **how)
         else:
             _write_mp4(frames, aside)
@@ -86,13 +84,9 @@ def _write_mp4(frames: Iterator[np.ndarray], path: Path) -> None:
     import imageio_ffmpeg
 
     first = next(frames)
-    writer = imageio_ffmpeg.write_frames(
-        path,
-        first.shape[1::-1],
-        fps=FRAMES_PER_SECOND,
-        output_params=["-f", "mp4"],
-        macro_block_size=2,
-    )
+    how = {"output_params": ["-f", "mp4"], "macro_block_size": 2}
+    size = first.shape[1::-1]  # width, height
+    writer = imageio_ffmpeg.write_frames(path, size, fps=FRAMES_PER_SECOND, **how)
     writer.send(None)  # starts ffmpeg
     for frame in chain([first], frames):
         writer.send(np.ascontiguousarray(frame))

@@ -2,51 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import position_errors
+from torchrl_nerd.evaluation.rollout_error import position_errors, rollout
 from torchrl_nerd.evaluation.stability import states
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
 
 Metrics = dict[str, float]
 """What a case measured, by name with its unit."""
-
-
-def roll(
-    dynamics: Dynamics,
-    start: TensorDict,
-    steps: int,
-    torque: Tensor | None = None,
-    every: int = 1,
-) -> TensorDict:
-    """States ``[n, 1 + steps // every]``, the start first.
-
-    Args:
-        dynamics: any.
-        start: ``[n]``: ``qpos``, ``qvel`` and, where the ground varies, ``terrain``.
-        steps: control steps.
-        torque: ``(n, T, num_actuated)``, repeated after T steps; None for zero.
-        every: steps between two states that are kept.
-    """
-    if torque is None:
-        torque = torch.zeros(len(start), 1, len(dynamics.scene.actuated)).double()
-    state: TensorDictBase = start.select(QPOS, QVEL)
-    dynamics.reset(state)
-    kept = [state]
-    for step in range(steps):
-        drive = torque[:, step % torque.shape[1]]  # (n, num_actuated)
-        state = dynamics.step(state, drive, start.get(TERRAIN, None))
-        if (step + 1) % every == 0:
-            kept.append(state.select(QPOS, QVEL))
-    return cast(TensorDict, TensorDict.stack(kept, 1))
 
 
 @dataclass(frozen=True)
@@ -76,12 +47,12 @@ class Trial:
         return self.dynamics.model
 
     def roll(self, start: TensorDict, steps: int, *how: Any, **more: Any) -> TensorDict:
-        """`roll` in the dynamics under test."""
-        return roll(self.dynamics, start, steps, *how, **more)
+        """`rollout` in the dynamics under test."""
+        return rollout(self.dynamics, start, steps, *how, **more)
 
     def roll_exactly(self, start: TensorDict, steps: int, *how: Any) -> TensorDict:
-        """`roll` in MuJoCo."""
-        return roll(MujocoDynamics(self.scene), start, steps, *how)
+        """`rollout` in MuJoCo."""
+        return rollout(MujocoDynamics(self.scene), start, steps, *how)
 
     def scaled(self, count: int, least: int) -> int:
         """A number of steps or trajectories times the scale."""
@@ -112,7 +83,7 @@ class Trial:
     def difference(self, path: TensorDict, other: TensorDict) -> Tensor:
         """Largest difference of all position quantities, m or rad, ``(n, steps)``."""
         errors = position_errors(self.scene, path[QPOS], other[QPOS])
-        return torch.stack(list(errors.values())).amax(0)
+        return torch.stack(list(errors.values())).amax(0)  # over quantities
 
 
 @dataclass(frozen=True)

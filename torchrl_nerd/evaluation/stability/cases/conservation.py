@@ -5,6 +5,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.rollout_error import rollout
 from torchrl_nerd.evaluation.stability.case import (
     Metrics,
     Trial,
@@ -12,7 +13,6 @@ from torchrl_nerd.evaluation.stability.case import (
     has_floating_base,
     largest,
     norm,
-    roll,
 )
 from torchrl_nerd.evaluation.stability.states import clear_of_ground, sample_states
 from torchrl_nerd.evaluation.traces import mechanics
@@ -50,13 +50,14 @@ def energy(trial: Trial) -> Metrics:
     metrics = {DRIFT: largest(early.mean(0)), LATE: largest(drift.mean(0))}
     if isinstance(trial.dynamics, MujocoDynamics):
         reference = MujocoDynamics(scene.reference)
-        path = roll(reference, start, min(steps, EARLY), every=EVERY)
+        path = rollout(reference, start, min(steps, EARLY), every=EVERY)
         metrics[REFERENCE] = largest(_drift(scene, path).mean(0))
     return metrics
 
 
 def _drift(scene: Scene, path: TensorDict) -> Tensor:
     """Change of energy relative to the depth of the well, ``(n, steps)``."""
+    # (n * steps,) -> (n, steps)
     joules = mechanics(scene, path.flatten())["energy"].reshape(path.batch_size)
     # the lowest potential energy, as far as random poses find it
     poses = sample_states(scene, 512, Generator().manual_seed(0))

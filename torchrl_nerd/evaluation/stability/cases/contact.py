@@ -35,9 +35,10 @@ def drop(trial: Trial) -> Metrics:
     """Dropped from up to 10 m it lands, does not penetrate and never rises higher."""
     z = trial.scene.base.qpos_address + 2
     lying = trial.settled(16)
+    # the first pose at rest, once for every height
     start = cast(TensorDict, lying[torch.zeros(len(HEIGHTS), dtype=torch.long)])
     start[QPOS][:, z] += torch.tensor(HEIGHTS, dtype=torch.float64)
-    height = trial.roll(start, 300)[QPOS][..., z]
+    height = trial.roll(start, 300)[QPOS][..., z]  # (heights, 301)
     exact = trial.roll_exactly(start, 300)[QPOS][..., z]
     return {
         LOW: largest(exact.amin(1) - height.amin(1)),
@@ -52,7 +53,7 @@ def resting(trial: Trial) -> Metrics:
     scene, start, kept = trial.scene, trial.settled(16), 100
     steps = trial.scaled(10_000, kept)
     path = trial.roll(start, steps, every=steps // kept)
-    here = path[QPOS]
+    here = path[QPOS]  # (n, 1 + kept, nq)
     errors = position_errors(scene, here[:, :1].expand_as(here), here)
     seconds = scene.control_step * steps
     return {
@@ -110,6 +111,7 @@ def joint_limits(trial: Trial) -> Metrics:
         return beyond.amax(1).clamp(min=0.0)
 
     own, exact = exceeded(trial.roll(start, 200, torque)), []
+    # a trajectory near a limit may miss it: MuJoCo's nearby ones count too
     for size in (0.0, *[PERTURBATION] * NUM_PERTURBED):
         nearby = start.clone()
         nearby[QVEL] += size * trial.normal(*nearby[QVEL].shape)

@@ -54,7 +54,7 @@ def horizon(trial: Trial) -> Metrics:
     metrics = _finiteness(path) | {LEAP: 0.0}
     if scene.base.is_floating and isinstance(trial.dynamics, NeRDDynamics):
         q, v = scene.base.qpos_address, scene.base.dof_address
-        moved = path[QPOS][..., q : q + 3].diff(dim=1)
+        moved = path[QPOS][..., q : q + 3].diff(dim=1)  # (n, KEPT, 3)
         bound = float(trial.model.training_range.speed[v])
         seconds = scene.control_step * (steps // KEPT)
         beyond = norm(moved) - (1.0 + ROUNDING) * bound * seconds
@@ -64,7 +64,7 @@ def horizon(trial: Trial) -> Metrics:
 
 def _finiteness(path: TensorDict) -> Metrics:
     """How many trajectories are not finite, and the largest speed of the others."""
-    state = torch.cat((path[QPOS], path[QVEL]), -1)
+    state = torch.cat((path[QPOS], path[QVEL]), -1)  # (n, steps, nq + nv)
     is_finite = state.isfinite().flatten(1).all(1)
     speed = path[QVEL].abs().nan_to_num(0.0, 0.0, 0.0).amax()
     return {NON_FINITE: float((~is_finite).sum()), SPEED: float(speed)}
@@ -144,6 +144,7 @@ def gradients(trial: Trial) -> Metrics:
             metrics[f"largest gradient after {steps} steps"] = size
         shift = [1e-6 * (1.0 + x.abs().amax(0)) * trial.normal(*x.shape) for x in first]
         pairs = list(zip(first, shift, strict=True))
+        # central difference along one random direction
         ahead, behind = (end([x + s * d for x, d in pairs], 1) for s in (1.0, -1.0))
         central = 0.5 * (ahead - behind).detach()
         along = [(g * d).sum() for g, d in zip(gradient(1), shift, strict=True)]

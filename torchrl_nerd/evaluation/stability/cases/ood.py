@@ -54,7 +54,7 @@ def inputs(
 ) -> tuple[TensorDict, TensorDict, TensorDict]:
     """Three sets of transitions: two like those of training, one unlike them."""
     data = simulate(scene, COUNT, LENGTH, generator)
-    data = cast(TensorDict, data[is_sound(data)].flatten(0, 1))
+    data = cast(TensorDict, data[is_sound(data)].flatten(0, 1))  # [transitions]
     order = torch.randperm(len(data), generator=generator)
     inside, calibration, outside = cast(TensorDict, data[order]).chunk(3)
     outside = outside.clone()
@@ -85,5 +85,5 @@ def _rollout_error(dynamics: Dynamics, start: TensorDict) -> float:
     torque[:, DRIVEN:] = 0.0
     start = start.select(QPOS, QVEL, TERRAIN, strict=False).clone()
     exact = MujocoDynamics(dynamics.scene)
-    errors = open_loop_errors(exact, dynamics, start, STEPS, torque)
+    errors = open_loop_errors(exact, dynamics, start, STEPS, torque)  # (n, STEPS) each
     return float(torch.stack(list(errors.values())).mean((0, 2)).nanmedian())
