@@ -23,7 +23,8 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
-    open_loop_errors,
+    open_loop,
+    position_errors,
     scene_of,
 )
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
@@ -71,7 +72,8 @@ def error_curves(
     """Mean error over rows at every step, ``(steps,)``."""
     scene = scene_of(source)
     drive = action_drive(source, len(start), steps, 0, random)
-    errors = open_loop_errors(MujocoDynamics(scene), learned, start, steps, drive)
+    both = MujocoDynamics(scene), learned
+    errors = position_errors(scene, *(open_loop(d, start, steps, drive) for d in both))
     return {name: error.mean(0) for name, error in errors.items()}
 
 

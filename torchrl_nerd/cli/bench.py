@@ -36,10 +36,6 @@ class Bench(MeasuringCommand):
     """Of the initial states."""
     steps: int | None = None
     """Horizon of the errors; the paper's by default."""
-    threads: int | None = None
-    """Processor threads; torch's own choice by default."""
-    without: tuple[str, ...] = ()
-    """Leave out candidates with one of these in their names, as in --without RK4 mlp."""
     quiet: bool = False
     """No progress bars."""
 
@@ -53,10 +49,8 @@ class Bench(MeasuringCommand):
             self.seed,
             self.steps,
             self.variants,
-            self.threads,
             self.device,
             self.quiet,
-            self.without,
             self.models,
         )
         print(bench_table(report))

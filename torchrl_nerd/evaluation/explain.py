@@ -4,11 +4,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 from torchrl_nerd.analytic import STEPS, default_step, make_step
-from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import (
-    CONTACT_DEPTH,
     CONTACT_DISTANCE,
-    CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
     ROBOT_STATE,
@@ -24,8 +21,6 @@ MEANINGS = {
     ROBOT_TORQUE: "joint torque, N and N m",
     CONTACT_DISTANCE: "clearance to the ground minus the margin, m; 0 beyond the margin",
     CONTACT_VELOCITY: "velocity along and across the ground's normal, m/s",
-    CONTACT_DEPTH: "predicted penetration at several times of the step, m",
-    CONTACT_FORCE: "predicted contact force on each degree of freedom, N and N m",
     CONTACT_NORMAL: "normal of the ground in the base frame",
 }
 """Meaning of every feature but ``robot_state``, see `_state_meaning`."""
@@ -94,18 +89,14 @@ class SceneReport:
         )
 
 
-def explain(scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> SceneReport:
+def explain(scene: Scene) -> SceneReport:
     """Report what of a scene is kept, dropped and why.
-
-    Args:
-        scene: the robot.
-        config: which predictions of the contact law are among the features.
 
     Examples:
         >>> explain(load_scene("cartpole")).token_width
         7
     """
-    features, model = SceneFeatures(scene, config), scene.model
+    features, model = SceneFeatures(scene), scene.model
     sizes = {**features.robot.sizes, **features.contact.sizes}
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
 

@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.analytic import make_step
 from torchrl_nerd.data.recorded import TORQUE, Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
-from torchrl_nerd.evaluation.bench.candidates import NoMotion
+from torchrl_nerd.evaluation.bench.candidates import NoMotion, has_step
 from torchrl_nerd.evaluation.bench.error_table import text_table
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
 from torchrl_nerd.keys import QPOS
@@ -154,10 +154,8 @@ def compare(
 def rivals(scene: Scene) -> dict[str, Dynamics]:
     """Dynamics with the scene's own parameters: MuJoCo, and an analytic step if any."""
     found: dict[str, Dynamics] = {"MuJoCo": MujocoDynamics(scene)}
-    try:
+    if has_step(scene):
         found["analytic"] = AnalyticDynamics(make_step(scene))
-    except ValueError:  # a scene whose contact law it does not know
-        pass
     return found
 
 

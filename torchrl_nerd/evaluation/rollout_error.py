@@ -104,18 +104,13 @@ def open_loop(
         stop_at_nan: stop once a trajectory is not finite; what is left is NaN. An engine
             takes long over states that diverge.
     """
-    terrain = start.get(TERRAIN, None)
+    terrain, drive = start.get(TERRAIN, None), _drive(dynamics, start, joint_torque)
     state: TensorDictBase = start.select(QPOS, QVEL)
-    count, like = len(start), {"dtype": start[QPOS].dtype, "device": start[QPOS].device}
-    idle = torch.zeros(count, len(dynamics.scene.actuated), **like)
     dynamics.reset(state)
-    positions = torch.full((count, steps, start[QPOS].shape[1]), torch.nan, **like)
+    shape = (len(start), steps, start[QPOS].shape[1])
+    positions = torch.full(shape, torch.nan).to(start[QPOS])
     for step in range(steps):
-        if callable(joint_torque):
-            torque = joint_torque(step, state)
-        else:
-            torque = idle if joint_torque is None else joint_torque[:, step]
-        state = dynamics.step(state, torque, terrain)
+        state = dynamics.step(state, drive(step, state), terrain)
         positions[:, step] = state[QPOS]
         if stop_at_nan and not state[QPOS].isfinite().all():
             break
@@ -139,21 +134,26 @@ def rollout(
             and state; or None for none.
         every: steps between two states that are kept.
     """
+    terrain, drive = start.get(TERRAIN, None), _drive(dynamics, start, joint_torque)
     state: TensorDictBase = start.select(QPOS, QVEL)
-    idle = torch.zeros(len(start), len(dynamics.scene.actuated)).to(state[QPOS])
     dynamics.reset(state)
     kept = [state]
     for step in range(steps):
-        if callable(joint_torque):
-            torque = joint_torque(step, state)
-        elif joint_torque is None:
-            torque = idle
-        else:
-            torque = joint_torque[:, step % joint_torque.shape[1]]  # (n, num_actuated)
-        state = dynamics.step(state, torque, start.get(TERRAIN, None))
+        state = dynamics.step(state, drive(step, state), terrain)
         if (step + 1) % every == 0:
             kept.append(state.select(QPOS, QVEL))
     return cast(TensorDict, TensorDict.stack(kept, 1))
+
+
+def _drive(
+    dynamics: Dynamics, start: TensorDict, joint_torque: Tensor | Drive | None
+) -> Drive:
+    """Torques as a function of step and state."""
+    if callable(joint_torque):
+        return joint_torque
+    idle = torch.zeros(len(start), 1, len(dynamics.scene.actuated))
+    torque = idle.to(start[QPOS]) if joint_torque is None else joint_torque
+    return lambda step, state: torque[:, step % torque.shape[1]]  # (n, num_actuated)
 
 
 def position_errors(
@@ -188,26 +188,6 @@ def position_errors(
     if joints:
         errors["joints"] = torch.stack(list(joints.values())).mean(0)  # (n, steps)
     return errors
-
-
-def open_loop_errors(
-    ground_truth: Dynamics,
-    other: Dynamics,
-    start: TensorDict,
-    steps: int,
-    joint_torque: Tensor | Drive | None = None,
-) -> dict[str, Tensor]:
-    """`position_errors` of two rollouts from the same states, ``(n, steps)`` each.
-
-    Args:
-        ground_truth: the dynamics that errors are measured against.
-        other: of the same robot.
-        start: see `open_loop`, as ``steps`` and ``joint_torque``.
-        steps: control steps.
-        joint_torque: N or N m.
-    """
-    paths = [open_loop(d, start, steps, joint_torque) for d in (ground_truth, other)]
-    return position_errors(ground_truth.scene, *paths)
 
 
 def unit_of(scene: Scene, quantity: str) -> str:
@@ -257,7 +237,9 @@ def passive_errors(
     start, scene = initial_states(source, num_trajectories, seed), scene_of(source)
     steps = max(horizons)
     drive = action_drive(source, num_trajectories, steps, seed, random_actions)
-    errors = open_loop_errors(ground_truth, other, start.to(device), steps, drive)
+    both = ground_truth, other
+    paths = [open_loop(one, start.to(device), steps, drive) for one in both]
+    errors = position_errors(scene, *paths)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
         for horizon in horizons

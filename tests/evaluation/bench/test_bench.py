@@ -102,9 +102,7 @@ def test_driven_beside_passive_where_there_are_actuators(name):
 def test_a_whole_benchmark(name, tmp_path, monkeypatch):
     monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)  # speeds need not be exact here
     scene = load_scene(name)
-    report = bench(
-        scene, (1, 3), num_trajectories=4, rounds=1, steps=3, variants=(), threads=1
-    )
+    report = bench(scene, (1, 3), num_trajectories=4, rounds=1, steps=3, variants=())
     expected = {c.name for c in [*simulators(scene, 1), *models(scene)]}
     shown = {row.name for row in report.errors if row.kind != "sensitivity"} - {PAPER}
     assert shown == expected and set(shipped_models(scene)) <= expected
@@ -130,7 +128,7 @@ def test_a_whole_benchmark(name, tmp_path, monkeypatch):
 
 def brief(scene: Scene, **how) -> BenchReport:
     """Two trajectories, two steps, nothing compiled."""
-    sizes = {"num_trajectories": 2, "rounds": 1, "steps": 2, "threads": 1}
+    sizes = {"num_trajectories": 2, "rounds": 1, "steps": 2}
     return bench(scene, (2,), **sizes, **{"variants": (), **how})
 
 
@@ -140,8 +138,7 @@ def test_a_third_party_robot_with_a_model_of_ones_own(tmp_path, monkeypatch):
     scene = load_scene("dm_control/hopper-stand")
     model = NeRD(scene, FeatureConfig(), NETWORKS["mlp-1x32"]).eval()
     folder = save_checkpoint(model, tmp_path / "hopper", make_card(model))
-    words = "RK4", "implicitfast", "discrete"
-    report = brief(scene, without=words, names=[str(folder)])
+    report = brief(scene, names=[str(folder)])
     assert {row.name for row in report.errors if row.kind == "learned"} == {str(folder)}
     means = {(row.name, row.quantity): row.mean for row in report.errors}
     for row in report.errors:
@@ -150,14 +147,12 @@ def test_a_third_party_robot_with_a_model_of_ones_own(tmp_path, monkeypatch):
     assert report.speeds(2)[str(folder)] > 0.0
 
 
-def test_what_is_left_out_is_not_measured(monkeypatch):
+def test_a_variant_is_one_more_candidate(monkeypatch):
     monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)
-    words = "Euler", "fine", "micro", "mlp", "perturbed"
-    report = brief(load_scene("cartpole"), without=words, variants=("window",))
+    report = brief(load_scene("cartpole"), variants=("window",))
     rivals = {f"MuJoCo {name}, 1 substep" for name in RIVALS}
     rivals |= {f"MuJoCo {name}, 4 substeps" for name in RIVALS}
     assert set(report.speeds(2)) >= rivals | {"cartpole", "cartpole, window"}
-    assert not any(word in name for name in report.speeds(2) for word in words)
 
 
 def test_another_number_of_substeps_is_the_same_control_step(name):
@@ -257,8 +252,6 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, rounds=0)
     with pytest.raises(ValueError, match="batch 0"):
         bench(scene, (0,))
-    with pytest.raises(ValueError, match="none without MuJoCo, cartpole, "):
-        bench(scene, without=("MuJoCo", "cartpole", "no motion", "analytic"))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
         bench(scene, names=["nowhere"])
     with pytest.raises(ValueError, match="variants among compiled, .*, got 'fast'"):

@@ -12,12 +12,7 @@ from torch import Tensor
 
 from torchrl_nerd.analytic import make_step
 from torchrl_nerd.checkpoint import shipped_models
-from torchrl_nerd.dynamics import (
-    Dynamics,
-    Model,
-    MujocoDynamics,
-    dynamics_of,
-)
+from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
@@ -53,11 +48,7 @@ class Candidate:
 
 
 class NoMotion:
-    """Dynamics in which every state stays as it is: the error of predicting nothing.
-
-    Args:
-        scene: the robot.
-    """
+    """Dynamics in which every state stays as it is: the error of predicting nothing."""
 
     kind = "baseline"
 
@@ -128,7 +119,7 @@ def models(
         known = ", ".join(VARIANTS)
         raise ValueError(f"expected variants among {known}, got '{unknown[0]}'")
     found: list[Candidate] = []
-    own = ["analytic"] if _has_step(scene) else []
+    own = ["analytic"] if has_step(scene) else []
     for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
         model = resolve_model(name, scene).to(device)
         found.append(_candidate(name, model))
@@ -136,7 +127,7 @@ def models(
     return sorted(found, key=lambda c: KINDS.index(c.kind))
 
 
-def _has_step(scene: Scene) -> bool:
+def has_step(scene: Scene) -> bool:
     """Whether the package knows the contact law of a scene."""
     try:
         make_step(scene)

@@ -99,10 +99,8 @@ def bench(
     seed: int = 500,
     steps: int | None = None,
     variants: Sequence[str] = ("compiled",),
-    threads: int | None = None,
     device: torch.device | str = "cpu",
     quiet: bool = False,
-    without: Sequence[str] = (),
     names: Sequence[str] = (),
 ) -> BenchReport:
     """Error and speed of MuJoCo and of the models of a scene on this machine.
@@ -115,28 +113,19 @@ def bench(
         seed: of the initial states.
         steps: horizon of the errors; the protocol's by default.
         variants: other ways to run each model, see `VARIANTS`.
-        threads: processors to use; torch's own choice by default.
         device: of learned models and of every state whose steps are timed; MuJoCo's
             states then travel to the processor and back within its time.
         quiet: no progress bars.
-        without: candidates with one of these in their names are left out.
         names: of models, see `models`.
 
     Raises:
-        ValueError: a setting out of range, or no candidate left.
+        ValueError: a setting out of range, or no such model.
     """
     expect_at_least(1, rounds=rounds, **{f"batch {b}": b for b in batches})
     expect_at_least(2, num_trajectories=num_trajectories)
     protocol = protocol_of(scene)
-    if threads is not None:
-        torch.set_num_threads(threads)
-    threads = torch.get_num_threads()
-    everyone = [*simulators(scene, threads), *models(scene, names, device, variants)]
-    candidates = [c for c in everyone if not any(word in c.name for word in without)]
-    if not candidates:
-        raise ValueError(
-            f"expected candidates to measure, got none without {', '.join(without)}"
-        )
+    threads = torch.get_num_threads()  # as many for MuJoCo
+    candidates = [*simulators(scene, threads), *models(scene, names, device, variants)]
     published = {horizon for _, horizon, _ in protocol.published}
     horizon = steps or max(published or protocol.horizons)
 

@@ -13,7 +13,7 @@ from torchrl_nerd.dynamics import (
     MujocoDynamics,
     NeRDDynamics,
 )
-from torchrl_nerd.evaluation.rollout_error import open_loop_errors
+from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
 from torchrl_nerd.evaluation.stability.case import Metrics, Trial, hard_case
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
@@ -84,6 +84,7 @@ def _rollout_error(dynamics: Dynamics, start: TensorDict) -> float:
     torque = start.get(JOINT_TORQUE)[:, None].repeat(1, STEPS, 1)  # (n, STEPS, m)
     torque[:, DRIVEN:] = 0.0
     start = start.select(QPOS, QVEL, TERRAIN, strict=False).clone()
-    exact = MujocoDynamics(dynamics.scene)
-    errors = open_loop_errors(exact, dynamics, start, STEPS, torque)  # (n, STEPS) each
+    both = MujocoDynamics(dynamics.scene), dynamics
+    paths = [open_loop(one, start, STEPS, torque) for one in both]
+    errors = position_errors(dynamics.scene, *paths)  # (n, STEPS) each
     return float(torch.stack(list(errors.values())).mean((0, 2)).nanmedian())
