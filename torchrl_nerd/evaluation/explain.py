@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 from torchrl_nerd.analytic import STEPS, default_step, make_step
 from torchrl_nerd.keys import (
+    CONTACT_DEPTH,
     CONTACT_DISTANCE,
+    CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
     ROBOT_STATE,
@@ -21,6 +23,8 @@ MEANINGS = {
     ROBOT_TORQUE: "joint torque, N and N m",
     CONTACT_DISTANCE: "clearance to the ground minus the margin, m; 0 beyond the margin",
     CONTACT_VELOCITY: "velocity along and across the ground's normal, m/s",
+    CONTACT_DEPTH: "predicted penetration at several times of the step, m",
+    CONTACT_FORCE: "predicted contact force on each degree of freedom, N and N m",
     CONTACT_NORMAL: "normal of the ground in the base frame",
 }
 """Meaning of every feature but ``robot_state``, see `_state_meaning`."""
