@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 import torchrl_nerd.gymnasium
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
-from torchrl_nerd.envs.gymnasium_env import GymnasiumEnv, GymnasiumVectorEnv
+from torchrl_nerd.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from torchrl_nerd.robots import TASKS, make_task
 
 TASK, ID = "cartpole/swingup", "TorchrlNerd/CartpoleSwingup-v0"

@@ -6,7 +6,7 @@ import dm_env
 import numpy as np
 import torch
 from dm_env import specs
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.make import make_env
@@ -45,7 +45,7 @@ class DmEnvironment(dm_env.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Begin the next episode."""
         self._is_over = False
-        return dm_env.restart(self._observe(self.env.reset()))
+        return dm_env.restart(self.env.reset()[OBSERVATION][0].cpu().numpy())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         """Act, or begin an episode where none is under way.
@@ -56,15 +56,13 @@ class DmEnvironment(dm_env.Environment):
         if self._is_over:
             return self.reset()
         given = torch.as_tensor(np.asarray(action), dtype=torch.float32)
-        row = {ACTION: given.to(self.env.device)[None]}
+        row = {ACTION: given.to(self.env.device)[None]}  # (1, A)
         after = self.env.step(TensorDict(row, self.env.batch_size))["next"]
-        observation, reward = self._observe(after), float(after["reward"])
         self._is_over = bool(after["done"])
-        if after["terminated"]:
-            return dm_env.termination(reward, observation)
-        if after["truncated"]:
-            return dm_env.truncation(reward, observation)
-        return dm_env.transition(reward, observation)
+        make = dm_env.transition
+        if self._is_over:
+            make = dm_env.termination if after["terminated"] else dm_env.truncation
+        return make(float(after["reward"]), after[OBSERVATION][0].cpu().numpy())
 
     def observation_spec(self) -> specs.Array:  # pyright: ignore
         """One array, float32."""
@@ -75,6 +73,3 @@ class DmEnvironment(dm_env.Environment):
         """One array in [-1, 1], float32."""
         size = self.env.task.controller.num_actions
         return specs.BoundedArray((size,), np.float32, -1.0, 1.0, ACTION)
-
-    def _observe(self, state: TensorDictBase) -> np.ndarray:
-        return np.array(state[OBSERVATION][0].cpu(), copy=True)

@@ -61,22 +61,23 @@ class Transition:
             ``observation``, ``reward``, ``fault``, the flags, and ``trust`` where the
             dynamics has one.
         """
-        given = torch.where(torch.all(action.isfinite(), -1, keepdim=True), action, 0.0)
-        moved, torque = self._control_step(state, given, state.get(TERRAIN))
+        given = torch.where(action.isfinite().all(-1, keepdim=True), action, 0.0)
+        terrain = state.get(TERRAIN)
+        moved, torque = self._control_step(state, given, terrain)
         trust = moved.get(TRUST)
         for _ in range(self.task.frame_skip - 1):
             graph_break()  # two steps in one piece take minutes to compile
-            moved, torque = self._control_step(moved, given, state.get(TERRAIN))
+            moved, torque = self._control_step(moved, given, terrain)
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])
-        fault = find_faults(action, moved)
+        fault = find_faults(action, moved)  # (num_envs, 1)
         is_good = fault == 0
-        after = dict(state)
-        for key in (QPOS, QVEL):
-            after[key] = torch.where(is_good, moved[key], state[key])
-        felt = {}
+        kept = {
+            key: torch.where(is_good, moved[key], state[key]) for key in (QPOS, QVEL)
+        }
+        after = state | kept
+        shown = after | {ACTION: given}
         if SENSORDATA in moved:
-            felt[SENSORDATA] = torch.where(is_good, moved[SENSORDATA], 0.0)
-        shown = after | felt | {ACTION: given}
+            shown[SENSORDATA] = torch.where(is_good, moved[SENSORDATA], 0.0)
         terminated = self.task.terminated(shown)[:, None] | ~is_good
         truncated = (age + 1 >= self.task.horizon)[:, None]
         if trust is not None:
@@ -133,12 +134,11 @@ class Transition:
         fresh = self.task.initial_state(uniforms(*streams)) | given
         column, num_torques = rows[:, None], len(self.task.scene.actuated)
         start = {k: torch.where(column, fresh[k], state[k]) for k in state}
+        flags = ("done", "terminated", "truncated")
         return start | {
             "joint_torque": start[QPOS].new_zeros(len(rows), num_torques),
             FAULT: torch.zeros_like(column, dtype=torch.long),
             TRUST: torch.ones_like(column, dtype=torch.float32),
             OBSERVATION: self.task.observation(start).to(torch.float32),
-            "done": torch.zeros_like(column),
-            "terminated": torch.zeros_like(column),
-            "truncated": torch.zeros_like(column),
+            **{flag: torch.zeros_like(column) for flag in flags},  # (num_envs, 1) each
         }

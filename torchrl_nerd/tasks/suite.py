@@ -1,8 +1,10 @@
 """Tasks of the dm_control suite in any dynamics: the suite's own code, envs of tensors."""
 
+import copy
 from collections.abc import Callable
 from math import ceil
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,8 +13,19 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.controllers import ActuatorController
-from torchrl_nerd.tasks.suite_reward import SuiteReward
+from torchrl_nerd.scenes.importer import load_suite
 from torchrl_nerd.tasks.task import State, Task
+
+SEEDS = 2**32  # of NumPy's RandomState, which the suite draws from
+FORCES = mujoco.mjtStage.mjSTAGE_ACC  # sensors of this stage need the contact forces
+PARTS = (  # of mj_forward: positions, velocities and the sensors of both
+    mujoco.mj_kinematics,
+    mujoco.mj_comPos,
+    mujoco.mj_comVel,
+    mujoco.mj_subtreeVel,  # or its sensors would read what the env before left
+    mujoco.mj_sensorPos,
+    mujoco.mj_sensorVel,
+)
 
 
 class SuiteTask(Task):
@@ -42,9 +55,8 @@ class SuiteTask(Task):
 
     def __init__(self, name: str, frame_skip: int = 1) -> None:
         self.name, self.frame_skip = name, frame_skip
-        domain, _, task = name.removeprefix("dm_control/").partition("-")
         model = self.scene.model  # refuses what is not supported
-        judge = SuiteReward(domain, task)
+        judge = SuiteReward(name)
         self.horizon = ceil(judge.horizon / frame_skip)
         self.observation_size = judge.observation_size
         width = 3 * len(judge.targets)
@@ -91,6 +103,115 @@ class SuiteTask(Task):
         return _on_rows(self._judge, row)
 
 
+class SuiteReward:
+    """Reset distribution, reward, observation and end of one task, env by env.
+
+    The suite's `Task` reads a `Physics`. Here that `Physics` is never stepped: a state is
+    written in and only what the suite reads is brought up to date.
+
+    | attribute | meaning |
+    |---|---|
+    | ``horizon`` | control steps until the suite's time limit |
+    | ``observation_size`` | width of the suite's observation, flattened in its order |
+    | ``targets`` | geoms that it places at each reset and that touch nothing |
+    | ``forces`` | entries of ``sensordata`` that need contact forces |
+
+    Raises:
+        ValueError: no such task, one without a time limit, or one that changes more at
+            a reset than where its targets are.
+    """
+
+    def __init__(self, name: str) -> None:
+        domain, _, task = name.removeprefix("dm_control/").partition("-")
+        env = load_suite(domain, task)
+        self._task, self._physics = env.task, env.physics
+        if not np.isfinite(env._step_limit):
+            raise ValueError(f"task '{name}' has no time limit: not supported")
+        self.horizon = ceil(env._step_limit)
+        self.targets = np.zeros(0, int)
+        self.targets = self._moved_geoms(name)
+        self.observation_size = len(self._observe())
+        needs_forces = self._model.sensor_needstage == FORCES
+        self.forces = np.flatnonzero(np.repeat(needs_forces, self._model.sensor_dim))
+
+    @property
+    def _model(self) -> mujoco.MjModel:
+        return self._physics.model.ptr
+
+    @property
+    def _data(self) -> mujoco.MjData:
+        return self._physics.data.ptr
+
+    def start(self, u: np.ndarray) -> np.ndarray:
+        """Start of an episode by the suite's own ``initialize_episode``.
+
+        Args:
+            u: ``(1,)`` in [0, 1); the suite's random state is seeded with it.
+
+        Returns:
+            qpos, qvel and the targets' positions, ``(nq + nv + 3 targets,)``.
+        """
+        self._task.random.seed(int(u[0] * SEEDS))
+        with self._physics.reset_context():
+            self._task.initialize_episode(self._physics)
+        target = self._model.geom_pos[self.targets].ravel()
+        return np.concatenate((self._data.qpos, self._data.qvel, target))
+
+    def __call__(self, row: np.ndarray) -> np.ndarray:
+        """Judge one state.
+
+        Args:
+            row: qpos, qvel, the targets' positions, ctrl and the `forces` felt, NaN where
+                nobody knows them: MuJoCo then computes them at this state.
+
+        Returns:
+            Reward, whether the episode ends (0 or 1), observation.
+        """
+        model, data = self._model, self._data
+        sizes = (model.nq, model.nv, 3 * len(self.targets), model.nu)
+        data.qpos, data.qvel, target, data.ctrl, felt = np.split(row, np.cumsum(sizes))
+        model.geom_pos[self.targets] = target.reshape(-1, 3)
+        if np.isnan(felt).any():
+            data.qacc_warmstart = 0.0  # nothing is left of the env before
+            mujoco.mj_forward(model, data)
+        else:
+            for update in PARTS:
+                update(model, data)
+            data.sensordata[self.forces] = felt
+        reward = self._task.get_reward(self._physics)
+        is_end = self._task.get_termination(self._physics) is not None
+        return np.concatenate(((reward, is_end), self._observe()))
+
+    def _observe(self) -> np.ndarray:
+        observation = self._task.get_observation(self._physics)
+        return np.concatenate([np.ravel(part) for part in observation.values()])
+
+    def _moved_geoms(self, name: str) -> np.ndarray:
+        """Geoms that are elsewhere at another reset; nothing else may be different."""
+        models = []
+        for u in (0.25, 0.75):
+            self.start(np.array([u]))
+            models.append(copy.copy(self._model))
+        first, second = models
+        moved = np.flatnonzero((first.geom_pos != second.geom_pos).any(-1))
+        touches = second.geom_contype[moved] | second.geom_conaffinity[moved]
+        has_contacts = not second.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+        second.geom_pos[:], second.light_pos[:] = first.geom_pos, first.light_pos
+        is_same = np.array_equal(_bytes(first), _bytes(second))
+        if not is_same or (has_contacts and touches.any()):
+            raise ValueError(
+                f"task '{name}' changes its robot at every reset: not supported"
+            )
+        return moved
+
+
+def _bytes(model: mujoco.MjModel) -> np.ndarray:
+    """All that a model is made of."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer
+
+
 class _RowMemo:
     """A slow function of rows; a row that is the same as last time keeps its answer."""
 
@@ -101,7 +222,7 @@ class _RowMemo:
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Answers to ``rows (n, k)``; of the same n and k as last time, or all anew."""
         is_known = np.zeros(len(rows), bool)
-        if rows.shape == self._given.shape:
+        if rows.shape == self._given.shape:  # bit for bit: NaN equals NaN
             is_known = (rows.view(np.int64) == self._given.view(np.int64)).all(-1)
         answers = [
             self._answers[i] if is_known[i] else self.function(row)

@@ -18,22 +18,13 @@ TensorDict is one."""
 
 
 class Task(ABC):
-    """Pure functions of the state; the same ones for all dynamics.
+    """Pure functions of the state; the same ones for all dynamics."""
 
-    | attribute | meaning |
-    |---|---|
-    | ``horizon`` | control steps after which an episode is truncated |
-    | ``num_uniforms`` | random numbers that one reset takes |
-    | ``observation_size`` | width of the observation |
-    | ``frame_skip`` | control steps over which an action is held |
-    | ``parameters`` | parameters of each env, drawn at a reset and kept, key -> width |
-    """
-
-    horizon: int
-    num_uniforms: int
-    observation_size: int
-    frame_skip: int = 1
-    parameters: Mapping[str, int] = {}
+    horizon: int  # control steps after which an episode is truncated
+    num_uniforms: int  # random numbers that one reset takes
+    observation_size: int  # width of the observation
+    frame_skip: int = 1  # control steps over which an action is held
+    parameters: Mapping[str, int] = {}  # drawn at a reset and kept, key -> width
 
     @cached_property
     def scene(self) -> Scene:

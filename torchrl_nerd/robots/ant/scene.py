@@ -32,27 +32,20 @@ def ant() -> Scene:
     for joint in JOINTS:
         set_penalty_limit(model, joint, **LIMIT)
     near, far = ANKLE
-    # Reference code, utils/commons.py.
-    base = BaseSampling(
-        low=(-10.0, -10.0, 1.0),
-        high=(10.0, 10.0, 1.3),
-        tilt=pi / 2,
-        linear_low=(-1.0, -1.0, -1.0),
-        linear_high=(1.0, 1.0, 1.0),
-        angular_low=(-pi, -pi, -pi),
-        angular_high=(pi, pi, pi),
-    )
-    return Scene(
-        name="ant",
-        model=model,
-        substeps=SUBSTEPS,
-        controller=TorqueController((GAIN,) * 8),
-        sampling=Sampling(
-            qpos_low=(-HIP, near, -HIP, -far, -HIP, -far, -HIP, near),
-            qpos_high=(HIP, far, HIP, -near, HIP, -near, HIP, far),
-            qvel_low=(-2 * pi,) * 8,
-            qvel_high=(2 * pi,) * 8,
-            torque=(GAIN,) * 8,
-            base=base,
+    sampling = Sampling(  # reference code, utils/commons.py
+        qpos_low=(-HIP, near, -HIP, -far, -HIP, -far, -HIP, near),
+        qpos_high=(HIP, far, HIP, -near, HIP, -near, HIP, far),
+        qvel_low=(-2 * pi,) * 8,
+        qvel_high=(2 * pi,) * 8,
+        torque=(GAIN,) * 8,
+        base=BaseSampling(
+            low=(-10.0, -10.0, 1.0),
+            high=(10.0, 10.0, 1.3),
+            tilt=pi / 2,
+            linear_low=(-1.0, -1.0, -1.0),
+            linear_high=(1.0, 1.0, 1.0),
+            angular_low=(-pi, -pi, -pi),
+            angular_high=(pi, pi, pi),
         ),
     )
+    return Scene("ant", model, SUBSTEPS, TorqueController((GAIN,) * 8), sampling)

@@ -51,33 +51,26 @@ def anymal() -> Scene:
     set_penalty_contact(model, **CONTACT)
     for leg in LEGS:
         set_penalty_limit(model, f"{leg}_HAA", **LIMIT)
-    # Starts of the reference's data, which are those of its env.
-    base = BaseSampling(
-        low=(-0.2, -0.2, 0.65),
-        high=(0.2, 0.2, 1.0),
-        tilt=pi / 6,
-        linear_low=(-0.1, -0.1, -0.1),
-        linear_high=(0.1, 0.1, 0.1),
-        angular_low=(-0.25, -0.25, -0.25),
-        angular_high=(0.25, 0.25, 0.25),
-    )
-    return Scene(
-        name="anymal",
-        model=model,
-        substeps=SUBSTEPS,
-        controller=TorqueController(GAIN),
-        sampling=Sampling(
-            qpos_low=tuple(q - 0.2 for q in STANDING_POSE),
-            qpos_high=tuple(q + 0.2 for q in STANDING_POSE),
-            qvel_low=(-0.25,) * 12,
-            qvel_high=(0.25,) * 12,
-            torque=GAIN,
-            base=base,
-            drive=random_pd,
-            zero_torque_fraction=0.1,
-            low_torque_fraction=0.4,
+    sampling = Sampling(
+        qpos_low=tuple(q - 0.2 for q in STANDING_POSE),
+        qpos_high=tuple(q + 0.2 for q in STANDING_POSE),
+        qvel_low=(-0.25,) * 12,
+        qvel_high=(0.25,) * 12,
+        torque=GAIN,
+        base=BaseSampling(  # of the reference's data, as of its env
+            low=(-0.2, -0.2, 0.65),
+            high=(0.2, 0.2, 1.0),
+            tilt=pi / 6,
+            linear_low=(-0.1, -0.1, -0.1),
+            linear_high=(0.1, 0.1, 0.1),
+            angular_low=(-0.25, -0.25, -0.25),
+            angular_high=(0.25, 0.25, 0.25),
         ),
+        drive=random_pd,
+        zero_torque_fraction=0.1,
+        low_torque_fraction=0.4,
     )
+    return Scene("anymal", model, SUBSTEPS, TorqueController(GAIN), sampling)
 
 
 def random_pd(
@@ -86,12 +79,11 @@ def random_pd(
     """Springs and dampers to random targets about the standing pose, N m, ``(n, 12)``.
 
     target = pose + 0.5 a, a uniform in [-1, 1]. Rows of scale 1 are the reference's: Kp
-    and Kd are drawn anew at every step, here per row (there one for all rows). A torque
-    that is held over the control step dt pumps energy as a damping of -Kp dt / 2 would;
-    this much is added to Kd, or a quarter of all trajectories would blow up within 100
-    steps (the reference drops them). Quiet rows (0 < scale < 1) have the tasks' Kp and Kd
-    and targets within ``scale`` of that range: they stand and shuffle as a policy would,
-    which the violent ones never do. Rows of scale 0 are passive.
+    and Kd are drawn at every step, here per row. A torque that is held over the control
+    step dt adds energy as a damping of -Kp dt / 2 would; this much is added to Kd, or a
+    quarter of all trajectories would diverge within 100 steps. Quiet rows (0 < scale < 1)
+    have the tasks' Kp and Kd and targets within ``scale`` of that range: they stand and
+    shuffle as a policy would. Rows of scale 0 are passive.
     """
     rows = len(qpos)
     draw = torch.rand(rows, 14, dtype=torch.float64, generator=generator)

@@ -23,16 +23,11 @@ def cartpole() -> Scene:
     path = Path(__file__).with_name("cartpole.xml")
     model = mujoco.MjModel.from_xml_path(str(path))
     set_penalty_limit(model, "slider", **LIMIT)
-    return Scene(
-        name="cartpole",
-        model=model,
-        substeps=SUBSTEPS,
-        controller=TorqueController((GAIN,)),
-        sampling=Sampling(
-            qpos_low=(-3.5, -pi),
-            qpos_high=(3.5, pi),
-            qvel_low=(-10.0, -10.0),
-            qvel_high=(10.0, 10.0),
-            torque=(GAIN,),
-        ),
+    sampling = Sampling(
+        qpos_low=(-3.5, -pi),
+        qpos_high=(3.5, pi),
+        qvel_low=(-10.0, -10.0),
+        qvel_high=(10.0, 10.0),
+        torque=(GAIN,),
     )
+    return Scene("cartpole", model, SUBSTEPS, TorqueController((GAIN,)), sampling)

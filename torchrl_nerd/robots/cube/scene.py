@@ -19,6 +19,11 @@ SUBSTEPS = 20  # of 1/2960 s: control step 1/148 s, the real tosses' frame rate
 # kd dt / m = 1.6 < 2. In MuJoCo's friction cone slip also lifts (see penalty.py): sliding
 # at 1 m/s the cube hops by 1 mm, at 3 m/s by 9 mm, and slows down by mu g all the same.
 CONTACT = {"ke": 1e4, "kd": 1e3, "kf": 50.0, "mu": 0.15}
+# The paper's numbers times the ratio of the masses, so that both cubes fall and bounce
+# alike. Its own damping of 1,000 N s/m would be unstable: over one substep it changes a
+# corner's speed by 4.3 times that speed, where 2 is the limit.
+LIGHTER = 0.37 / 1.15102
+REAL_CONTACT = {k: v if k == "mu" else LIGHTER * v for k, v in CONTACT.items()}
 HALF = 0.0524  # m, half the side
 
 # Starts of tosses; reference code, env_cube_toss. Drawn again until all corners are clear.
@@ -34,23 +39,19 @@ START = BaseSampling(
 CLEARANCE = 1e-3  # m
 UP = (0.0, 0.0, 1.0)  # normal of level ground
 STEEPEST = pi / 9  # rad; friction holds the cube up to atan(0.15) = 0.149
-# The paper's numbers times the ratio of the masses, so that both cubes fall and bounce
-# alike. Its own damping of 1,000 N s/m would be unstable: over one substep it changes a
-# corner's speed by 4.3 times that speed, where 2 is the limit.
-LIGHTER = 0.37 / 1.15102
 
 
 @cache
 def cube() -> Scene:
     """Build the scene. ``qpos`` = centre (m), quaternion."""
-    return cube_scene("cube", CONTACT)
+    return _scene("cube", mujoco.MjSpec.from_file(str(cube_path("cube"))))
 
 
 @cache
 def cube_real() -> Scene:
     """Build the scene. ``qpos`` = centre (m), quaternion."""
-    forces = {key: LIGHTER * CONTACT[key] for key in ("ke", "kd", "kf")}
-    return cube_scene("cube_real", {**forces, "mu": CONTACT["mu"]})
+    spec = mujoco.MjSpec.from_file(str(cube_path("cube_real")))
+    return _scene("cube_real", spec, REAL_CONTACT)
 
 
 @cache
@@ -69,7 +70,25 @@ def cube_slope() -> Scene:
         rgba=level.rgba,
     )
     spec.delete(level)
-    return cube_scene("cube_slope", CONTACT, spec.compile(), sample_slope)
+    return _scene("cube_slope", spec, ground=sample_slope)
+
+
+def cube_path(name: str) -> Path:
+    """Where the cube of that name is described."""
+    return Path(__file__).with_name(f"{name}.xml")
+
+
+def _scene(
+    name: str,
+    spec: mujoco.MjSpec,
+    contact: dict[str, float] = CONTACT,
+    ground: GroundSampler | None = None,
+) -> Scene:
+    model = spec.compile()
+    set_penalty_contact(model, **contact)
+    no_joints = ((), (), (), (), ())
+    sampling = Sampling(*no_joints, base=START, ground=ground, clearance=CLEARANCE)
+    return Scene(name, model, SUBSTEPS, TorqueController(()), sampling)
 
 
 def sample_slope(qpos: Tensor, generator: Generator) -> Tensor:
@@ -91,7 +110,7 @@ def slope_beneath(qpos: Tensor, u: Tensor) -> Tensor:
     place, quat = qpos[..., :3], qpos[..., 3:]
     gap = place[..., 2] - cube_reach(quat, quat.new_tensor(UP))
     offset = (normal * place).sum(-1) - cube_reach(quat, normal) - gap
-    return torch.cat((normal, offset[..., None]), -1)
+    return torch.cat((normal, offset[..., None]), -1)  # (*batch, 3 + 1)
 
 
 def cube_reach(quat: Tensor, direction: Tensor) -> Tensor:
@@ -101,38 +120,5 @@ def cube_reach(quat: Tensor, direction: Tensor) -> Tensor:
         quat: ``(*batch, 4)``.
         direction: of unit length, world, ``(*batch, 3)``.
     """
-    along = (direction[..., None, :] @ matrix_from_quat(quat))[..., 0, :]
+    along = (direction[..., None, :] @ matrix_from_quat(quat))[..., 0, :]  # (*batch, 3)
     return HALF * along.abs().sum(-1)
-
-
-def cube_path(name: str) -> Path:
-    """Where the cube of that name is described."""
-    return Path(__file__).parent / f"{name}.xml"
-
-
-def cube_scene(
-    name: str,
-    contact: dict[str, float],
-    model: mujoco.MjModel | None = None,
-    ground: GroundSampler | None = None,
-) -> Scene:
-    """A cube with penalty contacts: of that model, or of that name in the assets."""
-    if model is None:
-        model = mujoco.MjModel.from_xml_path(str(cube_path(name)))
-    set_penalty_contact(model, **contact)
-    return Scene(
-        name=name,
-        model=model,
-        substeps=SUBSTEPS,
-        controller=TorqueController(()),
-        sampling=Sampling(
-            qpos_low=(),
-            qpos_high=(),
-            qvel_low=(),
-            qvel_high=(),
-            torque=(),
-            base=START,
-            ground=ground,
-            clearance=CLEARANCE,
-        ),
-    )

@@ -34,9 +34,7 @@ GROUNDS = (
     (-0.3, (0.0, 0.0, 0.0)),
     (0.0, (pi / 8, 0.0, 0.0)),
 )
-
-
-ASSET = Path(__file__).parent / "double_pendulum.xml"
+ASSET = Path(__file__).with_name("double_pendulum.xml")
 
 
 @cache
@@ -66,22 +64,18 @@ def _scene(
     clearance: float | None = None,
 ) -> Scene:
     set_penalty_contact(model, **CONTACT)
-    return Scene(
-        name="double_pendulum",
-        model=model,
-        substeps=SUBSTEPS,
-        controller=TorqueController((GAIN, GAIN)),
-        sampling=Sampling(
-            qpos_low=(-pi, -pi),
-            qpos_high=(pi, pi),
-            qvel_low=(-2 * pi, -4 * pi),
-            qvel_high=(2 * pi, 4 * pi),
-            torque=(GAIN, GAIN),
-            ground=ground,
-            level_ground=None if ground is None else sample_level_ground,
-            clearance=clearance,
-        ),
+    sampling = Sampling(
+        qpos_low=(-pi, -pi),
+        qpos_high=(pi, pi),
+        qvel_low=(-2 * pi, -4 * pi),
+        qvel_high=(2 * pi, 4 * pi),
+        torque=(GAIN, GAIN),
+        ground=ground,
+        level_ground=None if ground is None else sample_level_ground,
+        clearance=clearance,
     )
+    controller = TorqueController((GAIN, GAIN))
+    return Scene("double_pendulum", model, SUBSTEPS, controller, sampling)
 
 
 def sample_ground(qpos: Tensor, generator: Generator) -> Tensor:
@@ -92,8 +86,7 @@ def sample_ground(qpos: Tensor, generator: Generator) -> Tensor:
     Source: reference code, ``generate/trajectory_sampler_pendulum.py``.
     """
     draw = torch.rand(len(qpos), 4, dtype=torch.float64, generator=generator)
-    normal = 2.0 * draw[:, :3] - 1.0
-    normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    normal = torch.nn.functional.normalize(2.0 * draw[:, :3] - 1.0, dim=-1)  # (n, 3)
     return _plane(normal, qpos, draw[:, 3])
 
 

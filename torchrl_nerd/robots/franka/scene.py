@@ -45,17 +45,6 @@ def franka_gravity() -> Scene:
 
 def _arm(name: str, low: Joints, high: Joints, torque: Joints) -> Scene:
     """The arm in the MJCF file of that name; ranges of angles in rad, torque in N m."""
-    path = Path(__file__).parent / f"{name}.xml"
-    return Scene(
-        name=name,
-        model=mujoco.MjModel.from_xml_path(str(path)),
-        substeps=SUBSTEPS,
-        controller=TorqueController(GAIN),
-        sampling=Sampling(
-            qpos_low=low,
-            qpos_high=high,
-            qvel_low=(-pi,) * 7,
-            qvel_high=(pi,) * 7,
-            torque=torque,
-        ),
-    )
+    model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name(f"{name}.xml")))
+    sampling = Sampling(low, high, (-pi,) * 7, (pi,) * 7, torque)
+    return Scene(name, model, SUBSTEPS, TorqueController(GAIN), sampling)
