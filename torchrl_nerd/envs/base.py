@@ -30,8 +30,7 @@ class SceneEnv(EnvBase):
 
     Per env: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
-    the control step that led here (zero after a reset); where a task holds an action over
-    several control steps, over the last of them. Random numbers are each env's own, so its
+    the last control step (zero after a reset). Random numbers are each env's own, so its
     episodes do not depend on how many envs there are. ``reset(td, set_state=True)``
     starts from the ``qpos``, ``qvel`` and parameters in ``td``.
 
@@ -89,15 +88,14 @@ class SceneEnv(EnvBase):
             model = inner.model if isinstance(inner, NeRDDynamics) else None
             self.recorder = FaultRecorder(dump_dir, about, model)
         self._make_specs()
-        zeros = torch.zeros(num_envs, dtype=torch.long, device=self.device)
-        self.register_buffer("_episode", zeros)
-        self.register_buffer("_age", zeros.clone())
-        self.register_buffer("_keys", zeros.clone(), persistent=False)
+        zeros = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
+        for name in ("_episode", "_age"):
+            self.register_buffer(name, zeros.long())
+        for key, size in self._state_sizes.items():  # (num_envs, size) each
+            self.register_buffer(f"_state_{key}", zeros[:, None].repeat(1, size))
         offsets = stream_offsets(task.num_uniforms, self.device)
         self.register_buffer("_offsets", offsets, persistent=False)
-        for key, size in self._state_sizes.items():
-            value = torch.zeros(num_envs, size, dtype=torch.float64, device=self.device)
-            self.register_buffer(f"_state_{key}", value)
+        self.register_buffer("_keys", zeros.long(), persistent=False)
         self._set_seed(seed)
 
     def __repr__(self) -> str:
@@ -111,14 +109,13 @@ class SceneEnv(EnvBase):
     def compile(self, *, warmup: int | None = None, **kwargs: Any) -> "SceneEnv":
         """Make one compiled piece of a step, and one of a reset; returns the env itself.
 
-        TorchRL calls it for ``compile=`` in a constructor; its own goes through the
-        bookkeeping too, in many pieces, and leaves `step` as it is. Without a compiler,
-        eager with one warning. `eager` undoes it.
+        TorchRL calls it for ``compile=`` in a constructor; its own would compile the
+        bookkeeping, in many pieces. Without a compiler, eager with one warning.
 
         Args:
             warmup: eager steps before the first compiled one; 1 where not given.
-            kwargs: of `torch.compile`; where no mode, backend or options are among
-                them, those that suit the model.
+            kwargs: of `torch.compile`; without mode, backend or options, those that suit
+                the model.
         """
         suits: Mapping[str, Any] = {}
         if (inner := self._torch_dynamics) is not None:
@@ -143,8 +140,8 @@ class SceneEnv(EnvBase):
     def _torch_dynamics(self) -> TorchDynamics | None:
         """The model that steps, guarded or not; None for an engine."""
         dynamics = self.dynamics
-        inner = dynamics.learned if isinstance(dynamics, GuardedDynamics) else dynamics
-        return inner if isinstance(inner, TorchDynamics) else None
+        dynamics = getattr(dynamics, "learned", dynamics)
+        return dynamics if isinstance(dynamics, TorchDynamics) else None
 
     @property
     def _state_sizes(self) -> dict[str, int]:
@@ -209,8 +206,9 @@ class SceneEnv(EnvBase):
         **kwargs: object,
     ) -> TensorDict:
         rows = None if tensordict is None else tensordict.get("_reset", None)
-        every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        rows = every if rows is None else rows.reshape(self.batch_size)
+        if rows is None:
+            rows = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        rows = rows.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
         given = self._given_state(tensordict, rows) if set_state else {}
         old = self._state()
         if rows.all():  # nothing of the past is left: no gradients of it either

@@ -1,9 +1,8 @@
 """What can go wrong in an env, found env by env, and written down to be replayed.
 
 A fault ends its env as ``terminated`` at its last good state and leaves the others bitwise
-as they are. With a folder to write to, the first fault of each kind leaves a dump there:
-the last states, torques, actions and the ground of one such env, and what the model made
-of them.
+as they are. With a folder, the first fault of each kind leaves a dump there: the last
+states, torques, actions and the ground of one such env, and the model's features of them.
 """
 
 from collections import deque
@@ -67,10 +66,10 @@ class FaultRecorder:
     def record(
         self, state: Mapping[str, Tensor], action: Tensor, torque: Tensor, fault: Tensor
     ) -> None:
-        """Keep a step; write what it broke for the first time.
+        """Keep a step; write a dump of each kind of fault that is new.
 
         Args:
-            state: before the step, ``[num_envs]``.
+            state: before the step, ``(num_envs, size)`` each.
             action: ``(num_envs, num_actions)``, as it was given.
             torque: ``(num_envs, num_actuated)``.
             fault: ``(num_envs, 1)`` from `find_faults`.

@@ -20,14 +20,10 @@ def frame_stack_of(actor: Actor) -> int:
 def stack_frames(env: SceneEnv, frame_stack: int) -> SceneEnv:
     """An env whose ``observation`` is its last ones side by side, the oldest first.
 
-    The first one after a reset stands for those before it.
-
-    Args:
-        env: whose observations to stack.
-        frame_stack: how many observations, the present one included; 1: ``env`` itself.
+    The first one after a reset stands for those before it. One frame is ``env`` itself.
 
     Raises:
-        ValueError: no observation at all.
+        ValueError: less than one frame.
 
     Examples:
         >>> from torchrl_nerd.envs import make_env
@@ -45,15 +41,12 @@ def stack_frames(env: SceneEnv, frame_stack: int) -> SceneEnv:
 def append_frame(
     recent: Tensor | None, observation: Tensor, frame_stack: int
 ) -> Tensor:
-    """What `stack_frames` shows, for a loop without an env.
+    """What `stack_frames` shows, ``(*batch, frame_stack * D)``, for a loop without an env.
 
     Args:
         recent: what this function gave one action ago; None at the start.
         observation: ``(*batch, D)``.
         frame_stack: how many observations.
-
-    Returns:
-        ``(*batch, frame_stack * D)``.
     """
     if recent is None:
         return observation.tile(frame_stack)

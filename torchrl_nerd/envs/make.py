@@ -9,13 +9,7 @@ from torchrl_nerd.dynamics import GuardedDynamics, Model, NeRDDynamics, dynamics
 from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.resolve import (
-    ENGINES,
-    Engine,
-    is_engine,
-    model_name,
-    resolve_model,
-)
+from torchrl_nerd.envs.resolve import ENGINES, Engine, model_name, resolve_model
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
@@ -27,10 +21,8 @@ class GroundTruthEnv(SceneEnv):
     Args:
         task: id of a registered task, or a task.
         engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``).
-        num_envs: how many envs step together.
-        seed: of the resets.
+        num_envs, seed, dump_dir: see `SceneEnv`.
         device: where all tensors live, and MuJoCo Warp runs; the others use the CPU.
-        dump_dir: see `SceneEnv`.
 
     Raises:
         ValueError: an unknown engine, or one that cannot step this scene.
@@ -51,7 +43,7 @@ class GroundTruthEnv(SceneEnv):
         device: torch.device | str = "cpu",
         dump_dir: Path | None = None,
     ) -> None:
-        if not is_engine(engine):
+        if engine not in ENGINES:
             raise ValueError(
                 f"unknown engine {engine!r}, expected one of {', '.join(ENGINES)}"
             )
@@ -68,13 +60,11 @@ class NeRDEnv(SceneEnv):
     Args:
         task: id of a registered task, or a task.
         model: a model, or the name of one, see `resolve_model`.
-        num_envs: how many envs step together.
-        seed: of the resets.
+        num_envs, seed, dump_dir: see `SceneEnv`.
         device: where the model and all tensors live.
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
         guard: what to do with steps far from the training data, see `GuardedDynamics`;
             None steps all alike.
-        dump_dir: see `SceneEnv`.
         differentiable: record gradients through every step, to actions and states, and to
             the weights where they ask for them.
 
@@ -104,11 +94,9 @@ class NeRDEnv(SceneEnv):
         if not isinstance(model, Model):
             name, model = model, resolve_model(model, task.scene)
             name = model_name(name, task.scene)
-        dynamics = dynamics_of(
-            model.to(expect_device(str(device))),
-            differentiable=differentiable,
-            inference=inference,
-        )
+        model = model.to(expect_device(str(device)))
+        how = {"differentiable": differentiable, "inference": inference}
+        dynamics = dynamics_of(model, **how)
         if isinstance(dynamics, NeRDDynamics):
             if guard is not None:
                 dynamics = GuardedDynamics(dynamics, guard)
@@ -156,7 +144,7 @@ def make_env(
         "device": device,
         "dump_dir": dump_dir,
     }
-    if is_engine(dynamics):
+    if isinstance(dynamics, str) and dynamics in ENGINES:
         if differentiable:
             raise ValueError(
                 "expected learned, hybrid or analytic dynamics for gradients, got "

@@ -28,11 +28,6 @@ KINDS = ("nerd", "hybrid", "analytic")
 """Names of the models of a scene, beside those of engines and of shipped models."""
 
 
-def is_engine(dynamics: object) -> bool:
-    """Whether that is the name of a ground-truth engine."""
-    return isinstance(dynamics, str) and dynamics in ENGINES
-
-
 def model_name(name: str | Path, scene: Scene) -> str:
     """The model that a name stands for: ``"ant-mlp"`` for ``"nerd"`` or ``"ant"``.
 

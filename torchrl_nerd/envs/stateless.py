@@ -13,16 +13,14 @@ from torchrl_nerd.envs.base import SceneEnv
 class StatelessEnv(EnvBase):
     """Steps from the state that the tensordict holds, whatever its batch size.
 
-    TorchRL's planners (`CEMPlanner`, `MPPIPlanner`) try many actions from one state and so
-    need an env that takes any batch and keeps no state; a `SceneEnv` has a fixed number
-    of envs, each with its state. This is a view of one: a tensordict of another state
-    than the env was left in sets that state, so its history is empty; one that the env
-    itself has just returned goes on, with its history. A reset begins episodes as in
-    ``env``; without a tensordict it gives all its envs.
+    For TorchRL's planners (`CEMPlanner`, `MPPIPlanner`), which try many actions from one
+    state. A view of a `SceneEnv`: a tensordict of another state than it was left in sets
+    that state, with an empty history; one that it has just returned goes on, with its
+    history. A reset begins episodes as in ``env``; without a tensordict, all of them.
 
     Args:
-        env: what steps; its ``num_envs`` is the number of envs of every tensordict, as
-            states to plan for times candidates.
+        env: what steps; every tensordict has ``num_envs`` elements, such as states to
+            plan for times candidates.
 
     Examples:
         >>> from torchrl_nerd.envs import make_env
@@ -54,11 +52,7 @@ class StatelessEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         given = tensordict.reshape(-1)
-        if not self._is_here(given):
+        state = self.env._state()
+        if not all(torch.equal(given[key], value) for key, value in state.items()):
             self.env.reset(given.exclude("_reset"), set_state=True)
         return self.env._step(given).reshape(tensordict.shape)
-
-    def _is_here(self, given: TensorDictBase) -> bool:
-        """Whether the env stands where ``given`` does."""
-        state = self.env._state()
-        return all(torch.equal(given[key], value) for key, value in state.items())

@@ -1,11 +1,9 @@
 """Random numbers that belong to an env, not to a batch.
 
-Env i of episode k gets the same numbers whatever the number of envs, whichever envs are
-reset beside it, and on every device: each number is a hash of (seed, env, episode, index).
-The hash is SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number
-generators", OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). Whatever counts envs and
-numbers is made outside of compiled code and handed in: there products with a range that is
-made on the spot are not kept modulo 2^64 (torch 2.13 on a CPU).
+Each number is a hash of (seed, env, episode, index), on every device, whatever the number
+of envs and whichever are reset beside it. The hash is SplitMix64 (Steele, Lea and Flood,
+OOPSLA 2014, https://doi.org/10.1145/2660193.2660195). Ranges of envs and numbers are made
+outside of compiled code, where their products are not kept modulo 2^64 (torch 2.13, CPU).
 """
 
 import torch

@@ -25,18 +25,16 @@ SCENES = {k: v for robot in ROBOTS.values() for k, v in robot.scenes.items()}
 TASKS = {k: v for robot in ROBOTS.values() for k, v in robot.tasks.items()}
 PRESETS = {k: v for robot in ROBOTS.values() for k, v in robot.presets.items()}
 PPO_CONFIGS = {k: v for robot in ROBOTS.values() for k, v in robot.ppo.items()}
-THIRD_PARTY = (
-    Preset(  # an MLP on single states: nobody has tuned anything for such robots
-        protocol=None,
-        data=DataConfig(trajectories=10_000, steps=100),
-        train=TrainConfig(
-            network="mlp-4x128",
-            steps=10_000,
-            rollout_steps=500,
-            single_step_fraction=1.0,
-            loss_eps=0.02,
-        ),
-    )
+THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
+    protocol=None,
+    data=DataConfig(trajectories=10_000, steps=100),
+    train=TrainConfig(
+        network="mlp-4x128",
+        steps=10_000,
+        rollout_steps=500,
+        single_step_fraction=1.0,
+        loss_eps=0.02,
+    ),
 )
 
 
@@ -121,9 +119,6 @@ __all__ = [
     "SCENES",
     "TASKS",
     "EvaluationProtocol",
-    "Preset",
-    "RecordedProtocol",
-    "Robot",
     "Source",
     "load_scene",
     "make_task",

@@ -1,4 +1,4 @@
-"""What tasks of robots with a floating base share: tilted starts, and what is seen.
+"""What tasks share: uniform draws, and what is seen of a robot with a floating base.
 
 Joint positions come after the base's seven numbers, joint velocities after its six. The
 reference code's axes are y up; here z is up, x forward and y to the left (its -z).
@@ -7,7 +7,7 @@ reference code's axes are y up; here z is up, x forward and y to the left (its -
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.rotations import random_tilt, rotate
+from torchrl_nerd.geometry.rotations import rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.tasks.task import State, Task
 
@@ -17,32 +17,10 @@ def symmetric(u: Tensor, half: Tensor | float) -> Tensor:
     return (2.0 * u - 1.0) * half
 
 
-def tilted_start(
-    u: Tensor, center: Tensor, spread: tuple[float, float, float], tilt: float
-) -> dict[str, Tensor]:
-    """A floating base near ``center``, tilted and slowly moving, its joints too.
-
-    Position within ``spread`` (m), joints within 0.2 rad, velocities within 0.1 m/s and
-    0.25 rad/s, both of the base in its own axes.
-
-    Args:
-        u: ``(*batch, 13 + 2 n)`` uniform numbers, for n joints.
-        center: ``(3 + n,)`` position of the base (m) and of the joints (rad).
-        spread: half ranges of the base's position, m, world.
-        tilt: largest angle of `random_tilt`, rad.
-    """
-    joints = len(center) - 3
-    sizes = [3, 4, 3, 3, joints, joints]
-    where, turn, linear, angular, pose, rates = u.split(sizes, -1)
-    quat = random_tilt(turn, tilt)
-    position = center[:3] + symmetric(where, u.new_tensor(spread))
-    pose = center[3:] + symmetric(pose, 0.2)
-    velocity = rotate(quat, symmetric(linear, 0.1))
-    rates = torch.cat((symmetric(angular, 0.25), symmetric(rates, 0.25)), -1)
-    return {
-        QPOS: torch.cat((position, quat, pose), -1),
-        QVEL: torch.cat((velocity, rates), -1),
-    }
+def between(u: Tensor, low: tuple[float, ...], high: tuple[float, ...]) -> Tensor:
+    """Numbers in [low, high) from uniform ones in [0, 1), ``(*batch, n)``."""
+    a, b = u.new_tensor(low), u.new_tensor(high)
+    return a + (b - a) * u
 
 
 def angular_velocity(state: State) -> Tensor:

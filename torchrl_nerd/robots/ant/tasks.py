@@ -3,18 +3,19 @@
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.rotations import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.ant.scene import STANDING_POSE, ant
 from torchrl_nerd.tasks.floating import (
     WalkingTask,
     angular_velocity,
     heading,
-    tilted_start,
+    symmetric,
     uprightness,
 )
 from torchrl_nerd.tasks.task import State
 
-START_HEIGHT = 1.0  # m
+START = (0.0, 0.0, 1.0)  # m, of the torso
 START_SPREAD = (0.2, 0.2, 0.1)  # m
 START_TILT = torch.pi / 6  # rad
 MIN_HEIGHT = 0.3  # m
@@ -34,9 +35,21 @@ class Ant(WalkingTask):
     observation_size = 29
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """Above the ground, tilted up to 30 degrees, near the standing pose."""
-        center = u.new_tensor((0.0, 0.0, START_HEIGHT, *STANDING_POSE))
-        return tilted_start(u, center, START_SPREAD, START_TILT)
+        """Above the ground, tilted up to 30 degrees, near the standing pose.
+
+        Joints within 0.2 rad of it; velocities within 0.1 m/s and 0.25 rad/s, those of the
+        base in its own axes.
+        """
+        where, turn, linear, angular, pose, rates = u.split([3, 4, 3, 3, 8, 8], -1)
+        quat = random_tilt(turn, START_TILT)
+        position = u.new_tensor(START) + symmetric(where, u.new_tensor(START_SPREAD))
+        pose = u.new_tensor(STANDING_POSE) + symmetric(pose, 0.2)
+        velocity = rotate(quat, symmetric(linear, 0.1))
+        rates = symmetric(torch.cat((angular, rates), -1), 0.25)  # (*batch, 3 + 8)
+        return {
+            QPOS: torch.cat((position, quat, pose), -1),  # (*batch, 3 + 4 + 8)
+            QVEL: torch.cat((velocity, rates), -1),
+        }
 
     def terminated(self, next_state: State) -> Tensor:
         """The torso is too low, bool ``(*batch,)``."""

@@ -15,7 +15,7 @@ from torchrl_nerd.robots.cube.scene import (
     cube_slope,
     slope_beneath,
 )
-from torchrl_nerd.tasks.floating import angular_velocity
+from torchrl_nerd.tasks.floating import angular_velocity, between
 from torchrl_nerd.tasks.task import State, Task
 
 
@@ -43,8 +43,8 @@ class CubeToss(Task):
         low = u.new_tensor(START.low).expand_as(where).clone()
         low[..., 2] = low[..., 2].maximum(reach + CLEARANCE)
         position = low + (u.new_tensor(START.high) - low) * where
-        velocity = _between(START.linear_low, START.linear_high, linear)
-        spin = _between(START.angular_low, START.angular_high, angular)
+        velocity = between(linear, START.linear_low, START.linear_high)
+        spin = between(angular, START.angular_low, START.angular_high)
         return {
             QPOS: torch.cat((position, quat), -1),
             QVEL: torch.cat((rotate(quat, velocity), spin), -1),
@@ -77,8 +77,3 @@ class SlopeToss(CubeToss):
         toss, slope = u.split([CubeToss.num_uniforms, 2], -1)
         state = super().initial_state(toss)
         return state | {TERRAIN: slope_beneath(state[QPOS], slope)}
-
-
-def _between(low: tuple[float, ...], high: tuple[float, ...], u: Tensor) -> Tensor:
-    a, b = u.new_tensor(low), u.new_tensor(high)
-    return a + (b - a) * u

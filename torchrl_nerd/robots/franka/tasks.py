@@ -10,7 +10,7 @@ from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
 from torchrl_nerd.robots.franka.scene import GAIN, HOME, franka, franka_gravity
 from torchrl_nerd.scenes.controllers import PDController
-from torchrl_nerd.tasks.floating import symmetric
+from torchrl_nerd.tasks.floating import between, symmetric
 from torchrl_nerd.tasks.task import State, Task
 
 START_SPREAD = 0.125  # rad about HOME
@@ -37,11 +37,10 @@ class FrankaReachTorque(Task):
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """At rest near home; the goal is uniform in a box before the robot."""
-        low, high = u.new_tensor(GOAL_LOW), u.new_tensor(GOAL_HIGH)
         return {
             QPOS: u.new_tensor(HOME) + symmetric(u[..., :7], START_SPREAD),
             QVEL: torch.zeros_like(u[..., :7]),
-            GOAL: low + (high - low) * u[..., 7:],
+            GOAL: between(u[..., 7:], GOAL_LOW, GOAL_HIGH),
         }
 
     def end_effector(self, qpos: Tensor) -> Tensor:
@@ -82,15 +81,9 @@ class FrankaReach(FrankaReachTorque):
     @property
     def controller(self) -> PDController:
         """Springs to a place near the present one, within the effort limits."""
-        joints = tuple(range(7))
+        joints, scale = tuple(range(7)), (ACTION_SCALE,) * 7
         return PDController(
-            qpos_addresses=joints,
-            dof_addresses=joints,
-            kp=KP,
-            kd=KD,
-            scale=(ACTION_SCALE,) * 7,
-            relative_to="current",
-            limit=GAIN,
+            joints, joints, KP, KD, scale, relative_to="current", limit=GAIN
         )
 
 
