@@ -83,7 +83,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Observations, rewards, terminated, truncated of all envs; an empty info."""
-        env, begins = self.env, self._is_over
+        env, begins = self.env, self._is_over  # (num_envs,): whose action is ignored
         given = torch.as_tensor(np.asarray(actions), dtype=torch.float32).to(env.device)
         after = env.step(TensorDict({ACTION: given}, env.batch_size))["next"]
         observation, reward = (

@@ -121,6 +121,7 @@ class SceneEnv(EnvBase):
         if (inner := self._torch_dynamics) is not None:
             is_chosen = not kwargs.keys().isdisjoint(("mode", "backend", "options"))
             suits = {} if is_chosen else inner.compile_options
+            # in parts on threads a model compiles its own step, the env what is round it
             inner.compile = not kwargs and inner.parts(self.batch_size.numel()) > 1
             self._transition.is_round = inner.compile
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}

@@ -40,7 +40,7 @@ def find_faults(action: Tensor, moved: Mapping[str, Tensor]) -> Tensor:
     is_fast, is_far = qvel.abs() > LARGEST_SPEED, qpos.abs() > FARTHEST
     runs = torch.any(is_fast, -1) | torch.any(is_far, -1)
     is_finite = torch.all(qpos.isfinite(), -1) & torch.all(qvel.isfinite(), -1)
-    fault = torch.where(is_finite, 3 * runs.long(), 2)
+    fault = torch.where(is_finite, 3 * runs.long(), 2)  # (num_envs,)
     return torch.where(torch.all(action.isfinite(), -1), fault, 1)[:, None]
 
 
@@ -82,7 +82,7 @@ class FaultRecorder:
                 self._write(kind, int((fault == kind).nonzero()[0, 0]))
 
     def _write(self, kind: int, row: int) -> None:
-        steps = self._steps
+        steps = self._steps  # at most `HISTORY`, the oldest first
         tensors = {
             k: torch.stack([s[k][row] for s in steps]) for k in steps[0]
         }  # (T, n)

@@ -34,6 +34,7 @@ def model_name(name: str | Path, scene: Scene) -> str:
     What stands for nothing else, or for nothing at all, is returned as it is.
     """
     given, shipped = str(name), shipped_models()
+    # a folder called "ant" is what "ant" names, but never what "nerd" stands for
     asked = {"nerd": scene.name, "hybrid": f"{scene.name}-hybrid"}.get(given, given)
     if asked in shipped:
         return asked

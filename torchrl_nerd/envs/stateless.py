@@ -35,7 +35,7 @@ class StatelessEnv(EnvBase):
     def __init__(self, env: SceneEnv) -> None:
         super().__init__(device=env.device, batch_size=torch.Size([]))
         self.env = env
-        self.observation_spec = env.observation_spec[0]
+        self.observation_spec = env.observation_spec[0]  # of one env
         self.action_spec = cast(Bounded, env.action_spec)[0]
         self.reward_spec = cast(Unbounded, env.reward_spec)[0]
         self.full_done_spec = env.full_done_spec[0]
@@ -51,7 +51,7 @@ class StatelessEnv(EnvBase):
         return after if tensordict is None else after.reshape(tensordict.shape)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        given = tensordict.reshape(-1)
+        given = tensordict.reshape(-1)  # [num_envs]
         state = self.env._state()
         if not all(torch.equal(given[key], value) for key, value in state.items()):
             self.env.reset(given.exclude("_reset"), set_state=True)

@@ -46,5 +46,5 @@ def uniforms(keys: Tensor, episode: Tensor, offsets: Tensor) -> Tensor:
         offsets: ``(count,)``, see `stream_offsets`.
     """
     keys = _mix(keys + (episode + 1) * GOLDEN)
-    bits = _mix(keys[:, None] + offsets)
-    return _shift_right(bits, 11).to(torch.float64) * 2.0**-53
+    bits = _mix(keys[:, None] + offsets)  # (rows, count)
+    return _shift_right(bits, 11).to(torch.float64) * 2.0**-53  # a double's 53 bits

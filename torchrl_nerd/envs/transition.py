@@ -61,6 +61,7 @@ class Transition:
             ``observation``, ``reward``, ``fault``, the flags, and ``trust`` where the
             dynamics has one.
         """
+        # an action that is not finite is a fault, found below; the physics gets zeros
         given = torch.where(action.isfinite().all(-1, keepdim=True), action, 0.0)
         terrain = state.get(TERRAIN)
         moved, torque = self._control_step(state, given, terrain)
@@ -78,7 +79,7 @@ class Transition:
         shown = after | {ACTION: given}
         if SENSORDATA in moved:
             shown[SENSORDATA] = torch.where(is_good, moved[SENSORDATA], 0.0)
-        terminated = self.task.terminated(shown)[:, None] | ~is_good
+        terminated = self.task.terminated(shown)[:, None] | ~is_good  # (num_envs, 1)
         truncated = (age + 1 >= self.task.horizon)[:, None]
         if trust is not None:
             truncated = truncated | (trust < self.least_trust)
@@ -131,6 +132,7 @@ class Transition:
         Returns:
             As `step`, without reward: zero torque, no fault, full trust, not done.
         """
+        # drawn for all envs, then selected: shapes stay the same
         fresh = self.task.initial_state(uniforms(*streams)) | given
         column, num_torques = rows[:, None], len(self.task.scene.actuated)
         start = {k: torch.where(column, fresh[k], state[k]) for k in state}
