@@ -105,11 +105,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
-    Args:
-        task: id of a task, or a task.
-        dynamics: as for `make_env`.
-        seed: of the resets, until `reset` is given another; None for a fresh one.
-        device: where the env computes.
+    Its arguments are those of `GymnasiumVectorEnv`.
     """
 
     metadata: Info = {"render_modes": []}

@@ -92,8 +92,8 @@ class NeRDEnv(SceneEnv):
         task = make_task(task) if isinstance(task, str) else task
         name = type(model).__name__
         if not isinstance(model, Model):
-            name, model = model, resolve_model(model, task.scene)
-            name = model_name(name, task.scene)
+            given, model = model, resolve_model(model, task.scene)
+            name = model_name(given, task.scene)
         model = model.to(expect_device(str(device)))
         how = {"differentiable": differentiable, "inference": inference}
         dynamics = dynamics_of(model, **how)
@@ -138,12 +138,7 @@ def make_env(
             in one sentence.
         ModuleNotFoundError: MuJoCo Warp is asked for and not installed.
     """
-    shared = {
-        "num_envs": num_envs,
-        "seed": seed,
-        "device": device,
-        "dump_dir": dump_dir,
-    }
+    shared = num_envs, seed, device
     if isinstance(dynamics, str) and dynamics in ENGINES:
         if differentiable:
             raise ValueError(
@@ -151,8 +146,9 @@ def make_env(
                 f"'{dynamics}'"
             )
         _refuse_network_options(dynamics, guard)
-        return GroundTruthEnv(task, cast(Engine, dynamics), **shared)
-    env = NeRDEnv(task, dynamics, guard=guard, differentiable=differentiable, **shared)
+        return GroundTruthEnv(task, cast(Engine, dynamics), *shared, dump_dir)
+    how = {"guard": guard, "dump_dir": dump_dir, "differentiable": differentiable}
+    env = NeRDEnv(task, dynamics, *shared, **how)
     return env.compile() if compile else env
 
 

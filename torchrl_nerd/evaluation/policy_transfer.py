@@ -19,6 +19,7 @@ from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
+from torchrl_nerd.envs.resolve import model_name
 from torchrl_nerd.evaluation.bench.error_table import text_table
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import make_task
@@ -152,24 +153,16 @@ def transfer(
         count = min(episodes, slow_episodes) if name == "dm_control" else episodes
         env = make_env(task, dynamics=name, num_envs=count, seed=seed, device=device)
         returns[name] = policy_returns(env, actor)
-        about[name] = env.dynamics.kind, model_of(env.scene, name)
+        about[name] = env.dynamics.kind, env.model_name or name
     return {
         name: summarize(value, returns[GROUND_TRUTH], *about[name])
         for name, value in returns.items()
     }
 
 
-def model_of(scene: Scene, name: str) -> str:
-    """The model that a name of dynamics stands for in a scene."""
-    if name == "nerd":
-        shipped, mlp = shipped_models(scene), f"{scene.name}-mlp"
-        return mlp if mlp in shipped and scene.name not in shipped else scene.name
-    return f"{scene.name}-hybrid" if name == "hybrid" else name
-
-
 def model_title(scene: Scene, name: str) -> str:
-    """`model_of`, engines by their proper names."""
-    return TITLES.get(name) or model_of(scene, name)
+    """The model that a name stands for; engines by their proper names."""
+    return TITLES.get(name) or model_name(name, scene)
 
 
 def mean_returns(
