@@ -66,13 +66,13 @@ class FreeBodyPenaltyStep(AnalyticStep):
     """
 
     compile_single_threaded: ClassVar[bool] = False
-    points: Tensor
-    inertia: Tensor
-    nominal: Tensor
-    share: Tensor
-    shift: Tensor
-    matrix: Tensor
-    spin: Tensor
+    points: Tensor  # (P, 3), m, body frame
+    inertia: Tensor  # (3,), kg m^2
+    nominal: Tensor  # (7,): the scene's own parameters
+    share: Tensor  # (7,)
+    shift: Tensor  # (5,)
+    matrix: Tensor  # (16, 9)
+    spin: Tensor  # (12, 4)
 
     def __init__(self, scene: Scene, num_substeps: int = 8) -> None:
         super().__init__(scene, FreeBodyConfig(num_substeps), num_defects=6)
@@ -90,7 +90,8 @@ class FreeBodyPenaltyStep(AnalyticStep):
         points, inertia = scene.contacts.positions, model.body_inertia[body]
         reach = (points**2).sum(-1).max() / inertia.min()
         self.lightest = float(1.0 / (1.0 / self.mass + reach))  # kg, at a point
-        one = torch.eye(4, dtype=torch.float64)  # the entries of a quaternion
+        # a quaternion's entries
+        one = torch.eye(4, dtype=torch.float64, device="cpu")
         turned = quat_multiply(one[1:], quat_conjugate(one)[:, None])  # (4, axis, 4)
         turned = quat_multiply(one[:, None, None], turned)[..., 1:]  # (4, 4, axis, 3)
         keep_constants(
@@ -101,9 +102,9 @@ class FreeBodyPenaltyStep(AnalyticStep):
             share=[*SCALED.values()],
             shift=[*SHIFTED.values()],
             # rotation matrix, row by row, from the 16 products of a quaternion's entries
-            matrix=turned.mT.reshape(16, 9),
+            matrix=turned.mT.reshape(16, 9).numpy(),
             # q (0, w) from the 12 products of q's and w's entries
-            spin=quat_multiply(one[:, None], one[1:]).reshape(12, 4),
+            spin=quat_multiply(one[:, None], one[1:]).reshape(12, 4).numpy(),
         )
         self.raw = nn.Parameter(torch.zeros(len(PARAMETERS), dtype=torch.float64))
 

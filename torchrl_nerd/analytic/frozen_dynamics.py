@@ -6,12 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import (
-    BasePose,
-    JointAxes,
-    keep_constants,
-    keep_indices,
-)
+from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants, keep_indices
 from torchrl_nerd.geometry.kinematics import PointKinematics, cross
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
 from torchrl_nerd.geometry.spd import BranchSparsity, spd_inverse
@@ -34,20 +29,15 @@ class FrozenDynamics(NamedTuple):
 class DynamicsEvaluation(nn.Module):
     """Evaluates the `FrozenDynamics` of a robot over its ground.
 
-    Args:
-        scene: a robot of hinges and slides, on a free base or a fixed one, over a ground.
-        axes: its joints.
-        damping_period: s, over which joint damping is implicit; 0: explicit.
-
-    Raises:
-        ValueError: a scene without ground.
+    Joint damping is implicit over ``damping_period`` s; 0: explicit. A scene without ground
+    raises ValueError.
     """
 
-    joints: Tensor
+    joints: Tensor  # (P C',): joints that move each point, flat
     jacobian_dofs: Tensor  # of the Jacobian's columns: C of each of the P points, flat
-    joint_weights: Tensor
-    radii: Tensor
-    is_slide: Tensor
+    joint_weights: Tensor  # (P, C', 1)
+    radii: Tensor  # (P, 1), m
+    is_slide: Tensor  # (P, C', 1)
 
     def __init__(self, scene: Scene, axes: JointAxes, damping_period: float) -> None:
         super().__init__()

@@ -26,16 +26,13 @@ MIN_IMPEDANCE, MAX_IMPEDANCE = mujoco.mjMINIMP, mujoco.mjMAXIMP
 class JointLimits(nn.Module):
     """Integrates hinges and slides under joint-limit constraints; batch last.
 
-    Args:
-        model: compiled, of a robot without a free base.
-        axes: its joints.
-        substep: s, of MuJoCo.
+    For robots without a free base; ``substep``: MuJoCo's, s.
     """
 
-    limits: Tensor
-    impedance: Tensor
-    power: Tensor
-    law: Tensor
+    limits: Tensor  # (2, L, 1): low and high, m or rad
+    impedance: Tensor  # (6, L, 1), see `_impedance_parameters`
+    power: Tensor  # (L, 1)
+    law: Tensor  # (3, L, 1): stiffness, damping, weight
 
     def __init__(self, model: mujoco.MjModel, axes: JointAxes, substep: float) -> None:
         super().__init__()

@@ -43,23 +43,16 @@ class SubstepState(NamedTuple):
 class SubstepIntegrator(nn.Module):
     """Integrates a robot under penalty contact and limit forces.
 
-    Args:
-        scene: whose contacts and limits follow the penalty law, with elliptic cones.
-        axes: its joints.
-        evaluation: what made the frozen dynamics.
-        step_size: s, of a substep.
-        stage_offset: when forces act in a substep, as a share of it: 0 for semi-implicit
-            Euler, 0.5 for leapfrog.
-
-    Raises:
-        ValueError: contacts or limits of another law or cone.
+    Contacts and limits of ``scene`` must follow the penalty law, with elliptic cones; else
+    ValueError. Forces act at ``stage_offset`` of a substep of ``step_size`` s: 0 for
+    semi-implicit Euler, 0.5 for leapfrog.
     """
 
-    limited_dofs: Tensor
-    limited_qpos: Tensor
-    scatter: Tensor
-    contact_law: Tensor
-    limit_law: Tensor
+    limited_dofs: Tensor  # (L,)
+    limited_qpos: Tensor  # (L,)
+    scatter: Tensor  # (nv, P C + L)
+    contact_law: Tensor  # (7, P, 1)
+    limit_law: Tensor  # (4, L, 1)
 
     def __init__(
         self,

@@ -24,10 +24,7 @@ class Dynamics(Protocol):
         ...
 
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """The state one control step later.
 

@@ -62,10 +62,7 @@ class DMControlDynamics:
 
     @uncompiled
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs on which MuJoCo gave up come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)

@@ -76,10 +76,7 @@ class GuardedDynamics:
             self._calm = self._calm.masked_fill(rows.reshape(-1), self.patience)
 
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`; the next state also holds ``trust (num_envs, 1)``.
 

@@ -16,6 +16,9 @@ from torchrl_nerd.modules.window import WindowNetwork
 
 Inference = Literal["streaming", "window"]
 
+Prediction = tuple[Tensor, Tensor, Tensor | None]
+"""Next ``qpos`` and ``qvel``, and the out-of-distribution score of the input."""
+
 Model = NeRD | AnalyticStep
 """Learned, hybrid (a `NeRD`) or analytic; ``kind`` says which."""
 
@@ -83,10 +86,7 @@ class TorchDynamics:
         """See `Dynamics.reset`; there is no history to empty."""
 
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`."""
         return self.scored_step(state, joint_torque, terrain, is_scored=False)[0]
@@ -121,23 +121,15 @@ class TorchDynamics:
         """What a step of so many envs needs beforehand."""
         self._rows = rows
 
-    def _run(self, given: tuple) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _run(self, given: tuple) -> Prediction:
         """`_predict`, eager or compiled, of all envs at once or in parts."""
         if not self.compile:
             return self._predict(*given)
         parts = 1 if torch.compiler.is_compiling() else self.parts(self._rows)
         return self._in_parts(parts, *given) if parts > 1 else self._compiled(*given)
 
-    def _predict(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None,
-        memory: Any,
-        is_scored: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Next ``qpos`` and ``qvel``, the input's score; advances ``memory``."""
+    def _predict(self, *args: Any, **kwargs: Any) -> Prediction:
+        """From qpos, qvel, joint torque, terrain, memory (advanced) and ``is_scored``."""
         raise NotImplementedError
 
 
@@ -200,7 +192,7 @@ class NeRDDynamics(TorchDynamics):
         terrain: Tensor | None,
         memory: Any,
         is_scored: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    ) -> Prediction:
         def network_step(token: Tensor) -> Tensor:
             return self.network.step(token, memory)
 
@@ -221,15 +213,8 @@ class AnalyticDynamics(TorchDynamics):
         self.analytic_step = step
         super().__init__(step, compile, differentiable)
 
-    def _predict(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None,
-        memory: Any,
-        is_scored: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _predict(self, *args: Any, **kwargs: Any) -> Prediction:
+        qpos, qvel, joint_torque, terrain, *_ = args
         result = self.analytic_step(qpos, qvel, joint_torque, terrain)
         return result.qpos, result.qvel, None
 

@@ -99,10 +99,7 @@ class MujocoDynamics:
 
     @uncompiled
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
@@ -113,10 +110,7 @@ class MujocoDynamics:
         return last
 
     def rollout(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDict:
         """Many control steps in one call: what `step` gives one after the other.
 

@@ -109,10 +109,7 @@ class MujocoWarpDynamics:
     @torch.no_grad()
     @uncompiled
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs that cannot be stepped come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)

@@ -11,10 +11,7 @@ import warp as wp
 
 
 @wp.kernel
-def _orthonormalize(
-    count: wp.array[int],
-    frame: wp.array[wp.mat33],
-):
+def _orthonormalize(count: wp.array[int], frame: wp.array[wp.mat33]):
     contact = wp.tid()
     if contact >= count[0]:
         return
@@ -24,13 +21,9 @@ def _orthonormalize(
 
 
 def straighten_frames(model: Any, data: Any) -> None:
-    """Turn the first tangent of every contact into the plane across its normal.
+    """Turn the first tangent of every contact into the plane across its normal, in place.
 
     A ``contactfilter`` of MuJoCo Warp: called between collision and constraints.
-
-    Args:
-        model: of `mujoco_warp.put_model`.
-        data: of `mujoco_warp.make_data`, changed in place.
     """
     wp.launch(
         _orthonormalize, dim=data.naconmax, inputs=[data.nacon, data.contact.frame]

@@ -105,8 +105,8 @@ class PointKinematics(nn.Module):
 class _Group(nn.Module):
     """Bodies at one depth of the tree that have joints of the same kinds."""
 
-    offset: Tensor
-    turn: Tensor
+    offset: Tensor  # (3, n, 1), m, in the parent
+    turn: Tensor  # (3, 3, n, 1), to the parent
 
     def __init__(
         self,
@@ -149,13 +149,13 @@ class _Joint(nn.Module):
     I + sin(q) K + (1 - cos(q)) K^2. Constants are in the frame before ``turns``.
     """
 
-    axis: Tensor
-    start: Tensor
-    anchor: Tensor
-    rest: Tensor
-    turn: Tensor
-    cross: Tensor
-    square: Tensor
+    axis: Tensor  # (3, n, 1)
+    start: Tensor  # (3, n, 1), m: the anchor before the joint moves
+    anchor: Tensor  # (3, n, 1), m, in the body
+    rest: Tensor  # (n, 1)
+    turn: Tensor  # (3, 3, n, 1)
+    cross: Tensor  # (3, 3, n, 1): turn K
+    square: Tensor  # (3, 3, n, 1): turn K^2
 
     def __init__(
         self, model: mujoco.MjModel, joints: list[int], turns: list[np.ndarray]

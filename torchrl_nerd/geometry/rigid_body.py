@@ -37,27 +37,21 @@ class _Inertia(NamedTuple):
 
 
 class RigidBodyDynamics(nn.Module):
-    """Acceleration of a robot without contacts and limits.
+    """Acceleration of a robot without contacts and limits; ``actuated``: driven dofs.
 
     It needs the points ``positions (4 B, 3)``, m, of ``bodies``: four of every body with
     mass, in the body's frame.
-
-    Args:
-        model: compiled.
-        base: of the robot.
-        axes: its joints.
-        actuated: dofs that actuators drive.
     """
 
-    mass: Tensor
-    ancestry: Tensor
-    together: Tensor
-    gravity: Tensor
-    damping: Tensor
-    stiffness: Tensor
-    rest: Tensor
-    armature: Tensor
-    is_slide: Tensor
+    mass: Tensor  # (B, 1), kg
+    ancestry: Tensor  # (nv, B): 1 where a body moves with a dof
+    together: Tensor  # (nv, nv): 1 where a dof's body moves with a dof
+    gravity: Tensor  # (3,), world
+    damping: Tensor  # (nv,)
+    stiffness: Tensor  # (J,)
+    rest: Tensor  # (J,): where a joint's spring is at rest
+    armature: Tensor  # (nv,)
+    is_slide: Tensor  # (J, 1)
 
     def __init__(
         self, model: mujoco.MjModel, base: Base, axes: JointAxes, actuated: list[int]

@@ -68,11 +68,8 @@ def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
 def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Every point of every shape that can touch the ground, none merged.
 
-    Returns:
-        body ids, positions ``(N, 3)`` (m, body frame) and radii ``(N,)`` (m).
-
-    Raises:
-        ValueError: a shape is none of sphere, capsule, box.
+    Body ids, positions ``(N, 3)`` (m, body frame) and radii ``(N,)`` (m). Raises
+    ValueError where a shape is none of sphere, capsule, box.
     """
     bodies, positions, radii = [], [], []
     grounds = ground_geoms(model)

@@ -138,10 +138,7 @@ def default_sampling(
 ) -> Sampling:
     """Sampling ranges from limits and strengths of a compiled model.
 
-    Args:
-        model: compiled.
-        controller: of its actuators.
-        ranges: fields of `Sampling` to use in place of the default ones.
+    ``ranges``: fields of `Sampling` to use in place of the default ones.
     """
     base = Base.from_model(model)
     skipped_q, skipped_v = (7, 6) if base.is_floating else (0, 0)

@@ -86,11 +86,7 @@ def set_penalty_limit(
 ) -> None:
     """Give a limited joint a spring and damper that act beyond its range.
 
-    Args:
-        model: compiled; changed in place.
-        joint: its name.
-        ke: stiffness, N/m or N m/rad.
-        kd: damping, N s/m or N m s/rad.
+    As `set_penalty_contact`; ``ke`` in N/m or N m/rad, ``kd`` in N s/m or N m s/rad.
     """
     index = model.joint(joint).id
     inverse_mass = model.dof_invweight0[model.jnt_dofadr[index]]
@@ -125,8 +121,6 @@ def limit_stiffness(
     model: mujoco.MjModel, joints: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping of the joints' limits, the inverse of `set_penalty_limit`.
-
-    In N/m and N s/m or N m/rad and N m s/rad.
 
     Raises:
         ValueError: a joint whose limit follows another law.

@@ -92,10 +92,7 @@ class Scene:
     def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":
         """The robot of a dm_control suite task, at the task's control step.
 
-        Args:
-            domain: such as ``"cheetah"``.
-            task: such as ``"run"``.
-            ranges: as for `from_mjcf`.
+        Such as ``"cheetah", "run"``; ``ranges`` as for `from_mjcf`.
 
         Raises:
             ValueError: no such task, or a robot with something not supported (named).
@@ -109,9 +106,7 @@ class Scene:
     def from_gymnasium(cls, env_id: str, **ranges: Any) -> "Scene":
         """The robot of a Gymnasium MuJoCo environment, at the environment's step.
 
-        Args:
-            env_id: such as ``"Ant-v5"``; version 5, which names its file.
-            ranges: as for `from_mjcf`.
+        Such as ``"Ant-v5"``: version 5 names its file. ``ranges`` as for `from_mjcf`.
 
         Raises:
             ValueError: no such environment, or a robot with something not supported.
@@ -248,9 +243,7 @@ class Scene:
     def clearances(self, qpos: Tensor, terrain: Tensor | None = None) -> Tensor:
         """Gap between every contact point's shape and the ground, m, ``(*batch, P)``.
 
-        Args:
-            qpos: ``(*batch, nq)``.
-            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+        ``terrain (*batch, terrain.size)``: None for the scene's own ground.
         """
         return self._ground(qpos, terrain)[0]
 

@@ -43,11 +43,7 @@ def silence_mujoco() -> Iterator[None]:
 
 
 def check_supported(name: str, model: mujoco.MjModel) -> None:
-    """Refuse a model that has something no feature describes.
-
-    Args:
-        name: of the scene, for the message.
-        model: compiled.
+    """Refuse the model of scene ``name`` if it has something no feature describes.
 
     Raises:
         ValueError: naming the first such thing, and which object it is.

@@ -128,12 +128,10 @@ class Terrain:
     def mocap_pose(self, terrain: Tensor) -> Tensor:
         """Mocap poses ``(*batch, 7 * mocap bodies)`` that put the ground there.
 
-        In the order of MuJoCo's state vector: all positions, then all quaternions. A
-        plane is turned the shortest way from z to its normal; mocap bodies that carry no
-        ground stay where the file has them. Raises what `check` raises.
-
-        Args:
-            terrain: ``(*batch, size)``.
+        From ``terrain (*batch, size)``, in the order of MuJoCo's state vector: all
+        positions, then all quaternions. A plane is turned the shortest way from z to its
+        normal; mocap bodies that carry no ground stay where the file has them. Raises what
+        `check` raises.
         """
         self.check(terrain, (*terrain.shape[:-1], self.size))
         default = torch.as_tensor(self.mocap_default).to(terrain)
@@ -164,10 +162,8 @@ class Terrain:
 class TerrainDistance(nn.Module):
     """Signed distance and normal of points to the nearest surface of a terrain.
 
-    Args:
-        terrain: the ground.
-        reach: m; up to here the distance to a height field is exact, see
-            `height_field_distance`. To all other surfaces it always is.
+    Exact up to ``reach`` m for a height field, see `height_field_distance`, and everywhere
+    for all other surfaces.
     """
 
     default: Tensor
@@ -183,13 +179,9 @@ class TerrainDistance(nn.Module):
                     keep_constants(self, **{f"{name}_{index}": value})
 
     def forward(
-        self,
-        points: Tensor,
-        terrain: Tensor | None,
-        position: Tensor,
-        rotation: Tensor,
+        self, points: Tensor, terrain: Tensor | None, position: Tensor, rotation: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Distance and normal at points given in a frame.
+        """Distance and normal of the nearest surface, at points given in a frame.
 
         Args:
             points: ``(*batch, P, 3)``, m, in the frame.
@@ -198,8 +190,7 @@ class TerrainDistance(nn.Module):
             rotation: ``(*batch, 3, 3)``, the frame's axes in the world.
 
         Returns:
-            distance ``(*batch, P)``, m, negative inside, and unit normal
-            ``(*batch, P, 3)`` in the frame, both of the nearest surface.
+            ``(*batch, P)``, m, negative inside; ``(*batch, P, 3)``, unit, in the frame.
         """
         if terrain is None:
             terrain = self.default.expand(*points.shape[:-2], -1)
