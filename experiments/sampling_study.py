@@ -1,4 +1,4 @@
-"""Which training data make the better model: strategies of `data/strategies.py` compared.
+"""Which training data make the better model: sampling strategies compared.
 
     python experiments/sampling_study.py --scene cartpole --json results/sampling.json
 
@@ -11,28 +11,105 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
+from torch import Generator, Tensor
 
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data.generate import CARD, Draw, generate, load_data
-from torchrl_nerd.data.strategies import strategies
+from torchrl_nerd.data.strategies import SettledStates, along, mix, strategy
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.envs import make_env
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import PPO_CONFIGS, PRESETS, make_task
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.tasks import Task
+from torchrl_nerd.training.policy_data import policy_data
 from torchrl_nerd.training.trainer import Trainer
 
+MIN_TORQUE_SCALE = 0.01  # of the largest torque
+ZERO_TORQUE_FRACTION = 0.1
 TEST_SEED = 500  # of starts and episodes; never one of training or validation
 PPO = Path(__file__).parents[1] / "examples" / "ppo.py"
+
+
+@dataclass(frozen=True)
+class TaskResets:
+    """Initial states of a task's episodes.
+
+    The task's terrain is not used, since models may be tested on it: where the terrain
+    varies, the scene's sampling draws it.
+    """
+
+    task: Task
+
+    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+        """See `Starts`."""
+        size = (rows, self.task.num_uniforms)
+        u = torch.rand(size, dtype=torch.float64, generator=generator)
+        state = self.task.initial_state(u)
+        return {QPOS: state[QPOS], QVEL: state[QVEL]}
+
+
+def strategies(
+    scene: Scene, task: Task, explorer: Actor | None = None
+) -> dict[str, Draw]:
+    """The sampling strategies of a scene, by name.
+
+    | name | initial states and torques |
+    |---|---|
+    | ``uniform`` | uniform in the ranges, new torques in every step |
+    | ``shares`` | the scene's own sampling, with zero-torque and low-torque trajectories |
+    | ``scales`` | torque scales log-uniform over two decades |
+    | ``starts`` | equal parts of ``shares``, task resets and settled states |
+    | ``correlated``, ``level``, ``resting`` | see `data.strategies` |
+    | ``policy`` | trajectories of an exploring policy |
+    | ``mixed`` | equal parts of ranges, task resets, settled states and policy |
+
+    All parts of ``mixed`` but the policy's have torque scales and correlation. Scenes
+    without such ground have no ``level``. Scenes whose torques follow the state have no
+    correlation. Without an explorer there is no ``policy`` and no part of it in ``mixed``.
+
+    Args:
+        scene: the robot.
+        task: of the same scene; its resets are among the initial states.
+        explorer: the policy that explores.
+    """
+    scaled: dict[str, Any] = {
+        "min_torque_scale": MIN_TORQUE_SCALE,
+        "zero_torque_fraction": ZERO_TORQUE_FRACTION,
+        "low_torque_fraction": 0.0,
+    }
+    own = along(scene)
+    resets, settled = {"starts": TaskResets(task)}, {"starts": SettledStates(scene)}
+    found = {
+        "uniform": along(scene, zero_torque_fraction=0.0, low_torque_fraction=0.0),
+        "shares": own,
+        "scales": along(scene, **scaled),
+        "starts": mix(own, along(scene, **resets), along(scene, **settled)),
+        "resting": strategy(scene, "resting"),
+    }
+    if scene.sampling.level_ground is not None:
+        found["level"] = strategy(scene, "level")
+    if scene.sampling.drive is None:
+        found["correlated"] = strategy(scene, "correlated")
+        scaled["correlation_time"] = (scene.control_step, 1.0)
+    mixed = [along(scene, **scaled, **starts) for starts in ({}, resets, settled)]
+    if explorer is not None:
+        found["policy"] = partial(policy_data, task, explorer)
+        mixed.append(found["policy"])
+    return {**found, "mixed": mix(*mixed)}
 
 
 @dataclass(frozen=True)

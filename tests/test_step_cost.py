@@ -8,10 +8,8 @@ from tensordict import TensorDict
 
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.modules.gru import GRUConfig
-from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.networks import NETWORKS
+from torchrl_nerd.modules.networks import NETWORKS, GRUConfig, MLPConfig
 from torchrl_nerd.modules.transformer import HEAD_WIDTH
 from torchrl_nerd.robots import load_scene
 

@@ -17,11 +17,9 @@ from torchrl_nerd.configs import (
     UnconstrainedConfig,
 )
 from torchrl_nerd.dynamics import Model
-from torchrl_nerd.modules.gru import GRUConfig
 from torchrl_nerd.modules.hybrid import HybridNeRD
-from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.networks import NetworkConfig
+from torchrl_nerd.modules.networks import GRUConfig, MLPConfig, NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.settings import SettingError
 

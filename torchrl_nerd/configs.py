@@ -10,7 +10,7 @@ COUNTS = (
     *("save_every", "validate_every", "rollout_restarts"),
 )
 
-Update = Literal["physics", "all", "head", "low-rank"]
+Update = Literal["physics", "all", "head"]
 Precision = Literal["float32", "float64"]
 
 
@@ -147,8 +147,8 @@ class FinetuneConfig:
         SettingError: a value that cannot be.
     """
 
-    # what changes: physical parameters (physics), all weights, the last layer (head), or
-    # low-rank changes; default: physics for an analytic step, all for a network
+    # what changes: physical parameters (physics), all weights, or the last layer (head);
+    # default: physics for an analytic step, all for a network
     update: Update | None = None
     evaluations: int = 90  # of physical parameters, in each of two stages
     epochs: float = 2.0  # at most; an epoch shows every training window once
@@ -156,7 +156,6 @@ class FinetuneConfig:
     sequence_length: int = 24  # control steps of a rollout
     # share of updates, the first ones, on rollouts of half the length
     short_history_fraction: float = 0.5
-    rank: int = 4  # of low-rank changes
     lr: float = 1e-3  # peak learning rate of Adam
     clip: float = 0.3  # largest norm of the gradient
     states: int = 80  # of a validation window, and of windows that physics is fitted to
@@ -169,7 +168,7 @@ class FinetuneConfig:
             known = ", ".join(get_args(Update))
             raise SettingError(f"expected update of {known}, got '{self.update}'")
         expect_at_least(2, states=self.states)
-        counts = ("evaluations", "batch_size", "sequence_length", "rank")
+        counts = ("evaluations", "batch_size", "sequence_length")
         for name in (*counts, "validate_every", "patience"):
             expect_at_least(1, **{name: getattr(self, name)})
         for name in ("epochs", "lr", "clip", "short_history_fraction"):

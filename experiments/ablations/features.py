@@ -11,7 +11,7 @@ from torchrl_nerd.keys import (
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
 )
-from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import ContactFeatures
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.modules.mlp import NoMemory
+from torchrl_nerd.modules.networks import NoMemory
 from torchrl_nerd.modules.transformer import (
     CausalTransformer,
     FullLinear,

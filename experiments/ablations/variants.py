@@ -6,11 +6,8 @@ from typing import cast
 
 from tensordict import TensorDict
 
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.gru import GRUConfig
-from torchrl_nerd.modules.mlp import MLPConfig
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, unit_stats
-from torchrl_nerd.modules.networks import NetworkConfig
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures, unit_stats
+from torchrl_nerd.modules.networks import GRUConfig, MLPConfig, NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.samples import stats_of

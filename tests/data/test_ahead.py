@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from torchrl_nerd.data.ahead import ahead
+from torchrl_nerd.data.mappers import ahead
 
 
 def test_results_come_in_order_and_every_item_once():

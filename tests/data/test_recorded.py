@@ -8,18 +8,14 @@ import torch
 from helpers import EXCERPT, simulated
 
 from torchrl_nerd import load_scene
-from torchrl_nerd.data.log_files import (
-    load_recording,
-    read_log,
-    read_transitions,
-    write_recording,
-)
+from torchrl_nerd.data.log_files import load_recording, read_log, write_recording
 from torchrl_nerd.data.recorded import (
     complete,
     estimate_velocities,
     free_fall,
     split_trajectories,
 )
+from torchrl_nerd.data.store import chunk_path, read_chunk
 from torchrl_nerd.geometry.manifold import integrate_pos
 
 
@@ -158,7 +154,7 @@ def test_the_split_is_the_published_one():
 
 def test_a_data_set_holds_what_was_recorded(real_cube, recording, tmp_path):
     card = write_recording(EXCERPT, real_cube, tmp_path / "set")
-    data = read_transitions(tmp_path / "set")
+    data = read_chunk(chunk_path(tmp_path / "set", 0), 1)
     assert card["trajectories"] == len(recording) and len(card["checks"]) >= 5
     assert torch.equal(data["qpos"], recording.transitions()["qpos"])
     with pytest.raises(ValueError, match="already holds data"):

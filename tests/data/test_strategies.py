@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import slow_but
+from sampling_study import TaskResets, strategies
 from tensordict import TensorDict
 from torch import Generator
 
@@ -20,10 +21,15 @@ from torchrl_nerd.data.generate import (
     load_data,
     simulate,
 )
-from torchrl_nerd.data.policy_data import policy_data
 from torchrl_nerd.data.simulate import SEGMENT
-from torchrl_nerd.data.starts import PerturbedRestStates, SettledStates, TaskResets
-from torchrl_nerd.data.strategies import mix, resample, strategies
+from torchrl_nerd.data.strategies import (
+    PerturbedRestStates,
+    SettledStates,
+    mix,
+    preset_strategy,
+    resample,
+    strategy,
+)
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs import GroundTruthEnv
 from torchrl_nerd.envs.frame_stack import append_frame
@@ -35,6 +41,7 @@ from torchrl_nerd.robots import PRESETS, SCENES, load_scene, make_task
 from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tasks import Task
+from torchrl_nerd.training.policy_data import policy_data
 
 STATE = ("qpos", "qvel")
 BY_TORQUES = [s for s in map(load_scene, SCENES) if s.sampling.drive is None]
@@ -104,6 +111,16 @@ def test_every_strategy_gives_sound_data_of_the_same_layout(name, seed):
         assert not torch.equal(other["qpos"], data["qpos"]), name
         one = draw(1, 1, seeded(seed))
         assert one.batch_size == (1, 1)
+
+
+def test_presets_name_strategies_that_fit_their_scenes():
+    chosen = {name: preset_strategy(load_scene(name)) for name in PRESETS}
+    names = {name: pair[0] for name, pair in chosen.items() if pair}
+    assert names["franka"] == "correlated" and names["cube"] == "resting"
+    assert names["double_pendulum"] == "level" and "cartpole" not in names
+    for name in ("level", "unknown"):
+        with pytest.raises(ValueError, match=f"for 'cartpole', got {name}"):
+            strategy(load_scene("cartpole"), name)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from helpers import every_scene, make_scene
 
 from torchrl_nerd.evaluation.explain import explain
-from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.robots import load_scene
 
 CROSSED = """

@@ -5,8 +5,7 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
-from torchrl_nerd.modules.gru import GRUConfig
-from torchrl_nerd.modules.mlp import MLPConfig
+from torchrl_nerd.modules.networks import GRUConfig, MLPConfig
 
 INPUTS, OUTPUTS, ROWS, STEPS = 5, 3, 4, 14
 CONFIGS = {

@@ -13,8 +13,7 @@ from tensordict import TensorDict
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.modules import nerd
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD
+from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.transforms import (

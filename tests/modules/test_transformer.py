@@ -6,7 +6,7 @@ from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
 from torchrl_nerd.modules.transformer import (
-    PRESETS,
+    TRANSFORMERS,
     CausalTransformer,
     FullLinear,
     TransformerConfig,
@@ -14,7 +14,7 @@ from torchrl_nerd.modules.transformer import (
 
 INPUTS, OUTPUTS = 5, 3
 CONFIGS = {
-    "transformer-2x64": PRESETS["transformer-2x64"],
+    "transformer-2x64": TRANSFORMERS["transformer-2x64"],
     "narrow band": TransformerConfig(layers=1, width=8, heads=1, band=2),
     "deep": TransformerConfig(layers=3, width=24, heads=3, band=4),
 }
@@ -179,9 +179,9 @@ def test_outputs_do_not_share_memory_with_the_history(config, generator):
         assert torch.equal(torch.stack(outputs, 1), stream(network, tokens))
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", TRANSFORMERS)
 def test_every_preset_gives_one_finite_output_per_token(name, generator):
-    network = PRESETS[name].build(INPUTS, OUTPUTS)
+    network = TRANSFORMERS[name].build(INPUTS, OUTPUTS)
     with torch.no_grad():
         output = network(randn(generator, 2, 3, INPUTS, dtype=torch.float32))
     assert output.shape == (2, 3, OUTPUTS) and output.isfinite().all()

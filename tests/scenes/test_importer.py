@@ -17,8 +17,7 @@ from torchrl_nerd.data.generate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.nerd import NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene

@@ -22,9 +22,9 @@ from torchrl_nerd.data.log_files import (
     FREE_BODY,
     load_recording,
     read_log,
-    read_transitions,
     write_recording,
 )
+from torchrl_nerd.data.store import chunk_path, expect_finite, read_chunk
 from torchrl_nerd.evaluation.policy import Policy, load_policy, save_policy
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.modules.nerd import NeRD
@@ -102,7 +102,9 @@ def _make_recorded(folder: Path) -> None:
 
 
 def _load_recorded(folder: Path) -> Found:
-    data = read_transitions(folder)
+    path = chunk_path(folder, 0)
+    data = read_chunk(path, 1)
+    expect_finite(data, path)
     return {str(k): v for k, v in data.items(True, True)}
 
 

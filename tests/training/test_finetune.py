@@ -5,12 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import simulated
-from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.configs import NO_PREDICTIONS, FinetuneConfig
-from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
+from torchrl_nerd.evaluation.rollout_error import position_errors
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.settings import SettingError
@@ -101,28 +99,17 @@ def test_statistics_are_frozen_and_the_given_model_is_left_alone(model, recordin
     assert frozen and all(torch.equal(before[k], after[k]) for k in frozen)
 
 
-@pytest.mark.parametrize("update", ["all", "head", "low-rank"])
+@pytest.mark.parametrize("update", ["all", "head"])
 def test_only_what_was_asked_for_changes(model, recording, update, generator):
     with torch.no_grad():
         for weight in model.network.parameters():
             weight += 0.01 * torch.randn(weight.shape, generator=generator)
-    run = tuner(model, recording, update=update, rank=2)
+    run = tuner(model, recording, update=update)
     run._step(run.starts[:64], 4)
-    run._frozen()  # a copy: training goes on
-    run._step(run.starts[:64], 4)
-    after = run._frozen()
-    state = TensorDict({"qpos": recording.qpos[:9], "qvel": recording.qvel[:9]}, [9])
-    steps = [open_loop(NeRDDynamics(x.eval()), state, 1) for x in (run.model, after)]
-    torch.testing.assert_close(*steps)
     for name, old in model.network.named_parameters():
-        change = dict(after.network.named_parameters())[name] - old
+        change = dict(run.model.network.named_parameters())[name] - old
         if update == "head":
             assert bool(change.any()) == ("head" in name)
-        elif update == "low-rank":
-            is_matrix = change.ndim == 2
-            assert is_matrix or not change.any()
-            if is_matrix:
-                assert torch.linalg.matrix_rank(change, atol=1e-7) <= 2
 
 
 def test_it_stops_where_validation_stands_still_at_full_length(model, recording):

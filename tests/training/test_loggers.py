@@ -9,8 +9,7 @@ from types import ModuleType
 import pytest
 
 from torchrl_nerd.cli import main
-from torchrl_nerd.training.log import TrainingLog
-from torchrl_nerd.training.loggers import PROJECT, open_logger
+from torchrl_nerd.training.log import PROJECT, TrainingLog, open_logger
 
 BLOCK = 32 * 1024  # of the files that Weights & Biases writes: LevelDB's log format
 
@@ -147,7 +146,7 @@ def test_where_a_library_is_missing_the_extra_is_named(
     monkeypatch.chdir(tmp_path)
     sizes = ["--trajectories", "4", "--steps", "20", "--out", "d", "--quiet"]
     assert main(["data", "cartpole", *sizes]) == 0
-    monkeypatch.setattr("torchrl_nerd.training.loggers.find_spec", lambda name: None)
+    monkeypatch.setattr("torchrl_nerd.training.log.find_spec", lambda name: None)
     argv = ["train", "cartpole", "--data", "d", "--out", "run", "--quiet"]
     assert main([*argv, "--logger", name]) == 2
     said = capsys.readouterr().err

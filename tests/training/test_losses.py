@@ -8,9 +8,8 @@ from torch import Tensor, nn
 
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.data.simulate import is_sound, simulate
-from torchrl_nerd.modules.gru import GRUConfig
-from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.modules.networks import GRUConfig, MLPConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.scenes import Scene

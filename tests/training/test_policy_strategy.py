@@ -9,12 +9,11 @@ from torchrl_nerd.cli import main
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data import generate as module
 from torchrl_nerd.data.generate import generate, load_data
-from torchrl_nerd.data.policy_data import policy_data
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.files import read_json
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.seeds import fold_in
-from torchrl_nerd.training.policy_strategy import along_policy
+from torchrl_nerd.training.policy_data import along_policy, policy_data
 
 TASK = "cartpole/swingup"
 SCENE = load_scene("cartpole")

@@ -8,8 +8,8 @@ from torch import Generator
 
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.data.simulate import is_sound, simulate
-from torchrl_nerd.modules.mlp import MLPConfig
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.networks import MLPConfig
 from torchrl_nerd.training.samples import PART, data_stats, raw_tokens
 from torchrl_nerd.training.sequences import Sequences
 

@@ -9,10 +9,8 @@ from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.mlp import MLPConfig
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
-from torchrl_nerd.modules.networks import NETWORKS
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
+from torchrl_nerd.modules.networks import NETWORKS, MLPConfig
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.augmentation import SignedPermutations, Symmetry
@@ -77,7 +75,7 @@ def test_the_group_is_closed_and_has_inverses(scene, data):
 
 
 def test_tokens_and_targets_are_renumbered(scene, data):
-    symmetry = Symmetry.of(scene, data)
+    symmetry = Symmetry.of(scene)
     encode = SceneFeatures(scene), StateDelta(scene)
     flat = data.flatten(0, 1)[::7]
     here = raw_tokens(*encode, flat)
@@ -91,7 +89,7 @@ def test_tokens_and_targets_are_renumbered(scene, data):
 
 def test_statistics_are_those_of_all_images(scene, data):
     """So that normalised vectors are renumbered as raw ones are."""
-    symmetry = Symmetry.of(scene, data)
+    symmetry = Symmetry.of(scene)
     found = symmetry.complete(data_stats(scene, data))
     images = [isometry(data) for isometry in symmetry.isometries]
     expected = data_stats(scene, torch.cat(images))
@@ -115,7 +113,7 @@ def test_statistics_are_those_of_all_images(scene, data):
 
 def test_batches_show_images_of_the_data(scene, data, generator):
     """Those of one step and those of rollouts, which the MuJoCo solver also takes."""
-    symmetry = Symmetry.of(scene, data)
+    symmetry = Symmetry.of(scene)
     model = NeRD(
         scene,
         NO_PREDICTIONS,

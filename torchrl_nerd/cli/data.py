@@ -18,20 +18,19 @@ from torchrl_nerd.cli.options import (
     scene_of,
 )
 from torchrl_nerd.configs import DataConfig
-from torchrl_nerd.data.ahead import ahead
 from torchrl_nerd.data.generate import (
     CARD,
     Draw,
     draw_chunk,
     generate,
-    plain_strategy,
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
-from torchrl_nerd.data.ray_map import ray_map
+from torchrl_nerd.data.mappers import ahead, ray_map
+from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.policy_strategy import along_policy
+from torchrl_nerd.training.policy_data import along_policy
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Data(Command):
             recording, _ = load_recording(self.recorded, recorded_scene(self.scene))
             return [f"convert {len(recording)} recorded trajectories"]
         scene, out = scene_of(self.scene, self.reference), self.folder
-        _, draw = self.strategy(scene) or plain_strategy(scene)
+        _, draw = self.strategy(scene) or (None, partial(simulate, scene))
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
         wanted, existing = self.config.trajectories, 0
         if (out / CARD).exists():

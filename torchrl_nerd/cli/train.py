@@ -25,7 +25,7 @@ from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training import ranks
-from torchrl_nerd.training.loggers import LoggerName
+from torchrl_nerd.training.log import LoggerName
 from torchrl_nerd.training.start import begin_from, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from torchrl_nerd import __version__
 from torchrl_nerd.configs import DataConfig
-from torchrl_nerd.data.ahead import ahead
+from torchrl_nerd.data.mappers import ahead
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.data.store import (
     chunk_path,
@@ -45,11 +45,6 @@ Mapper = Callable[
     [Callable[[Chunk], TensorDict], Iterable[Chunk]], Iterable[TensorDict]
 ]
 """Python's ``map`` or a parallel version of it that keeps the order."""
-
-
-def plain_strategy(scene: Scene) -> tuple[None, Draw]:
-    """Trajectories from the scene's own ranges, which have no name in cards."""
-    return None, partial(simulate, scene)
 
 
 def draw_chunk(draw: Draw, config: DataConfig, chunk: Chunk) -> TensorDict:
@@ -80,20 +75,20 @@ def generate(
     Raises:
         ValueError: the folder cannot be written or holds data of another card.
     """
-    name, draw = strategy or plain_strategy(scene)
+    name, draw = strategy or (None, partial(simulate, scene))
     card = _open_card(scene, config, writable_folder(folder), name)
     first, count = card["chunks_done"], -(-config.trajectories // CHUNK)
     chunks = [
         (number, min(CHUNK, config.trajectories - number * CHUNK))
         for number in range(first, count)
     ]
+    wanted, done = config.trajectories, min(first * CHUNK, config.trajectories)
+    how = {"desc": f"data {scene.name}", "unit": " transitions", "unit_scale": True}
     with tqdm(
-        total=config.trajectories * config.steps,
-        initial=min(first * CHUNK, config.trajectories) * config.steps,
-        unit=" transitions",
-        unit_scale=True,
-        desc=f"data {scene.name}",
+        total=wanted * config.steps,
+        initial=done * config.steps,
         disable=quiet,
+        **how,
     ) as bar:
         drawn = mapper(partial(draw_chunk, draw, config), chunks)
         for (number, rows), data in zip(chunks, drawn, strict=True):
@@ -166,11 +161,9 @@ def _open_card(
         "ranges": scene.sampling.ranges(),
         "mujoco": mujoco.__version__,
         "torchrl_nerd": __version__,
-        "trajectories": 0,
-        "dropped": 0,
-        "chunks_done": 0,
+        **dict.fromkeys(("trajectories", "dropped", "chunks_done"), 0),
     }
-    fresh = json.loads(json.dumps(fresh))
+    fresh = json.loads(json.dumps(fresh))  # as it will be read: tuples become lists
     path = folder / CARD
     if not path.exists():
         write_json(path, fresh)  # before any chunk, which never exists without a card
@@ -194,13 +187,11 @@ def _check_counts(card: dict[str, Any], folder: Path) -> DataConfig:
     try:
         config = DataConfig(**card["config"])
         counts = [card[key] for key in ("trajectories", "dropped", "chunks_done")]
-        numbers = *asdict(config).values(), *counts
-        if not all(type(n) is int for n in numbers) or min(counts) < 0:
-            raise ValueError
-        if counts[0] + counts[1] > config.trajectories:
-            raise ValueError
+        is_whole = all(type(n) is int for n in (*asdict(config).values(), *counts))
+        if is_whole and min(counts) >= 0 and sum(counts[:2]) <= config.trajectories:
+            return config
     except (KeyError, TypeError, ValueError):
-        raise ValueError(
-            f"expected {folder / CARD} to count trajectories, got something else"
-        ) from None
-    return config
+        pass
+    raise ValueError(
+        f"expected {folder / CARD} to count trajectories, got something else"
+    )

@@ -30,7 +30,6 @@ from zipfile import ZipFile
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_nerd import __version__
@@ -45,8 +44,6 @@ from torchrl_nerd.data.recorded import (
 )
 from torchrl_nerd.data.store import (
     chunk_path,
-    expect_finite,
-    read_chunk,
     write_chunk,
 )
 from torchrl_nerd.files import writable_folder, write_json
@@ -88,46 +85,43 @@ def read_log(path: Path, scene: Scene) -> Recording:
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"
             raise ValueError(f"expected '{name}' in {path}, found {found}")
-    count = len(arrays["position" if is_pose else QPOS])
-    sizes = {QPOS: scene.model.nq, QVEL: scene.model.nv}
-    sizes |= {TORQUE: len(scene.actuated)}
+    count, nv = len(arrays[needed[0]]), scene.model.nv
+    sizes = {QPOS: scene.model.nq, QVEL: nv, TORQUE: len(scene.actuated)}
+    sizes |= {name: len(columns) for name, columns in FREE_BODY.items()}
     if terrain:
         sizes[TERRAIN] = terrain.size
-    sizes |= {name: len(columns) for name, columns in FREE_BODY.items()}
     shapes: dict[str, tuple[int, ...]] = {k: (count, v) for k, v in sizes.items()}
     shapes |= {"time": (count,), "trajectory": (count,)}
     tensors = {}
     for name, shape in shapes.items():
-        if name not in arrays:
+        array = arrays.get(name)
+        if array is None:
             continue
-        if arrays[name].shape != shape:
+        if array.shape != shape:
             raise ValueError(
-                f"expected '{name}' of shape {shape} in {path}, got {arrays[name].shape}"
+                f"expected '{name}' of shape {shape} in {path}, got {array.shape}"
             )
-        if not np.isfinite(arrays[name]).all():
+        if not np.isfinite(array).all():
             raise ValueError(
                 f"expected finite numbers in '{name}' of {path}, got others"
             )
-        tensors[name] = torch.as_tensor(arrays[name], dtype=torch.float64)
+        tensors[name] = torch.as_tensor(array, dtype=torch.float64)
+    none = torch.full((count, nv), torch.nan, dtype=torch.float64)
     if is_pose:
-        missing = torch.full((count, 3), torch.nan, dtype=torch.float64)
-        parts = [tensors.get(name, missing) for name in FREE_BODY]
+        parts = [tensors.get(name, none[:, :3]) for name in FREE_BODY]
         tensors |= {QPOS: torch.cat(parts[:2], 1), QVEL: torch.cat(parts[2:], 1)}
-    none = tensors[QPOS].new_full((count, scene.model.nv), torch.nan)
-    idle = none.new_zeros(count, len(scene.actuated))
-    offsets, time = _offsets(arrays, count, path), tensors.get("time")
     log = Recording(
         tensors[QPOS],
         tensors.get(QVEL, none),
-        tensors.get(TORQUE, idle),
-        offsets,
+        tensors.get(TORQUE, none.new_zeros(count, len(scene.actuated))),
+        _offsets(arrays, count, path),
         scene.control_step,
-        time,
+        tensors.get("time"),
         tensors.get(TERRAIN),
     )
-    if time is None:
+    if log.time is None:
         return log
-    return replace(log, frame=float(time.diff()[log.inside[1:]].median()))
+    return replace(log, frame=float(log.time.diff()[log.inside[1:]].median()))
 
 
 def _offsets(arrays: dict[str, np.ndarray], count: int, path: Path) -> Tensor:
@@ -227,14 +221,3 @@ def write_recording(path: Path, scene: Scene, folder: Path) -> dict[str, Any]:
     }
     write_json(folder / CARD, card)
     return card
-
-
-def read_transitions(folder: Path) -> TensorDict:
-    """The data set that `write_recording` wrote, memory-mapped, ``[transitions]``.
-
-    Raises:
-        ValueError: in one sentence, what is missing or broken.
-    """
-    data = read_chunk(chunk_path(folder, 0), 1)
-    expect_finite(data, folder)
-    return data

@@ -32,17 +32,14 @@ WXYZ = [6, 3, 4, 5]  # columns of a free body's qpos, if its quaternion is xyzw
 
 @dataclass(frozen=True)
 class Check:
-    """A value, and the range ``low`` to ``high`` that it must lie in.
-
-    ``advice`` is the reading that would fit, or what is usually wrong.
-    """
+    """A value, and the range ``low`` to ``high`` that it must lie in."""
 
     name: str
     value: float
     low: float
     high: float
     unit: str
-    advice: str
+    advice: str  # the reading that would fit, or what is usually wrong
 
     @property
     def passes(self) -> bool:
@@ -73,66 +70,60 @@ def check_log(log: Recording, scene: Scene) -> list[Check]:
 def _checks(log: Recording, scene: Scene) -> Iterator[Check]:
     quats = [log.qpos[:, q : q + 4] for q, _ in scene.layout.rotations]
     if quats:
-        length = torch.linalg.vector_norm(torch.stack(quats), dim=-1)
-        worst = float((length - 1.0).abs().max())
-        yield Check(
-            *("length of quaternions less 1", worst, 0.0, UNIT_ERROR, ""),
-            "expected unit quaternions",
-        )
+        lengths = _length(torch.stack(quats))  # (rotations, N)
+        worst = float((lengths - 1.0).abs().max())
+        name, advice = "length of quaternions less 1", "expected unit quaternions"
+        yield Check(name, worst, 0.0, UNIT_ERROR, "", advice)
     if log.time is not None:
         steps = log.time.diff()[log.inside[1:]] / log.frame
+        least, most = float(steps.min()), float(steps.max())
         name, limits = "time between frames", (0.5, 1.5, "frames")
-        yield Check(
-            *(name, float(steps.min()), *limits),
-            "time must rise evenly within a trajectory",
+        advice = "time must rise evenly within a trajectory"
+        yield Check(name, least, *limits, advice)
+        advice = "there is a gap in time: split the trajectory there"
+        yield Check(name, most, *limits, advice)
+        name, ratio = (
+            "frame over the scene's control step",
+            log.frame / scene.control_step,
         )
-        yield Check(
-            *(name, float(steps.max()), *limits),
-            "there is a gap in time: split the trajectory there",
-        )
-        ratio = log.frame / scene.control_step
-        yield Check(
-            *("frame over the scene's control step", ratio, 0.95, 1.05, ""),
-            "resample the log to the scene's control step",
-        )
+        advice = "resample the log to the scene's control step"
+        yield Check(name, ratio, 0.95, 1.05, "", advice)
     if is_free_body(scene):
         yield from _free_body_checks(log, scene)
     elif not log.qvel.isnan().any():
-        mean = backward_differences(log, scene)
         ends = 0.5 * (log.qvel + log.qvel.roll(1, 0))  # of a frame
-        yield Check(
-            *("qvel against differences of qpos", _relative_error(ends, mean, log)),
-            *(0.0, VELOCITY_ERROR, "of the speed"),
-            "velocities are in other units, or frames are of another length",
-        )
+        mean = backward_differences(log, scene)
+        advice = "velocities are in other units, or frames are of another length"
+        yield _velocity("qvel against differences of qpos", ends, mean, log, advice)
 
 
 def _free_body_checks(log: Recording, scene: Scene) -> Iterator[Check]:
     yield _gravity(free_fall(log), scene)
     yield _depth(log, scene)
     mean = backward_differences(log, scene)
-    linear, angular = log.qvel[:, :3], log.qvel[:, 3:]
+    linear, angular = log.qvel.split(3, -1)  # (N, 3) each
     has_linear = not linear.isnan().any()
     if has_linear:
-        yield Check(
-            "linear velocity against differences of positions",
-            *(_relative_error(linear, mean[:, :3], log), 0.0, VELOCITY_ERROR),
-            *("of the speed", _linear_advice(log, mean[:, :3])),
-        )
+        name = "linear velocity against differences of positions"
+        advice = _linear_advice(log, mean[:, :3])
+        yield _velocity(name, linear, mean[:, :3], log, advice)
     if not angular.isnan().any():
-        yield Check(
-            "angular velocity in body axes against differences of quaternions",
-            *(_relative_error(angular, mean[:, 3:], log), 0.0, VELOCITY_ERROR),
-            *("of the speed", _angular_advice(log, mean[:, 3:], scene)),
-        )
+        name = "angular velocity in body axes against differences of quaternions"
+        advice = _angular_advice(log, mean[:, 3:], scene)
+        yield _velocity(name, angular, mean[:, 3:], log, advice)
     if has_linear:
-        apart = torch.linalg.vector_norm(mean[:, :3] - linear, dim=-1)
-        jump = apart / (torch.linalg.vector_norm(linear, dim=-1) + SLOW)
-        yield _gap(
-            "displacement within a frame that no velocity explains",
-            *(torch.where(log.inside, jump, 0.0), LARGEST_JUMP),
-        )
-    yield _excess(mean[:, :3], log.inside)
+        jump = _length(mean[:, :3] - linear) / (_length(linear) + SLOW)
+        jump = torch.where(log.inside, jump, 0.0)
+        name = "displacement within a frame that no velocity explains"
+        yield _gap(name, jump, LARGEST_JUMP)
+    # The velocity over a frame with an impact is a mean of those around it, so no impact
+    # makes it larger than both; lost frames do.
+    speed = _length(mean[:, :3])
+    around = torch.maximum(speed.roll(1), speed.roll(-1))
+    excess = (speed - around).clamp_min(0.0) / (around + SLOW)
+    excess = torch.where(log.inside & log.inside.roll(-1), excess, 0.0)
+    name = "speed of a frame above that of both its neighbours"
+    yield _gap(name, excess, LARGEST_EXCESS)
 
 
 def _gravity(fall: Tensor, scene: Scene) -> Check:
@@ -163,10 +154,26 @@ def _depth(log: Recording, scene: Scene) -> Check:
     advice = "sizes, or the ground's height, differ from the scene's"
     if deepest(_swapped(log).qpos) < limit:
         advice = "it fits if quaternions are read as xyzw: give them as wxyz"
-    return Check(
-        *("deepest corner under the ground", deepest(log.qpos)),
-        *(-float("inf"), limit, "m", advice),
-    )
+    name, found = "deepest corner under the ground", deepest(log.qpos)
+    return Check(name, found, -float("inf"), limit, "m", advice)
+
+
+def _velocity(
+    name: str, stored: Tensor, measured: Tensor, log: Recording, advice: str
+) -> Check:
+    error = _relative_error(stored, measured, log)
+    return Check(name, error, 0.0, VELOCITY_ERROR, "of the speed", advice)
+
+
+def _gap(name: str, values: Tensor, limit: float) -> Check:
+    """The largest of the frames' ``values (N,)``, and where it is."""
+    row = int(values.argmax())
+    advice = f"there is a gap in time, or frames are lost, before row {row}"
+    return Check(name, float(values[row]), 0.0, limit, "of it", advice)
+
+
+def _length(x: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(x, dim=-1)
 
 
 def _swapped(log: Recording) -> Recording:
@@ -176,8 +183,7 @@ def _swapped(log: Recording) -> Recording:
 
 def _relative_error(stored: Tensor, measured: Tensor, log: Recording) -> float:
     """Median difference over the median speed, of frames within a trajectory."""
-    apart = torch.linalg.vector_norm(stored - measured, dim=-1)[log.inside]
-    speed = torch.linalg.vector_norm(measured, dim=-1)[log.inside]
+    apart, speed = (_length(x)[log.inside] for x in (stored - measured, measured))
     return float(apart.median() / speed.median().clamp_min(1e-9))
 
 
@@ -186,46 +192,23 @@ def _linear_advice(log: Recording, measured: Tensor) -> str:
     turned = rotate(quat_normalize(log.qpos[:, 3:]), stored)
     if _relative_error(turned, measured, log) < VELOCITY_ERROR:
         return "it fits if they are read in body axes: give them in world axes"
-    speeds = (torch.linalg.vector_norm(x, dim=-1).median() for x in (measured, stored))
-    moved, own = (float(speed) for speed in speeds)
+    moved, own = (float(_length(x).median()) for x in (measured, stored))
     return f"positions move at {moved:.3g} m/s (median), velocities say {own:.3g} m/s"
 
 
 def _angular_advice(log: Recording, measured: Tensor, scene: Scene) -> str:
     stored, quat = log.qvel[:, 3:], quat_normalize(log.qpos[:, 3:])
     swapped = backward_differences(_swapped(log), scene)[:, 3:]
-    readings = {
-        "angular velocities are in world axes: give them in body axes": (
-            *(stored, rotate(quat, measured)),
-        ),
-        "quaternions are xyzw: give them as wxyz": (stored, swapped),
-        "angular velocities are in degrees: give them in rad/s": (
-            *(torch.deg2rad(stored), measured),
-        ),
-    }
-    for reading, (a, b) in readings.items():
+    turned, in_rad = rotate(quat, measured), torch.deg2rad(stored)
+    axes = "angular velocities are in world axes: give them in body axes"
+    order = "quaternions are xyzw: give them as wxyz"
+    unit = "angular velocities are in degrees: give them in rad/s"
+    readings = (
+        (axes, stored, turned),
+        (order, stored, swapped),
+        (unit, in_rad, measured),
+    )
+    for reading, a, b in readings:
         if _relative_error(a, b, log) < VELOCITY_ERROR:
             return f"it fits if {reading}"
     return "quaternions or angular velocities are in other frames or units"
-
-
-def _excess(linear: Tensor, inside: Tensor) -> Check:
-    """How much faster a frame is than the ones before and after it.
-
-    The velocity over a frame with an impact is a mean of those around it, so that no impact
-    makes it larger than both; lost frames do.
-    """
-    speed = torch.linalg.vector_norm(linear, dim=-1)
-    around = torch.maximum(speed.roll(1), speed.roll(-1))
-    excess = (speed - around).clamp_min(0.0) / (around + SLOW)
-    return _gap(
-        "speed of a frame above that of both its neighbours",
-        *(torch.where(inside & inside.roll(-1), excess, 0.0), LARGEST_EXCESS),
-    )
-
-
-def _gap(name: str, values: Tensor, limit: float) -> Check:
-    """The largest of the frames' ``values (N,)``, and where it is."""
-    row = int(values.argmax())
-    advice = f"there is a gap in time, or frames are lost, before row {row}"
-    return Check(name, float(values[row]), 0.0, limit, "of it", advice)

@@ -1,6 +1,7 @@
 """Recorded trajectories of a robot: completed, split, cut into windows, kept as data."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -19,26 +20,15 @@ FLIGHT = 8  # frames at the start of a trajectory in which free fall is measured
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Recorded trajectories, one after the other, float64.
+    """Recorded trajectories, one after the other, float64."""
 
-    | field | meaning |
-    |---|---|
-    | ``qpos`` | ``(N, nq)`` |
-    | ``qvel`` | ``(N, nv)``; NaN where not recorded, until `complete` |
-    | ``joint_torque`` | ``(N, num_actuated)``, N m or N, held until the next state |
-    | ``offsets`` | ``(T + 1,)``: trajectory i is rows ``offsets[i]:offsets[i + 1]`` |
-    | ``frame`` | time between two states, s |
-    | ``time`` | time stamps ``(N,)``, s, or None |
-    | ``terrain`` | the ground ``(N, terrain.size)``, where it varies, else None |
-    """
-
-    qpos: Tensor
-    qvel: Tensor
-    joint_torque: Tensor
-    offsets: Tensor
-    frame: float
-    time: Tensor | None = None
-    terrain: Tensor | None = None
+    qpos: Tensor  # (N, nq)
+    qvel: Tensor  # (N, nv); NaN where not recorded, until `complete`
+    joint_torque: Tensor  # (N, num_actuated), N m or N, held until the next state
+    offsets: Tensor  # (T + 1,): trajectory i is rows offsets[i]:offsets[i + 1]
+    frame: float  # time between two states, s
+    time: Tensor | None = None  # time stamps (N,), s
+    terrain: Tensor | None = None  # the ground (N, terrain.size), where it varies
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -65,11 +55,9 @@ class Recording:
         return replace(self, **kept, offsets=ends, time=None)
 
     def starts(self, states: int, numbers: Tensor | None = None) -> Tensor:
-        """Row of the first of every ``states`` consecutive states, ``(windows,)``.
+        """Rows ``(windows,)`` where ``states`` consecutive states begin.
 
-        Args:
-            states: in a window.
-            numbers: of the trajectories, ``(n,)``; None for all.
+        Of the trajectories with these ``numbers (n,)``, or of all.
         """
         found = [torch.zeros(0, dtype=torch.long)]
         for i in range(len(self)) if numbers is None else numbers.tolist():
@@ -77,13 +65,19 @@ class Recording:
             found.append(torch.arange(first, max(first, end - states + 1)))
         return torch.cat(found)
 
+    @property
+    def trajectories(self) -> list[slice]:
+        """The rows of each."""
+        bounds = self.offsets.tolist()
+        return [slice(first, end) for first, end in pairwise(bounds)]
+
     def trajectory_of(self, rows: Tensor) -> Tensor:
         """Number of the trajectory that each of ``rows (n,)`` belongs to, ``(n,)``."""
         return torch.searchsorted(self.offsets, rows, right=True) - 1
 
     def windows(self, starts: Tensor, states: int) -> TensorDict:
         """Consecutive states and torques ``[windows, states]``."""
-        rows = starts[:, None] + torch.arange(states)
+        rows = starts[:, None] + torch.arange(states)  # (windows, states)
         return TensorDict({k: v[rows] for k, v in self.columns.items()}, [*rows.shape])
 
     def transitions(self) -> TensorDict:
@@ -156,13 +150,12 @@ def free_fall(log: Recording) -> Tensor:
         ValueError: no trajectory of at least 4 frames.
     """
     found = []
-    for first, end in zip(log.offsets[:-1], log.offsets[1:], strict=True):
-        count = min(FLIGHT, int(end - first))
-        if count < 4:
+    for rows in log.trajectories:
+        path = log.qpos[rows, :3][:FLIGHT]  # (frames, 3)
+        if len(path) < 4:
             continue
-        t = log.frame * torch.arange(count, dtype=torch.float64)
+        t = log.frame * torch.arange(len(path), dtype=torch.float64)
         basis = torch.stack((torch.ones_like(t), t, 0.5 * t * t), -1)
-        path = log.qpos[first : first + count, :3]
         found.append(torch.linalg.lstsq(basis, path).solution[2])
     if not found:
         raise ValueError("expected a trajectory of at least 4 frames, got none")
@@ -177,6 +170,5 @@ def split_trajectories(count: int) -> dict[str, Tensor]:
     order = torch.from_numpy(np.random.default_rng(SPLIT_SEED).permutation(count))
     train = round(TRAIN_SHARE * count)
     last = train + round(VALIDATION_SHARE * count)
-    names = ("train", "validation", "test")
-    parts = (order[:train], order[train:last], order[last:])
-    return dict(zip(names, parts, strict=True))
+    parts = {"train": order[:train], "validation": order[train:last]}
+    return {**parts, "test": order[last:]}

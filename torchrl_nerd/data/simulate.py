@@ -23,20 +23,18 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
     states, torques = [state[:, None]], []
-    if scene.sampling.drive is None:
-        drawn = sample_torques(
-            scene.sampling, scale, steps, scene.control_step, generator
-        )
-        for held in drawn.split(SEGMENT, 1):
-            last = cast(TensorDict, states[-1][:, -1])
-            torques.append(held)
-            states.append(dynamics.rollout(last, held, terrain))
-    else:
-        for _ in range(steps):
-            last = cast(TensorDict, states[-1][:, -1])
-            torque = scene.sampling.drive(last[QPOS], last[QVEL], scale, generator)
-            torques.append(torque[:, None])
-            states.append(dynamics.rollout(last, torques[-1], terrain))
+    sampling, drawn = scene.sampling, ()
+    if sampling.drive is None:
+        drawn = sample_torques(sampling, scale, steps, scene.control_step, generator)
+        drawn = drawn.split(SEGMENT, 1)
+    for segment in range(steps if sampling.drive else len(drawn)):
+        last = cast(TensorDict, states[-1][:, -1])
+        if sampling.drive is None:
+            torque = drawn[segment]  # (rows, SEGMENT, num_actuated)
+        else:  # depends on the state: one step at a time
+            torque = sampling.drive(last[QPOS], last[QVEL], scale, generator)[:, None]
+        torques.append(torque)
+        states.append(dynamics.rollout(last, torque, terrain))
     return as_transitions(states, torques, terrain)
 
 

@@ -21,11 +21,7 @@ def chunk_path(folder: Path, number: int) -> Path:
 
 
 def write_chunk(data: TensorDictBase, path: Path) -> None:
-    """Write transitions with any number of batch dimensions to one file, atomically.
-
-    Raises:
-        ValueError: it cannot be written.
-    """
+    """Write transitions with any number of batch dimensions to one file, atomically."""
     writable_folder(path.parent)
     tensors = {key: x.clone() for key, x in data.flatten_keys("/").items()}
     write_tensors(path, tensors)  # clones: safetensors refuses views of one storage
@@ -45,11 +41,7 @@ def read_chunk(path: Path, dims: int) -> TensorDict:
 
 
 def expect_layout(data: TensorDictBase, scene: Scene, steps: int, path: Path) -> None:
-    """Refuse trajectories ``[*, steps]`` without the scene's keys, in its sizes.
-
-    Raises:
-        ValueError: naming the first key that is missing, unknown or of another shape.
-    """
+    """Raise a ValueError unless ``[*, steps]`` has the scene's keys, in its sizes."""
     sizes = {QPOS: scene.layout.nq, QVEL: scene.layout.nv}
     sizes |= {f"next/{key}": size for key, size in sizes.items()}
     sizes |= {"next/joint_torque": len(scene.actuated)}
@@ -68,11 +60,7 @@ def expect_layout(data: TensorDictBase, scene: Scene, steps: int, path: Path) ->
 
 
 def expect_finite(data: TensorDictBase, path: Path) -> None:
-    """Refuse data with NaN or infinity.
-
-    Raises:
-        ValueError: naming the key.
-    """
+    """Raise a ValueError with the first key that holds NaN or infinity."""
     for name, value in data.flatten_keys("/").items():
         if not value.isfinite().all():
             raise ValueError(

@@ -1,29 +1,83 @@
-"""Sampling strategies of training data, by name; see docs/training.md."""
+"""Sampling strategies of training data: initial states, mixtures, and presets' choices."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
+import torch
 from tensordict import TensorDict
-from torch import Generator
+from torch import Generator, Tensor
 
 from torchrl_nerd.data.generate import Draw
-from torchrl_nerd.data.policy_data import policy_data
 from torchrl_nerd.data.simulate import simulate
-from torchrl_nerd.data.starts import PerturbedRestStates, SettledStates, TaskResets
-from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.robots import make_task, preset_of
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.robots import preset_of
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.tasks import Task
+from torchrl_nerd.scenes.sampling import log_uniform
 
-MIN_TORQUE_SCALE = 0.01  # of the largest torque
 MAX_CORRELATION_TIME = 1.0  # s; the shortest is one control step
-ZERO_TORQUE_FRACTION = 0.1
+
+
+@dataclass(frozen=True)
+class SettledStates:
+    """States in which the robot has come to rest: the ends of passive trajectories."""
+
+    scene: Scene  # the robot, whose sampling gives the initial states
+    seconds: float = 3.0  # length of the trajectories
+
+    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+        """See `Starts`; a trajectory that diverges gives its initial state."""
+        start, _ = self.scene.sample_initial(rows, generator)
+        terrain = start.pop(TERRAIN, None)
+        state = first = TensorDict(start, [rows])
+        dynamics = MujocoDynamics(self.scene)
+        idle = torch.zeros(rows, len(self.scene.actuated), dtype=torch.float64)
+        dynamics.reset(first)
+        for _ in range(round(self.seconds / self.scene.control_step)):
+            state = cast(TensorDict, dynamics.step(state, idle, terrain))
+        is_fine = torch.cat((state[QPOS], state[QVEL]), -1).isfinite().all(-1)[:, None]
+        end = {k: torch.where(is_fine, state[k], first[k]) for k in (QPOS, QVEL)}
+        return end if terrain is None else end | {TERRAIN: terrain}
+
+
+@dataclass(frozen=True)
+class PerturbedRestStates:
+    """Settled states with small random velocities and displacements.
+
+    With them the data cover states near rest, where a model's small errors may otherwise
+    grow. Velocities of the settled states are dropped, so that the data show how sliding
+    begins on a steep slope. Sizes of velocity and displacement are log-uniform over four
+    decades, independent of each other: a sliding cube lies as deep in the ground as a
+    resting one.
+    """
+
+    settled: SettledStates
+    # smallest over largest size, which is 1 m/s, 3 rad/s, 1 cm, 0.03 rad
+    min_scale: float = 1e-4
+
+    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+        """See `Starts`."""
+        start, scene = self.settled(rows, generator), self.settled.scene
+        size = log_uniform(self.min_scale, 1.0, 2 * rows, generator).reshape(2, rows, 1)
+        shape = (2, rows, scene.model.nv)
+        push = size * torch.randn(shape, dtype=torch.float64, generator=generator)
+        unit = torch.full((scene.model.nv,), 3.0, dtype=torch.float64)
+        if scene.base.is_floating:
+            unit[scene.base.dof_address : scene.base.dof_address + 3] = 1.0
+        moved = integrate_pos(scene.layout, start[QPOS], 0.01 * unit * push[0])
+        return start | {QPOS: moved, QVEL: unit * push[1]}
 
 
 def resample(scene: Scene, **ranges: Any) -> Scene:
     """The same robot with other fields of its `Sampling`."""
     return replace(scene, sampling=replace(scene.sampling, **ranges))
+
+
+def along(scene: Scene, **ranges: Any) -> Draw:
+    """Trajectories with other fields of the scene's `Sampling`."""
+    return partial(simulate, resample(scene, **ranges))
 
 
 def mix(*draws: Draw) -> Draw:
@@ -42,67 +96,34 @@ def mix(*draws: Draw) -> Draw:
     return draw
 
 
-def strategies(
-    scene: Scene, task: Task, explorer: Actor | None = None
-) -> dict[str, Draw]:
-    """The sampling strategies of a scene, by name.
+def strategy(scene: Scene, name: str) -> Draw:
+    """A sampling strategy by its name.
 
     | name | initial states and torques |
     |---|---|
-    | ``uniform`` | uniform in the ranges, new torques in every step |
-    | ``shares`` | the scene's own sampling, with zero-torque and low-torque trajectories |
-    | ``scales`` | torque scales log-uniform over two decades |
     | ``correlated`` | correlated torques, from one control step to a second |
-    | ``starts`` | equal parts of ``shares``, task resets and settled states |
-    | ``level`` | two parts of ``shares``, one of it over ground that is hit vertically |
-    | ``resting`` | two parts of ``shares``, one of perturbed rest states |
-    | ``policy`` | trajectories of an exploring policy |
-    | ``mixed`` | equal parts of ranges, task resets, settled states and policy |
+    | ``level`` | two parts of the scene's own, one over ground that is hit vertically |
+    | ``resting`` | two parts of the scene's own, one of perturbed rest states |
 
-    All parts of ``mixed`` but the policy's have torque scales and correlation. Scenes
-    without such ground have no ``level``. Scenes whose torques follow the state have no
-    correlation. Without an explorer there is no ``policy`` and no part of it in ``mixed``.
-
-    Args:
-        scene: the robot.
-        task: of the same scene; its resets are among the initial states.
-        explorer: the policy that explores.
+    Raises:
+        ValueError: no such strategy, or one that does not fit the scene.
     """
-    scaled = {
-        "min_torque_scale": MIN_TORQUE_SCALE,
-        "zero_torque_fraction": ZERO_TORQUE_FRACTION,
-        "low_torque_fraction": 0.0,
-    }
-    held = {"correlation_time": (scene.control_step, MAX_CORRELATION_TIME)}
-    can_hold = scene.sampling.drive is None
-    resets, settled = {"starts": TaskResets(task)}, {"starts": SettledStates(scene)}
-    perturbed = PerturbedRestStates(SettledStates(scene))
-    both = scaled | held if can_hold else scaled
-
-    def along(**ranges: Any) -> Draw:
-        return partial(simulate, resample(scene, **ranges))
-
-    level = scene.sampling.level_ground
-    found = {
-        "uniform": along(zero_torque_fraction=0.0, low_torque_fraction=0.0),
-        "shares": along(),
-        "scales": along(**scaled),
-        "correlated": along(**held) if can_hold else None,
-        "starts": mix(along(), along(**resets), along(**settled)),
-        "level": mix(along(), along(), along(ground=level)) if level else None,
-        "resting": mix(along(), along(), along(starts=perturbed)),
-    }
-    mixed = [along(**both), along(**both, **resets), along(**both, **settled)]
-    if explorer is not None:
-        found["policy"] = partial(policy_data, task, explorer)
-        mixed.append(found["policy"])
-    found["mixed"] = mix(*mixed)
-    return {name: draw for name, draw in found.items() if draw is not None}
+    own, level = along(scene), scene.sampling.level_ground
+    if name == "correlated":
+        times = (scene.control_step, MAX_CORRELATION_TIME)
+        return along(scene, correlation_time=times)
+    if name == "level" and level is not None:
+        return mix(own, own, along(scene, ground=level))
+    if name == "resting":
+        starts = PerturbedRestStates(SettledStates(scene))
+        return mix(own, own, along(scene, starts=starts))
+    raise ValueError(
+        f"expected a strategy of correlated, level or resting for '{scene.name}', got "
+        f"{name}"
+    )
 
 
 def preset_strategy(scene: Scene) -> tuple[str, Draw] | None:
     """The strategy of a scene's preset, by name, for `generate`; None: its own ranges."""
-    preset = preset_of(scene.name)
-    if preset.strategy is None or preset.task is None:
-        return None
-    return preset.strategy, strategies(scene, make_task(preset.task))[preset.strategy]
+    name = preset_of(scene.name).strategy
+    return None if name is None else (name, strategy(scene, name))

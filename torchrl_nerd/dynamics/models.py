@@ -12,7 +12,7 @@ from torchrl_nerd.compiled import Compiled, RowThreads, parts_of
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD, Network
-from torchrl_nerd.modules.window import WindowNetwork
+from torchrl_nerd.modules.transformer import WindowNetwork
 
 Inference = Literal["streaming", "window"]
 

@@ -13,7 +13,7 @@ from torchrl_nerd.keys import (
     ROBOT_STATE,
     ROBOT_TORQUE,
 )
-from torchrl_nerd.modules.features import SceneFeatures
+from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import own_contacts
 from torchrl_nerd.scenes.explain import SolverReport

@@ -13,9 +13,7 @@ from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD, NetworkConfig
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Stats
 
-GATE_SCALE = (
-    1.0  # root mean square of the normalised velocity defect at which it is open
-)
+GATE_SCALE = 1.0  # rms of the normalised velocity defect at which the gate is open
 MAX_CHANGE = 1e6  # normalised; the analytic change of absurd torques overflows
 
 
@@ -70,7 +68,7 @@ class HybridNeRD(NeRD):
         change = self.state_delta.delta(qpos, qvel, result.qpos, result.qvel)
         change = _finite(self.normalize.normalize(TARGET, change))
         scale = self.normalize.std(TARGET)[: self.scene.layout.nv]
-        defect = result.velocity_defect
+        defect = result.velocity_defect  # (*batch, nv) or several of them
         defect = _finite(defect / scale.repeat(defect.shape[-1] // len(scale)))
         rms = defect.square().mean(-1, keepdim=True).sqrt()
         token = self.training_range.clamp_features(features)

@@ -17,13 +17,16 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_nerd.configs import FeatureConfig
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.ood import OODScore
-from torchrl_nerd.modules.sleep import Sleep
-from torchrl_nerd.modules.training_range import TrainingRange
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.transforms import Normalize, StateDelta, Stats
+from torchrl_nerd.transforms import (
+    ContactFeatures,
+    Normalize,
+    RobotCentric,
+    StateDelta,
+    Stats,
+)
 
 TOKEN, TARGET = "token", "target"  # keys of the statistics
 
@@ -68,6 +71,25 @@ class Encoded(NamedTuple):
     gate: Tensor  # (*batch, 1) or (): share of the network's output that counts
 
 
+class SceneFeatures(nn.Module):
+    """`RobotCentric`, joint torques and `ContactFeatures` of a state, concatenated."""
+
+    def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
+        super().__init__()
+        self.config = config
+        self.robot = RobotCentric(scene, config)
+        self.contact = ContactFeatures(scene, config)
+        self.size = sum((*self.robot.sizes.values(), *self.contact.sizes.values()))
+
+    def forward(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+    ) -> Tensor:
+        """Raw features ``(*batch, F)`` in the dtype of the state."""
+        state = self.robot.state_features(qpos, qvel)
+        contacts = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
+        return torch.cat((state, joint_torque, *contacts), -1)
+
+
 class NeRD(nn.Module):
     """The learned solver of one robot: state, torque and ground in, next state out.
 
@@ -75,8 +97,8 @@ class NeRD(nn.Module):
         scene: the robot and its ground.
         features: which predictions of the contact law are among its features.
         network: size and kind of the network.
-        stats: statistics of raw features and targets; zero mean and unit variance where
-            not given (weights that are yet to be loaded).
+        stats: of raw features and targets; zero mean and unit variance where not given
+            (weights that are yet to be loaded).
         scene_features: what it sees of a state; `SceneFeatures` where not given.
         state_delta: what it predicts; see `StateDelta`.
     """
@@ -101,8 +123,9 @@ class NeRD(nn.Module):
         self.scene_features = scene_features or SceneFeatures(scene, features)
         self.state_delta = state_delta or StateDelta(scene)
         num_features, num_outputs = self.scene_features.size, self.state_delta.size
+        sizes: dict[NestedKey, int] = {TOKEN: num_features, TARGET: num_outputs}
         self.normalize = Normalize(
-            stats or {TOKEN: unit_stats(num_features), TARGET: unit_stats(num_outputs)}
+            stats or {key: unit_stats(size) for key, size in sizes.items()}
         )
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
@@ -136,11 +159,10 @@ class NeRD(nn.Module):
 
         change = base + gate * output, denormalised, clamped and integrated.
         """
-        qpos, qvel = state
-        change = encoded.base + encoded.gate * output.to(qpos.dtype)
-        after = self.state_delta.integrate(
-            qpos, qvel, self.bounded(change), self.training_range.limit_motion
-        )
+        change = encoded.base + encoded.gate * output.to(encoded.base.dtype)
+        change = self.bounded(change)  # (*batch, D)
+        limit = self.training_range.limit_motion
+        after = self.state_delta.integrate(*state, change, limit)
         return self.sleep.apply_sleep(state, self.training_range.stop_joints(*after))
 
     def bounded(self, change: Tensor) -> Tensor:

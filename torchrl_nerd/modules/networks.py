@@ -1,14 +1,125 @@
-"""Networks by name: kind, then depth x width."""
+"""MLP and GRU with the transformer's signature, and all networks by name.
 
-from torchrl_nerd.modules.gru import GRUConfig
-from torchrl_nerd.modules.mlp import MLPConfig
-from torchrl_nerd.modules.transformer import PRESETS, TransformerConfig
+The MLP has no history (a Markov model); the GRU's history is a hidden state.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.modules.transformer import (
+    TRANSFORMERS,
+    FeedForward,
+    FullLinear,
+    TransformerConfig,
+    initialize,
+    make_head,
+)
 from torchrl_nerd.settings import SettingError
+
+
+@dataclass(frozen=True)
+class MLPConfig:
+    """Size of an MLP: ``depth`` residual blocks of ``width``."""
+
+    depth: int = 4
+    width: int = 64
+
+    def build(self, num_inputs: int, num_outputs: int) -> "MLP":
+        """A freshly initialised network."""
+        return MLP(self, num_inputs, num_outputs)
+
+
+class NoMemory:
+    """History of a network that has none."""
+
+    def clear(self, rows: Tensor) -> None:
+        """Nothing to forget."""
+
+
+class MLP(nn.Module):
+    """The transformer without its attention: a history of one (the Markov model)."""
+
+    def __init__(self, config: MLPConfig, num_inputs: int, num_outputs: int) -> None:
+        super().__init__()
+        self.config = config
+        self.embed = FullLinear(num_inputs, config.width)
+        self.blocks = nn.ModuleList(
+            FeedForward(config.width) for _ in range(config.depth)
+        )
+        self.head = make_head(config.width, num_outputs)
+        initialize(self.blocks)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """``(*batch, F) -> (*batch, D)``."""
+        x = self.embed(tokens)  # (*batch, width)
+        for block in self.blocks:
+            x = block(x)
+        return self.head(x)
+
+    def empty_memory(self, rows: int) -> NoMemory:
+        """Nothing."""
+        return NoMemory()
+
+    def step(self, token: Tensor, memory: NoMemory) -> Tensor:
+        """``(rows, F) -> (rows, D)``."""
+        return self(token)
+
+
+@dataclass(frozen=True)
+class GRUConfig:
+    """Size of a GRU: ``layers`` of ``width``."""
+
+    layers: int = 1
+    width: int = 128
+
+    def build(self, num_inputs: int, num_outputs: int) -> "GRU":
+        """A freshly initialised network."""
+        return GRU(self, num_inputs, num_outputs)
+
+
+@dataclass
+class HiddenState:
+    """Hidden state of a GRU; zero is an empty history."""
+
+    value: Tensor  # (layers, rows, width)
+
+    def clear(self, rows: Tensor) -> None:
+        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
+        self.value = torch.where(rows[:, None], 0.0, self.value)
+
+
+class GRU(nn.Module):
+    """Gated recurrent unit between two linear layers."""
+
+    def __init__(self, config: GRUConfig, num_inputs: int, num_outputs: int) -> None:
+        super().__init__()
+        self.config = config
+        self.embed = FullLinear(num_inputs, config.width)
+        self.gru = nn.GRU(config.width, config.width, config.layers, batch_first=True)
+        self.head = FullLinear(config.width, num_outputs)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
+        return self.head(self.gru(self.embed(tokens))[0])
+
+    def empty_memory(self, rows: int) -> HiddenState:
+        """A hidden state of zeros for ``rows`` rows."""
+        shape = (self.config.layers, rows, self.config.width)
+        return HiddenState(self.embed.weight.new_zeros(shape))
+
+    def step(self, token: Tensor, memory: HiddenState) -> Tensor:
+        """``(rows, F) -> (rows, D)``; advances ``memory``."""
+        inputs = self.embed(token)[:, None]  # (rows, 1, width)
+        output, memory.value = self.gru(inputs, memory.value)
+        return self.head(output[:, 0])
+
 
 NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 
 NETWORKS: dict[str, NetworkConfig] = {
-    **PRESETS,
+    **TRANSFORMERS,
     "mlp-1x16": MLPConfig(depth=1, width=16),
     "mlp-1x32": MLPConfig(depth=1, width=32),
     "mlp-2x32": MLPConfig(depth=2, width=32),
@@ -19,6 +130,7 @@ NETWORKS: dict[str, NetworkConfig] = {
     "mlp-4x160": MLPConfig(depth=4, width=160),
     "gru": GRUConfig(),
 }
+"""Kind, then depth x width."""
 
 
 def network_config(name: str) -> NetworkConfig:
@@ -28,7 +140,6 @@ def network_config(name: str) -> NetworkConfig:
         SettingError: no such network.
     """
     if name not in NETWORKS:
-        raise SettingError(
-            f"unknown network '{name}', expected one of {', '.join(NETWORKS)}"
-        )
+        known = ", ".join(NETWORKS)
+        raise SettingError(f"unknown network '{name}', expected one of {known}")
     return NETWORKS[name]

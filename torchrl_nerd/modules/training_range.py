@@ -1,4 +1,4 @@
-"""Bounds of the training data, within which a model's inputs and outputs are kept.
+"""What a model knows of its training data: their range, their spread, and rest in them.
 
 A network returns something for any input, far from its training data too. So features are
 clamped to the range that the data filled, changes of the state stay within the largest in
@@ -16,10 +16,11 @@ from torchrl_nerd.scenes.scene import Scene
 MARGIN = 0.1  # of a range's width, on either side
 SPEED_MARGIN = 2.0  # times the largest speed in the data
 UNBOUNDED = 1e300  # finite, so that a share of it is a number
-MAX_POSITION = (
-    1e6  # m and rad: beyond it a joint did not overshoot, the state is broken
-)
+MAX_POSITION = 1e6  # m and rad: beyond it the state is broken, no joint overshot
 MIN_WIDTH = 1e-3  # of a normalised feature's range, for `TrainingRange.excess`
+RIDGE = 1e-3  # variance added to every normalised feature before the inverse
+QUANTILE = 0.99  # of training inputs that score at most 1
+MAX_SAMPLES = 200_000  # for covariance and quantile
 
 
 class TrainingRange(nn.Module):
@@ -42,8 +43,12 @@ class TrainingRange(nn.Module):
 
     def __init__(self, scene: Scene, num_features: int, num_outputs: int) -> None:
         super().__init__()
-        self.vectors = vector_dofs(scene)
-        self.limited = _limited(scene)
+        model, self.vectors = scene.model, vector_dofs(scene)
+        self.limited = tuple(  # addresses in qpos and qvel of hinges and slides
+            (int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+            for joint in range(model.njnt)
+            if model.jnt_limited[joint] and model.jnt_type[joint] in (HINGE, SLIDE)
+        )
         self.joint_of = [0] * scene.model.nv  # qpos of each dof's joint, if limited
         is_limited = torch.zeros(scene.model.nv, dtype=torch.float64)
         for q, v in self.limited:
@@ -65,14 +70,7 @@ class TrainingRange(nn.Module):
     def fit(
         self, features: Tensor, targets: Tensor, qpos: Tensor, qvel: Tensor
     ) -> None:
-        """Take the bounds of a data set, in place of any before.
-
-        Args:
-            features: normalised, ``(samples, F)``.
-            targets: normalised, ``(samples, D)``.
-            qpos: ``(samples, nq)``.
-            qvel: ``(samples, nv)``.
-        """
+        """Take the bounds of samples ``(n, ...)``, features and targets normalised."""
         for q, _ in self.limited:
             low, high = qpos[:, q].amin(), qpos[:, q].amax()
             margin = MARGIN * (high - low)
@@ -105,10 +103,10 @@ class TrainingRange(nn.Module):
         return target.clamp(self.target_low, self.target_high)
 
     def clamp_change(self, change: Tensor, step: float) -> Tensor:
-        """Changes ``(*batch, 2 nv)`` no larger than from the largest speed to its opposite.
+        """Changes ``(*batch, 2 nv)`` within those from the largest speed to its opposite.
 
         Args:
-            change: of velocities, then of positions beside the trapezoid, see `StateDelta`.
+            change: see `StateDelta`.
             step: s, in which they happen.
         """
         largest = torch.cat((2.0 * self.speed, step * self.speed))
@@ -126,17 +124,12 @@ class TrainingRange(nn.Module):
         return motion * (farthest / torch.maximum(size, farthest))
 
     def stop_joints(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
-        """The state with limited joints no farther than in the data, and none going on.
-
-        Args:
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
-        """
+        """The state with limited joints no farther than in the data, and none going on."""
         if not self.limited:
             return qpos, qvel
         within = qpos.clamp(self.qpos_low, self.qpos_high)
         within = torch.where(qpos.abs() < MAX_POSITION, within, qpos)  # faults stay
-        push = (within - qpos)[..., self.joint_of] * self.is_limited
+        push = (within - qpos)[..., self.joint_of] * self.is_limited  # (*batch, nv)
         slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
         return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
 
@@ -147,13 +140,103 @@ class TrainingRange(nn.Module):
         return (outside / (high - low).clamp(min=MIN_WIDTH)).amax(-1)
 
 
-def magnitudes(vectors: tuple[int, ...], qvel: Tensor) -> Tensor:
-    """Magnitudes ``(*batch, nv)``; whole vectors count where free and ball joints are.
+class OODScore(nn.Module):
+    """Mahalanobis distance to the training features, scaled; zero until `fit`.
 
     Args:
-        vectors: see `vector_dofs`.
-        qvel: ``(*batch, nv)``.
+        num_features: width F of normalised features.
     """
+
+    center: Tensor
+    whitening: Tensor
+    reach: Tensor
+
+    def __init__(self, num_features: int) -> None:
+        super().__init__()
+        one = torch.ones((), dtype=torch.float64)
+        self.register_buffer("center", one.new_zeros(num_features))
+        self.register_buffer("whitening", one.new_zeros(num_features, num_features))
+        self.register_buffer("reach", one)
+
+    @torch.no_grad()
+    def fit(self, features: Tensor) -> None:
+        """Take mean, covariance and quantile of ``(samples, F)``."""
+        some = features[:: max(1, len(features) // MAX_SAMPLES)].double()
+        center = some.mean(0)
+        covariance = (some - center).T @ (some - center) / len(some)
+        ridge = RIDGE * torch.eye(len(center), dtype=some.dtype, device=some.device)
+        values, axes = torch.linalg.eigh(covariance + ridge)
+        self.center.copy_(center)
+        # the ridge bounds eigenvalues from below, but for rounding beside a huge one
+        self.whitening.copy_((axes / values.clamp_min(RIDGE).sqrt()).T)
+        length = self.mahalanobis(some.to(features.dtype))
+        self.reach.copy_(torch.quantile(length, QUANTILE))
+
+    def mahalanobis(self, features: Tensor) -> Tensor:
+        """Distance ``(*batch,)`` from the mean in units of the data's spread."""
+        return torch.linalg.vector_norm(
+            (features - self.center) @ self.whitening.T, dim=-1
+        )
+
+    def forward(self, features: Tensor, excess: Tensor) -> Tensor:
+        """Score ``(*batch,)``: up to 1 for 99% of training, above 1 outside the range.
+
+        The sum of both parts predicts large one-step errors best, see docs/stability.md.
+
+        Args:
+            features: normalised, ``(*batch, F)``.
+            excess: ``(*batch,)``, see `TrainingRange.excess`.
+        """
+        spread = self.mahalanobis(features) / self.reach
+        return torch.where(excess > 0.0, 1.0 + spread + excess.sqrt(), spread)
+
+
+class Sleep(nn.Module):
+    """Thresholds below which a robot over a ground stays exactly where it is.
+
+    As in game and robot engines: no solver's rest is exact, and a learned one's noise
+    would carry a resting robot away in time. Thresholds are zero until set.
+
+    | buffer | meaning |
+    |---|---|
+    | ``sleep_speed`` | ``(nv,)``, m/s and rad/s: speed of the model's noise at rest |
+    | ``sleep_gain`` | ``(nv,)``: speed that the model adds to a resting robot in a step;
+      one that gains more begins to move, as on a slope that friction does not hold |
+
+    Args:
+        scene: the robot; without a ground it never sleeps.
+    """
+
+    sleep_speed: Tensor
+    sleep_gain: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.vectors, self.can_rest = vector_dofs(scene), scene.terrain is not None
+        zero = torch.zeros(scene.model.nv, dtype=torch.float64)
+        self.register_buffer("sleep_speed", zero)
+        self.register_buffer("sleep_gain", zero.clone())
+
+    def apply_sleep(
+        self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """The state after, or the one before at zero velocity where the robot sleeps.
+
+        Args:
+            before: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
+            after: the same, one step later.
+        """
+        if not self.can_rest:
+            return after
+        old, new = (magnitudes(self.vectors, state[1]) for state in (before, after))
+        is_slow = torch.maximum(old, new) < self.sleep_speed
+        is_asleep = (is_slow & (new - old < self.sleep_gain)).all(-1, keepdim=True)
+        qpos = torch.where(is_asleep, before[0], after[0])
+        return qpos, after[1].masked_fill(is_asleep, 0.0)
+
+
+def magnitudes(vectors: tuple[int, ...], qvel: Tensor) -> Tensor:
+    """Magnitudes ``(*batch, nv)`` of ``qvel``; of whole vectors at `vector_dofs`."""
     sizes = qvel.abs()
     for start in vectors:
         norm = torch.linalg.vector_norm(qvel[..., start : start + 3], dim=-1)
@@ -165,13 +248,3 @@ def vector_dofs(scene: Scene) -> tuple[int, ...]:
     """Where in ``qvel`` the three components of each vector begin."""
     linear = [scene.base.dof_address] if scene.base.is_floating else []
     return (*linear, *(v for _, v in scene.layout.rotations))
-
-
-def _limited(scene: Scene) -> tuple[tuple[int, int], ...]:
-    """Addresses in ``qpos`` and ``qvel`` of every hinge and slide with limits."""
-    model = scene.model
-    return tuple(
-        (int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
-        for joint in range(model.njnt)
-        if model.jnt_limited[joint] and int(model.jnt_type[joint]) in (HINGE, SLIDE)
-    )

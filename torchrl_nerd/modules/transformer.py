@@ -5,6 +5,7 @@ Here each layer sees a token and the ``band - 1`` before it, and positions are r
 learned bias per head and offset). A token is written in its own base frame and never
 changes as time moves on, so its keys and values are kept in a ring. Depth widens the
 view: ``layers * (band - 1) + 1`` tokens reach the output, in training as in streaming.
+`WindowNetwork` is the paper's inference.
 """
 
 from dataclasses import asdict, dataclass
@@ -20,18 +21,12 @@ HEAD_WIDTH = 64  # paper, appendix A
 
 @dataclass(frozen=True)
 class TransformerConfig:
-    """Size of a transformer.
-
-    | field | meaning |
-    |---|---|
-    | ``layers``, ``width``, ``heads`` | as usual; ``heads`` divides ``width`` |
-    | ``band`` | tokens each layer sees, the current one included (paper: h = 10) |
-    """
+    """Size of a transformer."""
 
     layers: int = 2
     width: int = 64
-    heads: int = 4
-    band: int = 10
+    heads: int = 4  # divides width
+    band: int = 10  # tokens each layer sees, the current one included (paper: h = 10)
 
     def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
         """A freshly initialised network."""
@@ -40,19 +35,13 @@ class TransformerConfig:
 
 @dataclass
 class KeyValueCache:
-    """Keys and values of the last ``band - 1`` tokens of every layer.
+    """Keys and values of the last ``band - 1`` tokens of every layer."""
 
-    | field | meaning |
-    |---|---|
-    | ``keys``, ``values`` | per layer ``(rows, heads, band - 1, head width)`` |
-    | ``age`` | ``(rows,)``: tokens seen since the row's reset, at most ``band - 1`` |
-    | ``slot`` | ``(1,)``: where the oldest token lies, which the next one overwrites; a
-      tensor, so that compiled code is the same for all of them |
-    """
-
-    keys: list[Tensor]
-    values: list[Tensor]
-    age: Tensor
+    keys: list[Tensor]  # per layer (rows, heads, band - 1, head width)
+    values: list[Tensor]  # the same
+    age: Tensor  # (rows,): tokens seen since the row's reset, at most band - 1
+    # (1,): where the oldest token lies, which the next one overwrites; a tensor, so that
+    # compiled code is the same for all of them
     slot: Tensor
 
     def clear(self, rows: Tensor) -> None:
@@ -62,13 +51,7 @@ class KeyValueCache:
             past[rows] = 0.0  # whatever stood there, a masked NaN would still spread
 
     def write(self, layer: int, key: Tensor, value: Tensor) -> None:
-        """Store one token of one layer; out of place while gradients are recorded.
-
-        Args:
-            layer: its number.
-            key: ``(rows, heads, size)``.
-            value: likewise.
-        """
+        """Store one token ``(rows, heads, head width)``; with gradients, out of place."""
         for past, new in ((self.keys, key), (self.values, value)):
             if torch.is_grad_enabled():
                 size = past[layer].shape[2]
@@ -81,10 +64,8 @@ class KeyValueCache:
     def advance(self) -> None:
         """Count one token."""
         size = self.keys[0].shape[2]
-        is_shifted = torch.is_grad_enabled()
-        self.slot = (
-            torch.zeros_like(self.slot) if is_shifted else (self.slot + 1) % size
-        )
+        later = (self.slot + 1) % size  # `write` shifts, where gradients are recorded
+        self.slot = torch.zeros_like(later) if torch.is_grad_enabled() else later
         self.age = (self.age + 1).clamp_max(size)
 
 
@@ -100,16 +81,17 @@ class Attention(nn.Module):
         self.offset_bias = nn.Parameter(torch.zeros(config.heads, config.band))
 
     def _split(self, x: Tensor) -> tuple[Tensor, ...]:
-        parts = self.project(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
-        return parts  # each (*, heads, head width)
+        # query, key and value, (*, heads, head width) each
+        return self.project(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
 
     def forward(self, x: Tensor) -> Tensor:
         """All tokens at once, ``(rows, T, width)``."""
+        # (rows, heads, T, head width) each
         query, key, value = (part.transpose(1, 2) for part in self._split(x))
         steps = torch.arange(x.shape[1], device=x.device)
-        offset = steps[:, None] - steps[None, :]
+        offset = steps[:, None] - steps[None, :]  # (T, T): how long ago
         is_seen = (offset >= 0) & (offset < self.band)
-        bias = self.offset_bias[:, offset.clamp(0, self.band - 1)]
+        bias = self.offset_bias[:, offset.clamp(0, self.band - 1)]  # (heads, T, T)
         scores = query @ key.mT * self.scale + bias
         weights = scores.masked_fill(~is_seen, MASKED).softmax(-1)
         return self.output((weights @ value).transpose(1, 2).flatten(2))
@@ -120,12 +102,11 @@ class Attention(nn.Module):
         past_keys, past_values = cache.keys[layer], cache.values[layer]
         size = self.band - 1
         slots = torch.arange(size, device=x.device)
-        offset = (cache.slot - 1 - slots) % size + 1
-        is_seen = offset <= cache.age[:, None]
+        offset = (cache.slot - 1 - slots) % size + 1  # (band - 1,): how long ago
+        is_seen = offset <= cache.age[:, None]  # (rows, band - 1)
         past = torch.einsum("bhd,bhsd->bhs", query, past_keys) * self.scale
-        past = (past + self.offset_bias[:, offset]).masked_fill(
-            ~is_seen[:, None], MASKED
-        )
+        past = past + self.offset_bias[:, offset]  # (rows, heads, band - 1)
+        past = past.masked_fill(~is_seen[:, None], MASKED)
         own = (query * key).sum(-1, keepdim=True) * self.scale + self.offset_bias[:, :1]
         weights = torch.cat((past, own), -1).softmax(-1)
         mixed = torch.einsum("bhs,bhsd->bhd", weights[..., :-1], past_values)
@@ -203,11 +184,6 @@ def initialize(blocks: nn.ModuleList) -> None:
 class CausalTransformer(nn.Module):
     """Tokens of features to one prediction per token.
 
-    Args:
-        config: its size.
-        num_inputs: features per token.
-        num_outputs: numbers predicted per token.
-
     Raises:
         ValueError: a size that no transformer has.
     """
@@ -240,9 +216,8 @@ class CausalTransformer(nn.Module):
         """A history of nothing for ``rows`` rows."""
         c, weight = self.config, self.embed.weight
         shape = (rows, c.heads, c.band - 1, c.width // c.heads)
-        keys, values = (
-            [weight.new_zeros(shape) for _ in range(c.layers)] for _ in range(2)
-        )
+        keys = [weight.new_zeros(shape) for _ in range(c.layers)]
+        values = [torch.zeros_like(key) for key in keys]
         age = torch.zeros(rows, dtype=torch.long, device=weight.device)
         return KeyValueCache(keys, values, age, slot=age.new_zeros(1))
 
@@ -255,7 +230,51 @@ class CausalTransformer(nn.Module):
         return self.head(x)
 
 
-PRESETS = {
+class TokenWindow:
+    """The last ``size`` tokens of every row, left-aligned: a row's first is at index 0."""
+
+    def __init__(self, rows: int, size: int, width: int, like: Tensor) -> None:
+        self.tokens = like.new_zeros(rows, size, width)
+        self.age = torch.zeros(rows, dtype=torch.long, device=like.device)
+
+    def clear(self, rows: Tensor) -> None:
+        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
+        self.tokens = torch.where(rows[:, None, None], 0.0, self.tokens)
+        self.age = self.age.masked_fill(rows, 0)
+
+    def append(self, token: Tensor) -> Tensor:
+        """Add a token to every row; returns the index it got, ``(rows,)``."""
+        size = self.tokens.shape[1]
+        is_full = (self.age >= size)[:, None, None]
+        tokens = torch.where(is_full, self.tokens.roll(-1, 1), self.tokens)
+        index = self.age.clamp_max(size - 1)
+        # (rows, size): where the new token goes
+        slots = torch.arange(size, device=token.device) == index[:, None]
+        self.tokens = torch.where(slots[..., None], token[:, None], tokens)
+        self.age = (self.age + 1).clamp_max(size)
+        return index
+
+
+class WindowNetwork(nn.Module):
+    """A network run in the paper's way; the same signature as the network itself."""
+
+    def __init__(self, network: nn.Module, size: int, width: int) -> None:
+        super().__init__()
+        self.network, self.size, self.width = network, size, width
+
+    def empty_memory(self, rows: int) -> TokenWindow:
+        """A window without tokens."""
+        like = next(self.network.parameters())
+        return TokenWindow(rows, self.size, self.width, like)
+
+    def step(self, token: Tensor, memory: TokenWindow) -> Tensor:
+        """``(rows, F) -> (rows, D)``; advances ``memory``."""
+        index = memory.append(token)
+        outputs = self.network(memory.tokens)
+        return outputs[torch.arange(len(token), device=token.device), index]
+
+
+TRANSFORMERS = {
     "transformer-2x64": TransformerConfig(2, 64, 4),
     "transformer-2x96": TransformerConfig(2, 96, 4),
     "transformer-4x128": TransformerConfig(4, 128, 4),

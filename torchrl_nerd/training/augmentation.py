@@ -5,29 +5,23 @@ The image of a token or target under an isometry is a signed permutation of its 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import torch
-from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
-from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.nerd import TARGET, TOKEN
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, SceneFeatures
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.samples import PART, raw_tokens
+from torchrl_nerd.training.samples import raw_tokens
 from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_contact
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 RTOL = 1e-7  # of equal entries, relative to the largest of a column
-STATS_TOL = (
-    1e-3  # standard deviations: more than rounding, less than matters to a network
-)
-SEARCH_PARTS = 8  # of `PART` trajectories that are searched for hard examples
-# states with every contact point in the ground, which small data sets may not have
-LOW_STATES, MAX_DEPTH = 256, 1.0  # -, m
+STATS_TOL = 1e-3  # standard deviations: more than rounding, less than a network notices
+STATES = 512  # whose features tell which entry of an image is which of the original
+MAX_DEPTH = 1.0  # m: deep enough to have every contact point in the ground
 
 
 class SignedPermutations:
@@ -50,7 +44,7 @@ class SignedPermutations:
 
     def __call__(self, x: Tensor, choice: Tensor) -> Tensor:
         """Images of ``x (rows, length, F)``, each row by isometry ``choice (rows,)``."""
-        sources = self.sources[choice][:, None].expand(x.shape)
+        sources = self.sources[choice][:, None].expand(x.shape)  # (rows, length, F)
         return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
 
     def complete(self, stats: Stats) -> Stats:
@@ -58,13 +52,10 @@ class SignedPermutations:
 
         With these, normalised vectors are renumbered as raw ones are.
         """
-        merged, *others = (
+        return Stats.merge_all(
             Stats(stats.count, sign * stats.mean[source], stats.m2[source])
             for source, sign in zip(self.sources, self.signs, strict=True)
         )
-        for other in others:
-            merged = merged.merge(other)
-        return merged
 
     def keep(self, mean: Tensor, std: Tensor) -> bool:
         """Whether images of samples of these statistics ``(F,)`` have the same ones."""
@@ -76,12 +67,6 @@ class SignedPermutations:
         """On another device, in place."""
         self.sources, self.signs = self.sources.to(device), self.signs.to(device)
         return self
-
-
-def hard_examples(x: Tensor, per_column: int = 8) -> Tensor:
-    """Indices of the samples in ``x (N, F)`` with the largest entries of each column."""
-    count = min(per_column, len(x))
-    return x.abs().topk(count, 0).indices.flatten().unique()
 
 
 def _match(original: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,43 +87,21 @@ def _match(original: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """Isometries of a robot and their effect on its tokens and targets.
+    """Isometries of a robot and their effect on its tokens and targets."""
 
-    | field | meaning |
-    |---|---|
-    | ``isometries`` | the identity first |
-    | ``permutations`` | of `TOKEN` and `TARGET` |
-    """
-
-    isometries: tuple[Isometry, ...]
-    permutations: dict[str, SignedPermutations]
+    isometries: tuple[Isometry, ...]  # the identity first
+    permutations: dict[str, SignedPermutations]  # of `TOKEN` and `TARGET`
 
     @classmethod
-    def of(
-        cls, scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
-    ) -> "Symmetry":
-        """The symmetry of a robot; permutations are found from samples of ``data``."""
+    def of(cls, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> "Symmetry":
+        """The symmetry of a robot; permutations are found from random states."""
         isometries = find_isometries(scene)
-        tokens, targets = SceneFeatures(scene, config), StateDelta(scene)
-        low = states_in_contact(scene, LOW_STATES, MAX_DEPTH)
-
-        def hardest(flat: TensorDict) -> TensorDict:
-            rows = [hard_examples(x) for x in raw_tokens(tokens, targets, flat)]
-            return cast(TensorDict, flat[torch.cat(rows).unique()])
-
-        # the largest of all are among the largest of the parts, one at a time in memory
-        parts = data[: SEARCH_PARTS * PART].split(PART)
-        found = [hardest(cast(TensorDict, part.flatten(0, 1))) for part in parts]
-        some = hardest(cast(TensorDict, TensorDict.cat(found)))
-        token_images, target_images = [], []
-        for isometry in isometries:
-            token, target = raw_tokens(tokens, targets, isometry(some))
-            image = isometry(low)
-            keys = (QPOS, QVEL, JOINT_TORQUE)
-            other = tokens(*(image[k] for k in keys), image.get(TERRAIN, None))
-            token_images.append(torch.cat((token, other)))
-            target_images.append(target)
-        pairs = ((TOKEN, token_images), (TARGET, target_images))
+        encode = SceneFeatures(scene, config), StateDelta(scene)
+        states = states_in_contact(scene, STATES, MAX_DEPTH)
+        for key in (QPOS, QVEL):  # a change between any two states will do
+            states["next", key] = states[key].roll(1, 0)
+        images = [raw_tokens(*encode, isometry(states)) for isometry in isometries]
+        pairs = zip((TOKEN, TARGET), zip(*images, strict=True), strict=True)
         found = {key: SignedPermutations(x[0], x) for key, x in pairs}
         return cls(isometries, found)
 

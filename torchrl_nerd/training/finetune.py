@@ -9,7 +9,7 @@ import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -27,7 +27,6 @@ from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training.low_rank import add_low_rank, merge_low_rank
 from torchrl_nerd.training.physics_fit import WINDOWS, fit_flight, fit_parameters
 
 VALIDATION_STRIDE = 5  # of the validation windows, which overlap
@@ -74,9 +73,8 @@ class FineTuner:
         self.update = config.update or ("physics" if is_fit else "all")
         if (self.update == "physics") != is_fit or not isinstance(model, CAN_LEARN):
             raise SettingError(
-                "expected update 'physics' for a free body's analytic step, 'all', "
-                f"'head' or 'low-rank' for a network, got '{self.update}' for "
-                f"{type(model).__name__}"
+                "expected update 'physics' for a free body's analytic step, 'all' or "
+                f"'head' for a network, got '{self.update}' for {type(model).__name__}"
             )
         self.config, self.recording, self.quiet = config, recording, quiet
         self.model, self.train, self.keep = copy.deepcopy(model), train, keep
@@ -93,7 +91,10 @@ class FineTuner:
                 )
         self.curve: list[dict[str, float]] = []
         if isinstance(self.model, NeRD):
-            chosen = choose_weights(self.model.network, self.update, config.rank)
+            chosen = []
+            for name, weight in self.model.network.named_parameters():
+                weight.requires_grad_(self.update == "all" or "head" in name)
+                chosen += [weight] if weight.requires_grad else []
             self.optimizer = torch.optim.Adam(chosen, lr=config.lr)
 
     @property
@@ -120,7 +121,8 @@ class FineTuner:
 
     def _fit(self) -> None:
         """Physical parameters, without gradients; a window counts as part of an epoch."""
-        step, scene = cast(FreeBodyPenaltyStep, self.model), self.model.scene
+        step, scene = self.model, self.model.scene
+        assert isinstance(step, FreeBodyPenaltyStep)
         epoch, evaluations, seen = len(self.starts), self.config.evaluations, 0
         planned = evaluations * sum(min(windows, epoch) for windows in WINDOWS)
 
@@ -191,7 +193,7 @@ class FineTuner:
         self.curve.append(point)
         is_better = best is None or score(point) < best
         if is_better:
-            self._best = self._frozen()
+            self._best = copy.deepcopy(self.model).requires_grad_(True).eval()
             if self.keep is not None:
                 self.keep(self._best)
         return is_better
@@ -207,35 +209,10 @@ class FineTuner:
         dynamics = dynamics_of(self.model)
         return window_errors(dynamics, self.recording, rows, self.config.states)
 
-    def _frozen(self) -> Model:
-        """A copy of the model as it is now, low-rank changes added to its weights."""
-        model = copy.deepcopy(self.model)
-        if isinstance(model, NeRD):
-            merge_low_rank(model.network)
-        return model.requires_grad_(True).eval()
-
     def card(self) -> dict[str, Any]:
         """Configuration and convergence, for a checkpoint's card."""
         how = asdict(self.config) | {"update": self.update}
         return {"finetuning": {**how, **converged(self.curve)}}
-
-
-def choose_weights(network: nn.Module, update: str, rank: int) -> list[nn.Parameter]:
-    """Mark what an update changes, in place, and return it.
-
-    Args:
-        network: of the model.
-        update: ``"all"``, ``"head"`` (the last layer) or ``"low-rank"``.
-        rank: of low-rank changes.
-    """
-    if update == "low-rank":
-        add_low_rank(network, rank)
-    for name, weight in network.named_parameters():
-        is_chosen = update != "head" or "head" in name
-        if update == "low-rank":
-            is_chosen = ".parametrizations." in name and "original" not in name
-        weight.requires_grad_(is_chosen)
-    return [weight for weight in network.parameters() if weight.requires_grad]
 
 
 def rollout_error(model: Model, window: TensorDict) -> Tensor:

@@ -1,10 +1,19 @@
-"""Optimizers of the trainer: Muon for weight matrices, AdamW for all other weights."""
+"""Optimizers, their learning rates, and the state of a run that can be resumed.
+
+Muon trains the weight matrices of linear layers, AdamW all other weights.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW, Muon, Optimizer
 
 from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
+
+STATE = "state.safetensors"
 
 
 def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
@@ -26,7 +35,73 @@ def make_adamw(weights: list[Tensor], lr: float) -> AdamW:
     return AdamW(weights, lr=lr, betas=(0.9, 0.95), weight_decay=0.0)
 
 
-def allocate_state(optimizer: Optimizer) -> None:
+def learning_rate_ratio(config: TrainConfig, step: int) -> float:
+    """Share of the peak learning rate at update ``step``, counted from 0.
+
+    One-step updates: linear warmup, times a linear fall to zero. Rollout updates: a linear
+    fall from ``rollout_lr_ratio`` to zero, repeated ``rollout_restarts`` times.
+    """
+    if step < config.steps:
+        warmup = min(1.0, (step + 1) / max(config.warmup, 1))
+        return warmup * (1.0 - step / config.steps)
+    done = config.rollout_restarts * (step - config.steps) / config.rollout_steps
+    return config.rollout_lr_ratio * (1.0 - done % 1.0)
+
+
+class RunState:
+    """The tensors of a run, saved to one file and restored in place.
+
+    Args:
+        network: that is trained.
+        average: of its weights, by name.
+        optimizers: by name.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        average: Mapping[str, Tensor],
+        optimizers: Mapping[str, Optimizer],
+    ) -> None:
+        self.network, self.average, self.optimizers = network, average, optimizers
+        for optimizer in optimizers.values():
+            _allocate_state(optimizer)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors themselves, not copies, by name."""
+        found = {f"model.{k}": v for k, v in self.network.state_dict().items()}
+        found |= {f"average.{k}": v for k, v in self.average.items()}
+        for name, optimizer in self.optimizers.items():
+            for index, state in optimizer.state_dict()["state"].items():
+                found |= {f"{name}.{index}.{k}": v for k, v in state.items()}
+        return found
+
+    def save(self, folder: Path, step: int, best: float) -> None:
+        """Write all tensors with the update's number and the best validation error."""
+        numbers = {"step": torch.tensor(step)}
+        numbers["best"] = torch.tensor(best, dtype=torch.float64)
+        write_tensors(folder / STATE, {**self.tensors(), **numbers})
+
+    def restore(self, folder: Path) -> tuple[int, float]:
+        """Restore what `save` wrote; returns the number of the update and the best error.
+
+        Raises:
+            ValueError: in one sentence, a file that does not fit this run.
+        """
+        path = folder / STATE
+        found, own = read_tensors(path), self.tensors()
+        best = found.pop("best", torch.tensor([]))  # infinite before any validation
+        expected = {**own, "step": torch.tensor(0)}
+        expect_fit(found, expected, f"tensors in {path}", "this run")
+        if best.shape or best.dtype != torch.float64 or best.isnan():
+            raise ValueError(f"expected the best error in {path}, got {best}")
+        with torch.no_grad():
+            for name, tensor in own.items():
+                tensor.copy_(found[name])
+        return int(found["step"]), float(best)
+
+
+def _allocate_state(optimizer: Optimizer) -> None:
     """Give every weight the optimizer's state that its first update would create.
 
     A resumed run can then compare names and shapes of a saved state with its own. The
@@ -40,20 +115,3 @@ def allocate_state(optimizer: Optimizer) -> None:
     for weight in weights:
         for value in optimizer.state[weight].values():
             value.zero_()
-
-
-def learning_rate_ratio(config: TrainConfig, step: int) -> float:
-    """Share of the peak learning rate at an update.
-
-    One-step updates: linear warmup, times a linear fall to zero. Rollout updates: a linear
-    fall from ``rollout_lr_ratio`` to zero, repeated ``rollout_restarts`` times.
-
-    Args:
-        config: of the training.
-        step: number of the update, from 0.
-    """
-    if step < config.steps:
-        warmup = min(1.0, (step + 1) / max(config.warmup, 1))
-        return warmup * (1.0 - step / config.steps)
-    done = config.rollout_restarts * (step - config.steps) / config.rollout_steps
-    return config.rollout_lr_ratio * (1.0 - done % 1.0)

@@ -53,11 +53,8 @@ def fit_parameters(
             error = error_of(moved(origin, names, x), rows)
             return error if np.isfinite(error) else LOST
 
-        options = {
-            "maxfev": evaluations,
-            "initial_tr_radius": radius,
-            "final_tr_radius": CLOSE,
-        }
+        radii = {"initial_tr_radius": radius, "final_tr_radius": CLOSE}
+        options = {"maxfev": evaluations, **radii}
         found = minimize(score, np.zeros(len(names)), method="COBYQA", options=options)
         first = moved(origin, names, found.x)
         yield first
@@ -82,21 +79,17 @@ def fit_flight(scene: Scene, recording: Recording) -> dict[str, float]:
     The centre of mass ``p + R c`` of a body at ``p``, turned by ``R``, draws a parabola:
     ``p + R c = p0 + v0 t - g t^2 / 2``, linear in all unknowns. Empty where no trajectory
     flies long enough.
-
-    Args:
-        scene: a single free body.
-        recording: trajectories.
     """
     flies = scene.clearances(recording.qpos).amin(-1) > CLEAR
     rows, values = [], []
-    for first, end in zip(recording.offsets[:-1], recording.offsets[1:], strict=True):
-        down = (~flies[first:end]).nonzero()
-        count = int(down[0]) if len(down) else int(end - first)
+    for trajectory in recording.trajectories:
+        count = int(flies[trajectory].long().cumprod(0).sum())  # until it first lands
         if count < 3 or count * recording.frame < SHORTEST:
             continue
-        qpos = recording.qpos[first : first + count]
+        qpos = recording.qpos[trajectory][:count]
         time = recording.frame * torch.arange(count).to(qpos)
         line = torch.stack((torch.ones_like(time), time), 1)
+        # takes p0 and v0 t out of all that follows: (count, count)
         apart = torch.eye(count).to(qpos) - line @ torch.linalg.pinv(line)
         axes = torch.eye(3).to(qpos)
         for axis in range(3):

@@ -25,8 +25,8 @@ def join(device: torch.device) -> None:
 
 def leave() -> None:
     """Wait for all ranks, then disconnect."""
+    wait()
     if distributed.is_initialized():
-        distributed.barrier()
         distributed.destroy_process_group()
 
 
@@ -52,11 +52,7 @@ def share(x: Tensor) -> Tensor:
 
 
 def expect_shares(**sizes: int) -> None:
-    """Refuse batch sizes that the ranks cannot share equally.
-
-    Raises:
-        ValueError: naming the batch size.
-    """
+    """Raise a ValueError for batch sizes that the ranks cannot share equally."""
     for name, count in sizes.items():
         if count % world():
             raise ValueError(
@@ -66,20 +62,12 @@ def expect_shares(**sizes: int) -> None:
 
 @torch.no_grad()
 def average_gradients(parameters: Iterable[Tensor], loss: Tensor) -> Tensor:
-    """Replace every gradient by its mean over the ranks, in one message with the loss.
-
-    Args:
-        parameters: of any shapes, the same ones on every rank.
-        loss: of this rank's share, ``()``.
-
-    Returns:
-        The mean loss, that of the whole batch where shares are equal, ``()``.
-    """
+    """Replace every gradient by its mean over the ranks; returns the mean loss ``()``."""
     if world() == 1:
         return loss.detach()
     gradients = [p.grad for p in parameters if p.grad is not None]
     flat = torch.cat([x.flatten() for x in (loss.detach(), *gradients)])
-    distributed.all_reduce(flat)
+    distributed.all_reduce(flat)  # all in one message
     flat /= world()
     mean, *parts = flat.split([1, *(gradient.numel() for gradient in gradients)])
     for gradient, part in zip(gradients, parts, strict=True):
@@ -92,13 +80,9 @@ def merge_stats(mine: Stats) -> Stats:
     if world() == 1:
         return mine
     count = torch.tensor([mine.count], dtype=torch.float64)
-    packed = torch.cat((count, mine.mean.cpu(), mine.m2.cpu()))
-    device = torch.device("cuda" if distributed.get_backend() == "nccl" else "cpu")
-    packed = packed.to(device)
+    device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
+    packed = torch.cat((count, mine.mean.cpu(), mine.m2.cpu())).to(device)  # (1 + 2 D,)
     found = [torch.empty_like(packed) for _ in range(world())]
     distributed.all_gather(found, packed)
-    parts = [Stats(int(x[0]), *x[1:].cpu().chunk(2)) for x in found if x[0] > 0]
-    merged, *rest = parts
-    for other in rest:
-        merged = merged.merge(other)
-    return merged
+    parts = (Stats(int(x[0]), *x[1:].cpu().chunk(2)) for x in found if x[0] > 0)
+    return Stats.merge_all(parts)

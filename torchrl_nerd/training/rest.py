@@ -11,9 +11,7 @@ from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.training_range import magnitudes
 
-REST_SPEED = (
-    1e-4  # m/s and rad/s: slower is rest in the data; soft friction creeps faster
-)
+REST_SPEED = 1e-4  # m/s, rad/s: slower is rest in the data; soft friction creeps faster
 ROWS, MIN_ROWS = 256, 16
 STEPS = 20
 QUANTILE, MARGIN = 0.99, 1.5
@@ -21,11 +19,7 @@ MAX_SPEED = 0.1  # m/s or rad/s: a model that moves faster than this does not re
 
 
 def resting(data: TensorDict) -> TensorDict:
-    """Up to 256 transitions ``[rows]`` that begin and end at rest, spread over the data.
-
-    Args:
-        data: transitions, ``[trajectories, steps]``.
-    """
+    """Up to 256 transitions ``[rows]`` at rest, spread over ``[trajectories, steps]``."""
     speed = torch.maximum(data[QVEL].abs(), data[NEXT_QVEL].abs()).amax(-1)
     rows = (speed.flatten() < REST_SPEED).nonzero()[:, 0]
     flat = cast(TensorDict, data.flatten())

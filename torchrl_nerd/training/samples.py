@@ -7,8 +7,7 @@ from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.features import SceneFeatures
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training import ranks
 from torchrl_nerd.transforms import StateDelta, Stats
@@ -20,10 +19,9 @@ def raw_tokens(
     tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
 ) -> tuple[Tensor, Tensor]:
     """Unnormalised tokens ``(*batch, F)`` and targets ``(*batch, D)``, float64."""
-    terrain = data.get(TERRAIN, None)
-    token = tokens(data[QPOS], data[QVEL], data[JOINT_TORQUE], terrain)
-    target = state_delta.delta(data[QPOS], data[QVEL], data[NEXT_QPOS], data[NEXT_QVEL])
-    return token, target
+    state, terrain = (data[QPOS], data[QVEL]), data.get(TERRAIN, None)
+    token = tokens(*state, data[JOINT_TORQUE], terrain)
+    return token, state_delta.delta(*state, data[NEXT_QPOS], data[NEXT_QVEL])
 
 
 def data_stats(
@@ -39,14 +37,9 @@ def stats_of(
     """Exact statistics of tokens and targets over a data set, each rank's part of it."""
     size = min(PART, -(-len(data) // ranks.world()))
     mine = data.split(size)[ranks.rank() :: ranks.world()]
-    parts = [raw_tokens(tokens, state_delta, part) for part in mine]
-    stats: dict[NestedKey, Stats] = {}
-    for index, key in enumerate((TOKEN, TARGET)):
-        merged, *rest = (Stats.of(part[index]) for part in parts)
-        for other in rest:
-            merged = merged.merge(other)
-        stats[key] = ranks.merge_stats(merged)
-    return stats
+    pairs = [map(Stats.of, raw_tokens(tokens, state_delta, part)) for part in mine]
+    merged = map(Stats.merge_all, zip(*pairs, strict=True))
+    return dict(zip((TOKEN, TARGET), map(ranks.merge_stats, merged), strict=True))
 
 
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
@@ -55,9 +48,8 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
         torch.empty(*data.batch_size, size, device=data[QPOS].device)
         for size in (model.scene_features.size, model.state_delta.size)
     )
-    for part, *places in zip(
-        data.split(PART), tokens.split(PART), targets.split(PART), strict=True
-    ):
+    parts = data.split(PART), tokens.split(PART), targets.split(PART)
+    for part, *places in zip(*parts, strict=True):  # filled in place: memory is short
         raw = raw_tokens(model.scene_features, model.state_delta, part)
         for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
             place.copy_(model.normalize.normalize(key, value))
@@ -67,10 +59,10 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
 def cover(
     model: NeRD, data: TensorDict, samples: tuple[Tensor, Tensor] | None = None
 ) -> None:
-    """Fit a model's training range and out-of-distribution score to its data.
+    """Fit a model's training range and out-of-distribution score to its data, in place.
 
     Args:
-        model: changed in place.
+        model: whose.
         data: transitions, ``[trajectories, steps]``.
         samples: their normalised features and targets, where they are there already.
     """

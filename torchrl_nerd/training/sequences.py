@@ -35,21 +35,13 @@ class Inputs(NamedTuple):
             parts.append([x.float() for x in found[1:]])
         return cls(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
-    def __getitem__(self, index: tuple[Tensor, Tensor]) -> "Inputs":  # pyright: ignore
-        """Those of some samples."""
-        return Inputs(*(x[index] if x.ndim else x for x in tuple(self)))
+    def each(self, function: Callable[[Tensor], Tensor]) -> "Inputs":
+        """The result of a function for every part that has samples."""
+        return Inputs(*(function(x) if x.ndim else x for x in self))
 
     def change(self, output: Tensor) -> Tensor:
         """The normalised change ``(*batch, D)`` that a network's output makes."""
         return self.base + self.gate * output
-
-    def to(self, device: torch.device) -> "Inputs":
-        """The same on another device."""
-        return Inputs(*(x.to(device) for x in tuple(self)))
-
-    def share(self, share: Callable[[Tensor], Tensor]) -> "Inputs":
-        """The part of each that a rank takes."""
-        return Inputs(*(share(x) if x.ndim else x for x in tuple(self)))
 
 
 class Sequences:
@@ -78,7 +70,7 @@ class Sequences:
             )
         features, targets = normalised(model, data)
         self.features, self.targets = features, targets.to(device)
-        self.inputs = Inputs.of(model, data, features).to(device)
+        self.inputs = Inputs(*(x.to(device) for x in Inputs.of(model, data, features)))
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
         self.steps = data.batch_size[1]
@@ -98,19 +90,20 @@ class Sequences:
     ) -> tuple["Inputs", Tensor]:
         """Network inputs and targets of ``(rows, length)`` samples."""
         row, time_index = self.pick(rows, length, generator)
-        inputs, targets = self.inputs[row, time_index], self.targets[row, time_index]
+        targets = self.targets[row, time_index]  # (rows, length, D)
+        inputs = self.inputs.each(lambda x: x[row, time_index])
         if self.symmetry is None:
             return inputs, targets
         count = len(self.symmetry.isometries)
         choice = torch.randint(count, (rows,), generator=generator).to(targets.device)
         permute = self.symmetry.permutations
-        tokens = permute[TOKEN](inputs.token, choice)
-        return inputs._replace(token=tokens), permute[TARGET](targets, choice)
+        inputs = inputs._replace(token=permute[TOKEN](inputs.token, choice))
+        return inputs, permute[TARGET](targets, choice)
 
     def rollout(
         self, rows: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """True states ``(rows, length + 1, ...)``, torques and ground."""
+        """True ``qpos``, ``qvel (rows, length + 1, ...)``, torques and ground."""
         row, time_index = self.pick(rows, length, generator)
         batch = cast(TensorDict, self.data[row, time_index])
         if self.symmetry is not None:  # the rows are in no order: a part for each
@@ -121,5 +114,6 @@ class Sequences:
         qpos = torch.cat((batch[QPOS], batch[NEXT_QPOS][:, -1:]), 1)
         qvel = torch.cat((batch[QVEL], batch[NEXT_QVEL][:, -1:]), 1)
         terrain = batch.get(TERRAIN, None)
-        ground = None if terrain is None else terrain[:, 0]
-        return qpos, qvel, batch[JOINT_TORQUE], ground
+        if terrain is not None:
+            terrain = terrain[:, 0]  # the same at all times: (rows, terrain.size)
+        return qpos, qvel, batch[JOINT_TORQUE], terrain

@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Mapping
 
-from tensordict import TensorDict
 from tensordict.utils import NestedKey
 
 from torchrl_nerd.analytic import make_step, step_config
@@ -13,7 +12,6 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.augmentation import Symmetry
-from torchrl_nerd.training.samples import data_stats
 from torchrl_nerd.transforms import Stats
 
 
@@ -37,33 +35,16 @@ def make_model(
     return HybridNeRD(scene, step, features, network, stats)
 
 
-def fresh_model(
-    scene: Scene, data: TensorDict, config: TrainConfig, symmetry: Symmetry | None
-) -> NeRD:
-    """A model with random weights and the statistics of its data.
-
-    Args:
-        scene: the robot.
-        data: transitions, ``[trajectories, steps]``.
-        config: see `make_model`.
-        symmetry: whose images count as data too.
-    """
-    stats = data_stats(scene, data, config.features)
-    if symmetry is not None:
-        stats = symmetry.complete(stats)
-    return make_model(scene, config, stats)
-
-
 def begin_from(
     start: NeRD, scene: Scene, config: TrainConfig, symmetry: Symmetry | None = None
 ) -> NeRD:
-    """A model with weights and statistics of another one.
+    """A model with weights and statistics of another one, which is left as it is.
 
     The statistics stay as they are: what the network's inputs mean is part of what it
     learned. The training range is left to be fitted.
 
     Args:
-        start: whose weights; left as it is.
+        start: whose weights.
         scene: the robot.
         config: must describe a network like that of ``start``.
         symmetry: images of samples that will be shown.
@@ -74,9 +55,10 @@ def begin_from(
     """
     if start.config != network_config(config.network):
         names = [name for name, known in NETWORKS.items() if known == start.config]
+        name = " or ".join(names) or start.config
         raise ValueError(
-            f"expected the network of the model to start from, "
-            f"{' or '.join(names) or start.config}, got {config.network}"
+            f"expected the network of the model to start from, {name}, "
+            f"got {config.network}"
         )
     model = make_model(scene, config)
     if type(model) is not type(start):

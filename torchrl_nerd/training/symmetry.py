@@ -19,14 +19,7 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.manifold import SLIDE
 from torchrl_nerd.geometry.rotations import quat_multiply
 from torchrl_nerd.geometry.surfaces import PLANE_PARAMETERS
-from torchrl_nerd.keys import (
-    JOINT_TORQUE,
-    NEXT_QPOS,
-    NEXT_QVEL,
-    QPOS,
-    QVEL,
-    TERRAIN,
-)
+from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
 
@@ -39,26 +32,16 @@ MIRROR = np.diag((1.0, -1.0, 1.0))  # of the world, where the base is mirrored
 
 @dataclass(frozen=True, eq=False)
 class Isometry:
-    """A map of states, torques and terrain that commutes with the dynamics.
-
-    | field | meaning |
-    |---|---|
-    | ``world`` | ``(3, 3)``: of velocities, and of positions about ``center`` |
-    | ``center`` | ``(3,)``, m |
-    | ``body`` | ``(3, 3)``: of vectors in the axes of a floating base |
-    | ``turn`` | ``(4,)``: what is left of it where the world is mirrored back |
-    | ``sources``, ``signs`` | ``(nv,)``: joint v's image is sign times joint source |
-    | ``motors`` | ``(num_actuated,)``: the same among the actuated dofs |
-    """
+    """A map of states, torques and terrain that commutes with the dynamics."""
 
     scene: Scene
-    world: Tensor
-    center: Tensor
-    body: Tensor
-    turn: Tensor
-    sources: Tensor
-    signs: Tensor
-    motors: Tensor
+    world: Tensor  # (3, 3): of velocities, and of positions about `center`
+    center: Tensor  # (3,), m
+    body: Tensor  # (3, 3): of vectors in the axes of a floating base
+    turn: Tensor  # (4,): what is left of it where the world is mirrored back
+    sources: Tensor  # (nv,): joint v's image is sign times joint source
+    signs: Tensor  # (nv,)
+    motors: Tensor  # (num_actuated,): sources among the actuated dofs
 
     @property
     def is_identity(self) -> bool:
@@ -67,11 +50,12 @@ class Isometry:
 
     def moves_like(self, other: "Isometry") -> bool:
         """Whether both map the robot's states alike, as across the plane it moves in."""
-        same = torch.equal(self.sources, other.sources)
-        same = same and torch.equal(self.signs, other.signs)
-        return same and (
-            not self.scene.base.is_floating or torch.equal(self.body, other.body)
+        names = (
+            "sources",
+            "signs",
+            *(("body",) if self.scene.base.is_floating else ()),
         )
+        return all(torch.equal(getattr(self, k), getattr(other, k)) for k in names)
 
     def qpos(self, qpos: Tensor) -> Tensor:
         """Image of positions ``(*batch, nq)``."""
@@ -120,21 +104,14 @@ class Isometry:
 
     def to(self, device: torch.device) -> "Isometry":
         """The same on another device."""
-        moved = {
-            name: value.to(device)
-            for name, value in vars(self).items()
-            if isinstance(value, Tensor)
-        }
-        return Isometry(self.scene, **moved)
+        tensors = {k: v for k, v in vars(self).items() if k != "scene"}
+        return Isometry(self.scene, **{k: v.to(device) for k, v in tensors.items()})
 
 
 def find_isometries(scene: Scene) -> tuple[Isometry, ...]:
     """The symmetry group of a robot on its ground, the identity first.
 
     Only the identity for robots with ball joints and for grounds other than planes.
-
-    Args:
-        scene: the robot.
     """
     identity, *others = sorted(_candidates(scene), key=lambda c: not c.is_identity)
     found = [identity]
@@ -239,13 +216,7 @@ def _solver_agrees(isometry: Isometry) -> bool:
 
 
 def states_in_contact(scene: Scene, rows: int, max_depth: float) -> TensorDict:
-    """States and torques ``[rows]``, floating bases placed in the ground.
-
-    Args:
-        scene: the robot.
-        rows: how many.
-        max_depth: m that the lowest contact point may reach below the ground.
-    """
+    """Random states and torques ``[rows]``, up to ``max_depth`` m in the ground."""
     generator = Generator().manual_seed(0)
     state, scale = scene.sample_initial(rows, generator)
     draw = torch.rand(rows, dtype=torch.float64, generator=generator)

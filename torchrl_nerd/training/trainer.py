@@ -5,7 +5,7 @@ import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -21,21 +21,19 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.training import ranks
 from torchrl_nerd.training.augmentation import Symmetry
-from torchrl_nerd.training.log import TrainingLog
-from torchrl_nerd.training.loggers import LoggerName, open_logger
+from torchrl_nerd.training.log import LoggerName, TrainingLog, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.optimizers import (
-    allocate_state,
+    RunState,
     learning_rate_ratio,
     make_adamw,
     make_muon,
     split_parameters,
 )
 from torchrl_nerd.training.rest import find_rest, resting
-from torchrl_nerd.training.run_state import RunState
-from torchrl_nerd.training.samples import cover
+from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Sequences
-from torchrl_nerd.training.start import begin_from, fingerprint, fresh_model
+from torchrl_nerd.training.start import begin_from, fingerprint, make_model
 from torchrl_nerd.training.validation import Errors, Validation, for_card, metrics
 
 STATE = "state.json"  # card of a run that can be resumed
@@ -97,10 +95,8 @@ class Trainer:
         torch.manual_seed(config.seed)
         self._build(data, init_from)
         self.optimizers = self.make_optimizers()
-        for optimizer in self.optimizers.values():
-            allocate_state(optimizer)
-        weights = dict(self.model.network.named_parameters())
-        self.average = {name: w.detach().clone() for name, w in weights.items()}
+        weights = self.model.network.named_parameters()
+        self.average = {name: weight.detach().clone() for name, weight in weights}
         self.state = RunState(self.model.network, self.average, self.optimizers)
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
         self.errors: Errors = {}  # of the last validation
@@ -111,7 +107,7 @@ class Trainer:
         """The model, its statistics and its batches."""
         symmetry = None
         if self.config.use_symmetry:
-            symmetry = Symmetry.of(self.scene, data, self.config.features)
+            symmetry = Symmetry.of(self.scene, self.config.features)
         if init_from is None:
             model = self.make_model(data, symmetry)
         else:
@@ -126,7 +122,9 @@ class Trainer:
 
     def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
         """The configured model with fresh weights."""
-        return fresh_model(self.scene, data, self.config, symmetry)
+        stats = data_stats(self.scene, data, self.config.features)
+        stats = stats if symmetry is None else symmetry.complete(stats)
+        return make_model(self.scene, self.config, stats)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Muon for the weights of linear layers, AdamW for all others."""
@@ -139,14 +137,14 @@ class Trainer:
     def run(self, until: int | None = None) -> NeRD:
         """Train to the end, or to update ``until``; returns the averaged model."""
         last = min(until or self.config.total_steps, self.config.total_steps)
-        log = self._open_log() if ranks.rank() == 0 else None
+        log = None
+        if ranks.rank() == 0:
+            settings = {"scene": self.scene.name, **asdict(self.config)}
+            logger = open_logger(self.logger, self.folder, self.step, settings)
+            log = TrainingLog(self.folder, self.step, logger)
         began = time.monotonic() - self.seconds
-        with tqdm(
-            total=self.config.total_steps,
-            initial=self.step,
-            desc=f"train {self.scene.name}",
-            disable=self.quiet,
-        ) as bar:
+        how = {"desc": f"train {self.scene.name}", "disable": self.quiet}
+        with tqdm(total=self.config.total_steps, initial=self.step, **how) as bar:
             while self.step < last:
                 loss = self.update()
                 self.step += 1
@@ -167,21 +165,15 @@ class Trainer:
     def _is_due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.config.total_steps
 
-    def _open_log(self) -> TrainingLog:
-        settings = {"scene": self.scene.name, **asdict(self.config)}
-        logger = open_logger(self.logger, self.folder, self.step, settings)
-        return TrainingLog(self.folder, self.step, logger)
-
     def update(self) -> Tensor:
         """One update; returns its loss ``()``. Seed and step alone decide the batch."""
         generator = fold_in(self.config.seed, self.step)
         self._set_learning_rates()
         self.model.train()
         is_rollout = self.step >= self.config.steps
+        loss_of = self._rollout_loss if is_rollout else self._one_step_loss
         with torch.enable_grad(), self._autocast():
-            loss = (self._rollout_loss if is_rollout else self._one_step_loss)(
-                generator
-            )
+            loss = loss_of(generator)
         loss.backward()
         parameters = list(self.model.network.parameters())
         loss = ranks.average_gradients(parameters, loss)
@@ -211,19 +203,19 @@ class Trainer:
         if torch.rand((), generator=generator) < config.single_step_fraction:
             count, length = count * length, 1
         batch = self.sequences.one_step(count, length, generator)
-        inputs, targets = batch[0].share(ranks.share), ranks.share(batch[1])
+        inputs, targets = batch[0].each(ranks.share), ranks.share(batch[1])
         changes = inputs.change(self.model.network(inputs.token).float())
         return one_step_loss(changes, targets, config.loss_eps)
 
     def _rollout_loss(self, generator: Generator) -> Tensor:
         """Loss of the model's own rollouts."""
         config = self.config
-        *states, terrain = self.sequences.rollout(
-            config.rollout_batch_size, config.rollout_length, generator
+        sizes = config.rollout_batch_size, config.rollout_length
+        batch = (
+            x if x is None else ranks.share(x)
+            for x in self.sequences.rollout(*sizes, generator)
         )
-        qpos, qvel, torque = map(ranks.share, cast(list[Tensor], states))
-        ground = None if terrain is None else ranks.share(terrain)
-        return rollout_loss(self.model, qpos, qvel, torque, ground, config.loss_eps)
+        return rollout_loss(self.model, *batch, config.loss_eps)
 
     def _autocast(self) -> AbstractContextManager:
         is_coarse = self.step < self.config.bf16_fraction * self.config.steps
@@ -278,8 +270,11 @@ class Trainer:
     @property
     def _identity(self) -> dict[str, Any]:
         """What a resumed run must have in common with the one that stopped."""
-        config, scene_hash = asdict(self.config), self.scene.hash
-        return {"config": config, "scene_hash": scene_hash, "init_from": self.init_from}
+        return {
+            "config": asdict(self.config),
+            "scene_hash": self.scene.hash,
+            "init_from": self.init_from,
+        }
 
     def _resume(self) -> None:
         card = read_json(self.folder / STATE)

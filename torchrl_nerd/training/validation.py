@@ -19,18 +19,11 @@ Errors = dict[int, dict[str, ErrorSummary]]
 
 @dataclass(frozen=True)
 class Validation:
-    """Rollouts that measure a model.
+    """Rollouts that measure a model."""
 
-    | field | meaning |
-    |---|---|
-    | ``source`` | task or scene whose resets or ranges give the initial states |
-    | ``horizons`` | control steps over which errors are averaged, the shortest first |
-    | ``random_actions`` | uniform actions in [-1, 1] in place of zero |
-    """
-
-    source: Source
-    horizons: tuple[int, ...] = (100, 500)
-    random_actions: bool = False
+    source: Source  # task or scene whose resets or ranges give the initial states
+    horizons: tuple[int, ...]  # control steps averaged over, the shortest first
+    random_actions: bool  # uniform actions in [-1, 1] in place of zero
 
     def __call__(self, model: NeRD, device: torch.device) -> Errors:
         """Errors of a model on the device that it is on."""

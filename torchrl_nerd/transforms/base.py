@@ -1,6 +1,6 @@
-"""What the scene's transforms share: reading inputs, writing outputs, specs, no inverse."""
+"""What the transforms share: where they act, missing keys, specs, no inverse."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import cast
 
 import torch
@@ -11,15 +11,26 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 
-class FeatureTransform(Transform):
+class StateTransform(Transform):
+    """`_call` at an env's reset and step, in a replay buffer, and alone."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        """Write the outputs beside the inputs."""
+        return self._call(tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+class FeatureTransform(StateTransform):
     """Features of the state alone, written beside it wherever a state appears.
 
     A subclass gives ``sizes`` (key -> width), the ``out_keys`` among them that an env's
-    observation holds (all, unless told) and defines ``_features``. At an env's
-    reset and step, in a replay buffer and alone the same features come out.
+    observation holds (all, unless told), and defines ``_features``.
     """
 
-    sizes: dict[NestedKey, int]
     why_no_inverse: str
 
     def __init__(
@@ -36,24 +47,10 @@ class FeatureTransform(Transform):
         raise NotImplementedError
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        missing = [key for key in self.in_keys if key not in next_tensordict.keys(True)]
-        if missing:
-            found = sorted(map(str, next_tensordict.keys(True, True)))
-            raise KeyError(
-                f"{type(self).__name__} needs {missing}, got a tensordict with {found}"
-            )
+        expect_keys(type(self).__name__, self.in_keys, next_tensordict)
         for key, value in self._features(next_tensordict).items():
             next_tensordict.set(key, value.to(torch.float32))
         return next_tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
-        """Write the features beside the state."""
-        return self._call(tensordict)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._call(tensordict_reset)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         keys = tensordict.keys(True)
@@ -67,11 +64,26 @@ class FeatureTransform(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the features."""
-        spec = cast(Composite, observation_spec.clone())
-        for key in self.out_keys:
-            spec[key] = Unbounded(
-                torch.Size((*spec.shape, self.sizes[key])),
-                dtype=torch.float32,
-                device=spec.device,
-            )
-        return spec
+        sizes = {key: self.sizes[key] for key in self.out_keys}
+        return add_to_spec(observation_spec, sizes, torch.float32)
+
+
+def expect_keys(
+    name: str, needed: Iterable[NestedKey], tensordict: TensorDictBase
+) -> None:
+    """Raise a KeyError with the keys that are not there."""
+    missing = [key for key in needed if key not in tensordict.keys(True)]
+    if missing:
+        found = sorted(map(str, tensordict.keys(True, True)))
+        raise KeyError(f"{name} needs {missing}, got a tensordict with {found}")
+
+
+def add_to_spec(
+    spec: TensorSpec, sizes: Mapping[NestedKey, int], dtype: torch.dtype
+) -> TensorSpec:
+    """A copy of an observation's spec with unbounded entries of these widths added."""
+    found = cast(Composite, spec.clone())
+    for key, size in sizes.items():
+        shape = torch.Size((*found.shape, size))
+        found[key] = Unbounded(shape, dtype=dtype, device=found.device)
+    return found

@@ -6,11 +6,9 @@ the ground is one plane that all rows share, and it is level (gravity is normal 
 fixed base cannot turn against it, n follows from gravity and pose and is left out too. Of
 several surfaces each point sees the nearest, so that a model fits any number.
 
-Added are the point's velocity and its predicted penetration over the step: whether a point
-touches within the step is a threshold, which a network learns slowly from distance and
-speed. All of it fades to zero at the margin without a jump. `FeatureConfig` adds the
-predicted contact force, and predicts along unconstrained motion in place of constant
-velocity.
+Added are the point's velocity and its predicted penetration over the step, see
+`predicted_contact`. All of it fades to zero at the margin without a jump. `FeatureConfig`
+adds the predicted contact force, and predicts along unconstrained motion.
 """
 
 import numpy as np
@@ -37,8 +35,8 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
-from torchrl_nerd.transforms.predicted_force import PredictedForce
-from torchrl_nerd.transforms.predicted_penetration import (
+from torchrl_nerd.transforms.predicted_contact import (
+    PredictedForce,
     PredictedPenetration,
     num_times,
 )
@@ -103,6 +101,7 @@ class ContactFeatures(FeatureTransform):
         if terrain is None:
             return
         points = scene.contacts
+        # one pass of kinematics: contact points, then joint axes, then inertia's points
         bodies, positions = points.bodies, points.positions
         self.force, self.rigid_body, self.num_places = None, None, 0
         if features.predicted_force or features.unconstrained_motion:
@@ -144,14 +143,14 @@ class ContactFeatures(FeatureTransform):
             return []
         found, velocity = self.kinematics(qpos, qvel)
         sizes = (self.count, self.num_places, found.shape[-2] - self.num_known)
-        now, places, corners = found.split(sizes, -2)
+        now, places, corners = found.split(sizes, -2)  # (*batch, P, 3), ...
         velocity = velocity[..., : self.count, :]
         pose = self.pose(qpos)
         distance, normal = self.ground(now, terrain, *pose)
         velocity = over_ground(self.base, qvel, now, velocity, pose[1])
         beyond = distance - self.margins
         gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
-        gate = gate[..., None]
+        gate = gate[..., None]  # (*batch, P, 1)
         speed = (velocity * normal).sum(-1)
         sliding = velocity - speed[..., None] * normal
         gain = None
@@ -159,13 +158,10 @@ class ContactFeatures(FeatureTransform):
             where = pose[1], corners, places
             gain = self.rigid_body(qpos, qvel, joint_torque, *where, self.step_size)
             gain = self.step_size * gain
-        depth = self.radii - distance
-        depth = gate * self.predicted_penetration(
-            qpos, qvel, terrain, gain, depth, speed
-        )
-        features = [beyond.clamp_max(0.0)]
-        features.append((gate * torch.cat((speed[..., None], sliding), -1)).flatten(-2))
-        features.append(depth.flatten(-2))
+        motion = qpos, qvel, terrain, gain, self.radii - distance, speed
+        depth = gate * self.predicted_penetration(*motion)  # (*batch, P, K)
+        moving = gate * torch.cat((speed[..., None], sliding), -1)  # (*batch, P, 4)
+        features = [beyond.clamp_max(0.0), moving.flatten(-2), depth.flatten(-2)]
         if self.force is not None:
             contact = now, normal, depth, speed[..., None], sliding
             features.append(self.force(*contact, places))

@@ -4,14 +4,16 @@ NeRD section 3.4. Statistics are float64 and exact (Chan, Golub and LeVeque, "Al
 for computing the sample variance", 1983), so that huge offsets cost no digits.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import Transform
+
+from torchrl_nerd.transforms.base import StateTransform
 
 FLOOR, ROUNDING = 1e-6, 1e-12
 """Smallest standard deviation, and what is added for each unit of |mean|: a constant
@@ -20,23 +22,16 @@ stays a constant, and whatever varies beside a huge offset counts."""
 
 @dataclass(frozen=True)
 class Stats:
-    """Count, mean and sum of squared deviations of one vector quantity.
-
-    | field | meaning |
-    |---|---|
-    | ``count`` | number of samples |
-    | ``mean`` | ``(D,)`` |
-    | ``m2`` | ``(D,)``: sum of (x - mean)^2 |
-    """
+    """Count, mean and sum of squared deviations of one vector quantity."""
 
     count: int
-    mean: Tensor
-    m2: Tensor
+    mean: Tensor  # (D,)
+    m2: Tensor  # (D,): sum of (x - mean)^2
 
     @classmethod
     def of(cls, samples: Tensor) -> "Stats":
         """Statistics of ``(*batch, D)`` samples over all leading dimensions."""
-        x = samples.detach().double().flatten(0, -2)
+        x = samples.detach().double().flatten(0, -2)  # (n, D)
         mean = x.mean(0)
         return cls(len(x), mean, ((x - mean) ** 2).sum(0))
 
@@ -48,6 +43,11 @@ class Stats:
         m2 = self.m2 + other.m2 + shift**2 * (self.count * share)
         return Stats(count, self.mean + shift * share, m2)
 
+    @staticmethod
+    def merge_all(parts: Iterable["Stats"]) -> "Stats":
+        """Statistics of the samples of one or more parts together."""
+        return reduce(Stats.merge, parts)
+
     @property
     def std(self) -> Tensor:
         """Population standard deviation ``(D,)``, floored."""
@@ -55,13 +55,12 @@ class Stats:
         return torch.maximum((self.m2 / max(self.count, 1)).sqrt(), floor)
 
 
-class Normalize(Transform):
+class Normalize(StateTransform):
     """``(x - mean) / std`` per element, and its inverse.
 
-    Statistics are frozen buffers: they follow ``.to`` and ``state_dict``, are copied by
-    ``deepcopy``, and never change while running. Keys that a tensordict lacks are left
-    alone. The inverse acts on ``in_keys_inv`` alone, none by default: a replay buffer
-    calls it on whatever is stored. `denormalize` is the inverse of one quantity.
+    Statistics are frozen buffers. Keys that a tensordict lacks are left alone. The inverse
+    acts on ``in_keys_inv`` alone, none by default: a replay buffer calls it on whatever is
+    stored. `denormalize` is the inverse of one quantity.
 
     Args:
         stats: key -> `Stats`.
@@ -78,39 +77,30 @@ class Normalize(Transform):
     def __init__(
         self, stats: Mapping[NestedKey, Stats], in_keys_inv: Sequence[NestedKey] = ()
     ) -> None:
-        keys = list(stats)
-        super().__init__(
-            in_keys=keys,
-            out_keys=keys,
-            in_keys_inv=list(in_keys_inv),
-            out_keys_inv=list(in_keys_inv),
-        )
-        self.names = {key: "_".join(("key", *_parts(key))) for key in keys}
-        for key, name in self.names.items():
-            self.register_buffer(f"{name}_mean", stats[key].mean.clone())
-            self.register_buffer(f"{name}_std", stats[key].std.clone())
+        keys, back = list(stats), list(in_keys_inv)
+        super().__init__(keys, keys, in_keys_inv=back, out_keys_inv=back)
+        self.names = {}
+        for key, of_key in stats.items():
+            parts = (key,) if isinstance(key, str) else key
+            name = self.names[key] = "_".join(("key", *parts))  # pyright: ignore
+            self.register_buffer(f"{name}_mean", of_key.mean.clone())
+            self.register_buffer(f"{name}_std", of_key.std.clone())
 
     def normalize(self, key: NestedKey, x: Tensor) -> Tensor:
         """``(x - mean) / std`` of ``(*batch, D)`` in float64, in the dtype of ``x``."""
-        mean, std = self._constants(key)
-        return ((x.double() - mean) / std).to(x.dtype)
+        return ((x.double() - self.mean(key)) / self.std(key)).to(x.dtype)
 
     def denormalize(self, key: NestedKey, x: Tensor) -> Tensor:
         """``mean + std * x`` of ``(*batch, D)`` in float64, in the dtype of ``x``."""
-        mean, std = self._constants(key)
-        return (mean + std * x.double()).to(x.dtype)
+        return (self.mean(key) + self.std(key) * x.double()).to(x.dtype)
 
     def mean(self, key: NestedKey) -> Tensor:
         """Mean ``(D,)``, float64."""
-        return self._constants(key)[0]
+        return self.get_buffer(f"{self.names[key]}_mean")
 
     def std(self, key: NestedKey) -> Tensor:
         """Standard deviation ``(D,)``, float64."""
-        return self._constants(key)[1]
-
-    def _constants(self, key: NestedKey) -> tuple[Tensor, Tensor]:
-        name = self.names[key]
-        return self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
+        return self.get_buffer(f"{self.names[key]}_std")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.in_keys:
@@ -119,24 +109,9 @@ class Normalize(Transform):
                 next_tensordict.set(key, self.normalize(key, x))
         return next_tensordict
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
-        """Normalise the keys that are there."""
-        return self._call(tensordict)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.parent is not None:
-            return tensordict
-        for key in self.in_keys_inv:
+        for key in self.in_keys_inv if self.parent is None else ():
             x = tensordict.get(key, None)
             if x is not None:
                 tensordict.set(key, self.denormalize(key, x))
         return tensordict
-
-
-def _parts(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)  # pyright: ignore

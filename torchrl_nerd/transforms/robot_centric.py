@@ -70,7 +70,7 @@ class RobotCentric(FeatureTransform):
             q, v = self.base.qpos_address, self.base.dof_address
             quat, down = qpos[..., q + 3 : q + 7], torch.zeros_like(qvel[..., :3])
             for axis, share in enumerate(self.down):
-                if share:
+                if share:  # a tensor of `down` would have to follow the device
                     down[..., axis] = share
             linear = rotate_inverse(quat, qvel[..., v : v + 3])
             angular = qvel[..., v + 3 : v + 6]
@@ -88,31 +88,21 @@ class RobotCentric(FeatureTransform):
 
 @dataclass(frozen=True)
 class _JointFeatures:
-    """Addresses of the joints by the kind of feature they give.
+    """Addresses of the joints by the kind of feature they give."""
 
-    | field | meaning |
-    |---|---|
-    | ``step_size`` | control step, s |
-    | ``angles`` | qpos of unlimited hinges |
-    | ``positions`` | qpos that enter as they are |
-    | ``balls`` | qpos of ball joints' quaternions |
-    | ``velocities`` | dofs whose velocity enters as it is |
-    | ``limited`` | qpos of limited joints |
-    | ``limits`` | low, high, margin of each |
-    | ``gated`` | (index into limited, dof): velocity near a limit |
-    | ``predicted`` | dofs of the limited joints whose limit torque is predicted |
-    | ``springs`` | stiffness, damping of each |
-    """
-
-    step_size: float
-    angles: list[int] = field(default_factory=list)
-    positions: list[int] = field(default_factory=list)
-    balls: list[int] = field(default_factory=list)
-    velocities: list[int] = field(default_factory=list)
-    limited: list[int] = field(default_factory=list)
+    step_size: float  # control step, s
+    angles: list[int] = field(default_factory=list)  # qpos of unlimited hinges
+    positions: list[int] = field(default_factory=list)  # qpos that enter as they are
+    balls: list[int] = field(default_factory=list)  # qpos of ball joints' quaternions
+    velocities: list[int] = field(default_factory=list)  # dofs that enter as they are
+    limited: list[int] = field(default_factory=list)  # qpos of limited joints
+    # low, high, margin of each
     limits: list[tuple[float, float, float]] = field(default_factory=list)
+    # (index into limited, dof): velocity near a limit
     gated: list[tuple[int, int]] = field(default_factory=list)
+    # dofs of the limited joints whose limit torque is predicted
     predicted: list[int] = field(default_factory=list)
+    # stiffness, damping of each
     springs: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
@@ -122,10 +112,7 @@ class _JointFeatures:
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
         for joint in range(model.njnt):
-            kind, is_limited = (
-                int(model.jnt_type[joint]),
-                bool(model.jnt_limited[joint]),
-            )
+            kind, is_limited = model.jnt_type[joint], bool(model.jnt_limited[joint])
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             if kind == FREE:
                 continue
@@ -163,7 +150,7 @@ class _JointFeatures:
         angles = qpos[..., self.angles]
         parts = [angles.sin(), angles.cos(), qpos[..., self.positions]]
         for q in self.balls:
-            columns = matrix_from_quat(qpos[..., q : q + 4])[..., :2]
+            columns = matrix_from_quat(qpos[..., q : q + 4])[..., :2]  # (*batch, 3, 2)
             parts.append(columns.flatten(-2))
         parts.append(qvel[..., self.velocities])
         if self.limited:
@@ -182,12 +169,11 @@ class _JointFeatures:
 
     def _limit_torque(self, position: Tensor, qvel: Tensor) -> Tensor:
         """Mean predicted torque of the limits' springs and dampers over the step, N m."""
-        low, high, _ = position.new_tensor(self.limits)[..., None].unbind(-2)
+        low, high, _ = position.new_tensor(self.limits)[..., None].unbind(-2)  # (J, 1)
         stiffness, damping = position.new_tensor(self.springs)[..., None].unbind(-2)
-        speed = qvel[..., self.predicted, None]
-        times = torch.linspace(
-            0.0, self.step_size, NUM_TIMES + 1, dtype=qvel.dtype, device=qvel.device
-        )
+        speed = qvel[..., self.predicted, None]  # (*batch, J, 1)
+        how = {"dtype": qvel.dtype, "device": qvel.device}
+        times = torch.linspace(0.0, self.step_size, NUM_TIMES + 1, **how)
         there = position[..., None] + speed * times
         below, above = limit_forces(stiffness, damping, low, high, there, speed)
         return (below + above).mean(-1)

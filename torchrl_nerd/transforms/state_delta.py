@@ -6,18 +6,18 @@ rotations live in the tangent space: 2 nv numbers, no quaternion.
 """
 
 from collections.abc import Callable
-from typing import cast
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec
 from torchrl.envs import Transform
 
 from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
 from torchrl_nerd.geometry.rotations import quat_exp, rotate, rotate_inverse
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, STATE_DELTA
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms.base import add_to_spec, expect_keys
 
 ROUNDING = 1e-6  # of a velocity
 
@@ -48,11 +48,8 @@ class StateDelta(Transform):
     """
 
     def __init__(self, scene: Scene) -> None:
-        super().__init__(
-            in_keys=[QPOS, QVEL, NEXT_QPOS, NEXT_QVEL], out_keys=[STATE_DELTA]
-        )
-        self.layout = scene.layout
-        self.base = scene.base
+        super().__init__([QPOS, QVEL, NEXT_QPOS, NEXT_QVEL], [STATE_DELTA])
+        self.layout, self.base = scene.layout, scene.base
         self.step_size = scene.control_step
 
     @property
@@ -120,22 +117,15 @@ class StateDelta(Transform):
         Raises:
             KeyError: naming the keys that are not there.
         """
-        missing = [key for key in self.in_keys if key not in tensordict.keys(True)]
-        if missing:
-            found = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(f"StateDelta needs {missing}, got a tensordict with {found}")
+        expect_keys("StateDelta", self.in_keys, tensordict)
         delta = self.delta(*(tensordict[key] for key in self.in_keys))
         return tensordict.set(STATE_DELTA, delta)
 
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        delta = self.delta(
-            tensordict[QPOS],
-            tensordict[QVEL],
-            next_tensordict[QPOS],
-            next_tensordict[QVEL],
-        )
+        before, after = tensordict, next_tensordict
+        delta = self.delta(before[QPOS], before[QVEL], after[QPOS], after[QVEL])
         return next_tensordict.set(STATE_DELTA, delta)
 
     def _reset(
@@ -149,28 +139,17 @@ class StateDelta(Transform):
         keys = tensordict.keys(True)
         is_known = NEXT_QPOS in keys and NEXT_QVEL in keys  # as in a buffer's extend
         if self.parent is None and STATE_DELTA in keys:
-            missing = [key for key in (QPOS, QVEL) if key not in tensordict.keys()]
-            if missing:
-                raise KeyError(
-                    f"the inverse of StateDelta needs {missing}: a start state"
-                )
+            expect_keys("the inverse of StateDelta", (QPOS, QVEL), tensordict)
             if is_known:
                 return tensordict
             state = (tensordict[QPOS], tensordict[QVEL], tensordict[STATE_DELTA])
             next_qpos, next_qvel = self.integrate(*state)
-            tensordict.set(NEXT_QPOS, next_qpos)
-            tensordict.set(NEXT_QVEL, next_qvel)
+            tensordict.set(NEXT_QPOS, next_qpos).set(NEXT_QVEL, next_qvel)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the change of the state."""
-        spec = cast(Composite, observation_spec.clone())
-        spec[STATE_DELTA] = Unbounded(
-            torch.Size((*spec.shape, self.size)),
-            dtype=torch.float64,
-            device=spec.device,
-        )
-        return spec
+        return add_to_spec(observation_spec, {STATE_DELTA: self.size}, torch.float64)
 
 
 def _replace(x: Tensor, start: int, value: Tensor) -> Tensor:

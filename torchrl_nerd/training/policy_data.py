@@ -1,15 +1,28 @@
-"""Training data from trajectories of an exploring policy."""
+"""Training data from trajectories of an exploring policy, or of a saved one."""
+
+import hashlib
+from functools import partial
+from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_nerd.data.generate import Draw
 from torchrl_nerd.data.simulate import as_transitions
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import append_frame, frame_stack_of
+from torchrl_nerd.evaluation.policy import (
+    WEIGHTS,
+    load_policy,
+    make_actor,
+    policy_task,
+)
 from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
 
 
@@ -46,8 +59,7 @@ def policy_data(
     dynamics.reset(row)
     state: TensorDictBase = row.select(QPOS, QVEL)
     action = torch.zeros(rows, controller.num_actions, dtype=torch.float64)
-    states, torques = [state[:, None]], []
-    recent = None
+    states, torques, recent = [state[:, None]], [], None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for step in range(steps):
             if step % task.frame_skip == 0:
@@ -62,3 +74,30 @@ def policy_data(
             states.append(state[:, None])
             torques.append(torque[:, None])
     return as_transitions(states, torques, terrain)
+
+
+def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, Draw]:
+    """A saved policy as a strategy for `generate`: its name, and what it draws.
+
+    The name contains a hash of the weights and the noise: no data set mixes two policies.
+
+    Args:
+        scene: the robot.
+        folder: of a policy that `save_policy` wrote; its card names the task.
+        noise: as for `policy_data`.
+
+    Raises:
+        ValueError: in one sentence, no such policy, one for another scene, or a
+            negative noise.
+    """
+    expect_at_least(0.0, noise=noise)
+    task = policy_task(folder)
+    if task.scene.hash != scene.hash:
+        raise ValueError(
+            f"the policy in {folder} acts in scene '{task.scene.name}' "
+            f"({task.scene.hash}), expected '{scene.name}' ({scene.hash})"
+        )
+    policy = load_policy(folder, task)
+    digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:16]
+    draw = partial(policy_data, task, make_actor(policy), noise=noise)
+    return f"policy {digest} with noise {noise:g}", draw

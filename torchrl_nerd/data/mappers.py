@@ -1,9 +1,10 @@
-"""``map`` on the workers of a Ray cluster that survives the loss of workers."""
+"""``map`` that computes ahead in a thread, or on the workers of a Ray cluster."""
 
 import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -11,6 +12,28 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 RETRIES = 10  # of one call, each on another worker
+
+
+def ahead(
+    function: Callable[[Item], Result], items: Iterable[Item]
+) -> Iterator[Result]:
+    """Results of ``map`` in its order; a thread computes the next one meanwhile.
+
+    Memory holds two results at most. What a call raises is raised where its result is
+    taken.
+
+    Examples:
+        >>> list(ahead(abs, [-1, 2, -3]))
+        [1, 2, 3]
+    """
+    with ThreadPoolExecutor(1, "ahead") as thread:
+        coming: Future[Result] | None = None
+        for item in items:
+            taken, coming = coming, thread.submit(function, item)
+            if taken is not None:
+                yield taken.result()
+        if coming is not None:
+            yield coming.result()
 
 
 def ray_map(
@@ -43,24 +66,18 @@ def ray_map(
     if is_new:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     try:
-        yield from _results(ray, function, items)
+        call = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+        sent = ray.put(function)
+        pending: deque[Any] = deque()
+        for item in items:
+            pending.append(call.remote(sent, item))
+            if len(pending) > ray.cluster_resources().get("CPU", 1):
+                yield _take(ray, pending.popleft())
+        while pending:
+            yield _take(ray, pending.popleft())
     finally:
         if is_new:
             ray.shutdown()
-
-
-def _results(
-    ray: Any, function: Callable[[Item], Result], items: Iterable[Item]
-) -> Iterator[Result]:
-    call = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
-    sent = ray.put(function)
-    pending: deque[Any] = deque()
-    for item in items:
-        pending.append(call.remote(sent, item))
-        if len(pending) > ray.cluster_resources().get("CPU", 1):
-            yield _take(ray, pending.popleft())
-    while pending:
-        yield _take(ray, pending.popleft())
 
 
 def _call(function: Callable[[Item], Result], item: Item) -> Result:

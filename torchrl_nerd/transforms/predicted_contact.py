@@ -1,0 +1,186 @@
+"""Predicted contact over the coming step: penetration and force, without a solver.
+
+Features of contact that a network learns slowly from distance and speed: a damper acts
+from the substep on at which its point is first in the ground. Fast points move 0.1 m per
+substep, and a fraction of a millimetre decides in which substep contact begins.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.base import (
+    BasePose,
+    JointAxes,
+    keep_constants,
+    over_ground,
+)
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw, friction_force, normal_force
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.terrain import TerrainDistance
+
+MAX_TIMES = 5  # within a step
+MIN_SLIP = 1e-9  # m/s: keeps the direction of slip defined at rest
+
+
+class PredictedPenetration(nn.Module):
+    """Predicted penetration of every contact point at K times of the step.
+
+    The K = min(substeps, 5) times are spaced evenly from the step's start on: with few
+    substeps they are those at which MuJoCo evaluates collision.
+
+    Args:
+        scene: the robot and its ground.
+        ground: distances to that ground.
+        pose: of its base.
+    """
+
+    radii: Tensor
+    parabola: Tensor
+    cubic: Tensor
+
+    def __init__(self, scene: Scene, ground: TerrainDistance, pose: BasePose) -> None:
+        super().__init__()
+        points = scene.contacts
+        self.base, self.layout = scene.base, scene.layout
+        self.period = scene.control_step
+        self.substeps = scene.substeps // scene.reference_ratio
+        self.ground, self.pose = ground, pose
+        self.kinematics = PointKinematics(
+            scene.model, scene.base, points.bodies, points.positions
+        )
+        times = num_times(scene)
+        one = np.arange(times) / times
+        two, three = one**2, one**3
+        blend = 3.0 * two - 2.0 * three
+        keep_constants(  # polynomials at the K times, by their values at the ends
+            self,
+            radii=points.radii,
+            parabola=np.stack((1.0 - two, one - two, two)),  # (3, K)
+            cubic=np.stack((1.0 - blend, one - 2.0 * two + three, blend, three - two)),
+        )
+
+    def forward(
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        terrain: Tensor | None,
+        gain: Tensor | None,
+        depth: Tensor,
+        speed: Tensor,
+    ) -> Tensor:
+        """Penetrations ``(*batch, P, K)``, m, at least zero.
+
+        At constant velocity the parabola through the depth and its rate now and the depth
+        after the step. Along unconstrained motion the cubic through depths and rates at
+        both ends, accurate to 0.02 mm in the double pendulum's impacts.
+
+        Args:
+            qpos: ``(*batch, nq)``.
+            qvel: ``(*batch, nv)``.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+            gain: velocity change of unconstrained motion over the step, ``(*batch, nv)``;
+                None: at constant velocity.
+            depth: of every point now, ``(*batch, P)``, m.
+            speed: of every point along its normal now, ``(*batch, P)``, m/s.
+        """
+        if gain is None:
+            later = integrate_pos(self.layout, qpos, self.period * qvel)
+            points, _ = self.kinematics(later, qvel.new_empty(0, qvel.shape[-1]))
+            distance, _ = self.ground(points, terrain, *self.pose(later))
+            ends = depth, -self.period * speed, self.radii - distance
+            # (*batch, P, 3) @ (3, K)
+            return (torch.stack(ends, -1) @ self.parabola).clamp_min(0.0)
+        first = qvel + 0.5 / self.substeps * gain  # semi-implicit Euler: velocity first
+        mean, last = first + 0.5 * gain, first + gain
+        later = integrate_pos(self.layout, qpos, self.period * mean)
+        # both ends of the step at once: (2, *batch, nq) and (2, *batch, nv)
+        states, rates = torch.stack((qpos, later)), torch.stack((first, last))
+        points, velocity = self.kinematics(states, rates)
+        pose = self.pose(states)
+        if terrain is not None:
+            terrain = terrain.expand(2, *terrain.shape)
+        distance, normal = self.ground(points, terrain, *pose)
+        velocity = over_ground(self.base, rates, points, velocity, pose[1])
+        rate = -self.period * (velocity * normal).sum(-1)
+        ends = torch.stack((self.radii - distance, rate), -1)  # (2, *batch, P, 2)
+        # (*batch, P, 4) @ (4, K)
+        return (torch.cat((ends[0], ends[1]), -1) @ self.cubic).clamp_min(0.0)
+
+
+def num_times(scene: Scene) -> int:
+    """K: number of predicted times per step."""
+    return min(scene.substeps // scene.reference_ratio, MAX_TIMES)
+
+
+class PredictedForce(nn.Module):
+    """Predicted generalised force ``J^T f`` of all contact points, in B_t.
+
+    The penalty law (see `scenes.penalty_law`) on the predicted motion of every contact point.
+    Stiff contacts change velocities within the step, so this is an estimate only; but it
+    condenses many points, depths and Jacobians into one number per degree of freedom.
+
+    Args:
+        scene: a robot whose contacts follow the penalty law.
+        axes: its joints.
+
+    Raises:
+        ValueError: contacts of another kind.
+    """
+
+    law: Tensor
+    ancestry: Tensor
+    is_slide: Tensor
+
+    def __init__(self, scene: Scene, axes: JointAxes) -> None:
+        super().__init__()
+        model, self.is_floating = scene.model, scene.base.is_floating
+        law = PenaltyLaw.of_bodies(model, scene.contacts.bodies)
+        merged = scene.contacts.merged.sum(1)
+        numbers = law.stiffness, law.damping, law.slip, law.friction, merged
+        keep_constants(
+            self,
+            law=np.stack(numbers),  # (5, P)
+            ancestry=axes.ancestry(scene.contacts.bodies),  # (J, P)
+            is_slide=axes.is_slide,
+        )
+
+    def forward(
+        self,
+        points: Tensor,
+        normal: Tensor,
+        depth: Tensor,
+        speed: Tensor,
+        sliding: Tensor,
+        places: Tensor,
+    ) -> Tensor:
+        """``(*batch, nv)``, N and N m; the base's six first, force before moment.
+
+        Args:
+            points: ``(*batch, P, 3)``, m, as all that follows in and relative to B_t.
+            normal: of the ground at each, ``(*batch, P, 3)``.
+            depth: at K times of the step, ``(*batch, P, K)``, m, zero beside the ground.
+            speed: along the normal, ``(*batch, P, 1)``, m/s.
+            sliding: across it, ``(*batch, P, 3)``, m/s.
+            places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m.
+        """
+        stiffness, damping, slip, friction, merged = self.law
+        # mean over the K times: (*batch, P)
+        push = normal_force(stiffness[:, None], damping[:, None], depth, speed).mean(-1)
+        slipping = torch.linalg.vector_norm(sliding, dim=-1)
+        touching = (depth > 0.0).to(push.dtype).mean(-1)  # share of the step
+        drag = friction_force(slip * touching, friction, push, slipping)
+        drag = drag / (slipping + MIN_SLIP)
+        force = push[..., None] * normal - drag[..., None] * sliding
+        force = merged[:, None] * force  # coinciding points act one by one
+        moment = torch.linalg.cross(points, force)
+        anchor, tip = places.chunk(2, -2)  # (*batch, J, 3) each
+        force_on, moment_on = self.ancestry @ force, self.ancestry @ moment
+        turning = moment_on - torch.linalg.cross(anchor, force_on)
+        along = torch.where(self.is_slide[:, None] > 0.0, force_on, turning)
+        parts = [((tip - anchor) * along).sum(-1)]  # (*batch, J)
+        if self.is_floating:
+            parts = [force.sum(-2), moment.sum(-2), *parts]
+        return torch.cat(parts, -1)
