@@ -14,13 +14,7 @@ import mujoco
 import torch
 
 from torchrl_nerd.analytic import make_step
-from torchrl_nerd.card import (
-    FORMAT,
-    features_of,
-    make_card,
-    network_config_of,
-    step_config_of,
-)
+from torchrl_nerd.card import FORMAT, config_of, make_card
 from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.hybrid import HybridNeRD
@@ -45,21 +39,16 @@ def save_checkpoint(model: Model, folder: Path, card: dict[str, Any]) -> Path:
     """Write weights, with a few steps to check them by, then card: each whole or not."""
     folder = writable_folder(folder)
     steps = stored_steps(model, _solver_scene(card, model.scene))
-    weights = model.state_dict()
-    write_tensors(folder / WEIGHTS, weights | steps)
+    write_tensors(folder / WEIGHTS, model.state_dict() | steps)
     write_json(folder / CARD, card)
     return folder
 
 
 def load_checkpoint(folder: str | Path, scene: Scene | None = None) -> Model:
-    """A model from a folder; warns where this machine does not repeat its steps.
-
-    See `read_checkpoint`.
-    """
-    folder = Path(folder)
-    model, check = read_checkpoint(folder, scene)
+    """`read_checkpoint`; warns where this machine does not repeat the stored steps."""
+    model, check = read_checkpoint(Path(folder), scene)
     if check is not None:
-        warn_of_differences(check, folder)
+        warn_of_differences(check, Path(folder))
     return model
 
 
@@ -68,11 +57,8 @@ def read_checkpoint(
 ) -> tuple[Model, SelfCheck | None]:
     """A model from a folder that `save_checkpoint` wrote, and its self-check.
 
-    There is no self-check for another scene than the card's.
-
-    Args:
-        folder: where.
-        scene: the robot to use it for; the card's own scene where not given.
+    It is for ``scene``, or for the card's own where none is given. There is no self-check
+    for another scene than the card's.
 
     Raises:
         ValueError: in one sentence, a missing, truncated or foreign file, a wrong shape,
@@ -159,16 +145,14 @@ def _build(
     try:
         with torch.random.fork_rng(devices=[]):
             if kind == "analytic":
-                config = step_config_of(card, folder)
-                return make_step(solver_scene, config)
-            network = network_config_of(card, folder)
+                return make_step(solver_scene, config_of(card, "step", folder))
+            network = config_of(card, "network", folder)
             _expect_room(network, tensors)
-            features = features_of(card, folder)
+            features = config_of(card, "features", folder)
             if kind == "learned":
                 return NeRD(scene, features, network)
             if kind == "hybrid":
-                config = step_config_of(card, folder)
-                step = make_step(solver_scene, config)
+                step = make_step(solver_scene, config_of(card, "step", folder))
                 return HybridNeRD(scene, step, features, network)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(

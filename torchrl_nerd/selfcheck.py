@@ -24,16 +24,10 @@ MUJOCO_TOLERANCE, MODEL_TOLERANCE = 1e-6, 1e-3  # relative to 1 + the largest nu
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """How far this machine's next states are from the stored ones, relative.
+    """How far next states of this machine are from the stored ones, relative."""
 
-    | field | meaning |
-    |---|---|
-    | ``mujoco`` | MuJoCo's |
-    | ``model`` | the model's |
-    """
-
-    mujoco: float
-    model: float
+    mujoco: float  # of MuJoCo
+    model: float  # of the model
 
     @property
     def agrees(self) -> bool:
@@ -44,16 +38,11 @@ class SelfCheck:
 def stored_steps(model: Model, scene: Scene) -> dict[str, Tensor]:
     """A few steps of this machine, to be kept among the model's weights.
 
-    Args:
-        model: the weights' owner.
-        scene: its own, as the data were stepped, see `Scene.reference`.
+    ``scene`` is the model's own, as the data were stepped, see `Scene.reference`.
     """
     start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
     high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
-    torque = (scale * high).clone()
-    given = {QPOS: start[QPOS], QVEL: start[QVEL], "joint_torque": torque}
-    if TERRAIN in start:
-        given[TERRAIN] = start[TERRAIN]
+    given = {**start, "joint_torque": (scale * high).clone()}
     return {PREFIX + k: v for k, v in (given | _steps(model, scene, given)).items()}
 
 
@@ -64,8 +53,8 @@ def self_check(
 
     Args:
         model: as it was loaded.
-        scene: its own, as the data were stepped, see `Scene.reference`.
-        tensors: that were stored with its weights; others than steps are passed over.
+        scene: see `stored_steps`.
+        tensors: of the checkpoint, steps among them.
         where: they were read from, for the sentence.
 
     Raises:
@@ -86,11 +75,8 @@ def self_check(
             f"expected a few steps of '{model.scene.name}' in {where}, got "
             f"something else: {str(error).splitlines()[0]}"
         ) from None
-    mujoco_, model_ = (
-        max(worst[f"{kind}_{key}"] for key in (QPOS, QVEL))
-        for kind in ("mujoco", "model")
-    )
-    return SelfCheck(mujoco_, model_)
+    kinds = ("mujoco", "model")
+    return SelfCheck(*(max(worst[f"{k}_{key}"] for key in (QPOS, QVEL)) for k in kinds))
 
 
 def warn_of_differences(check: SelfCheck, folder: Path) -> None:
@@ -108,12 +94,8 @@ def _steps(model: Model, scene: Scene, given: dict[str, Tensor]) -> dict[str, Te
     """One step of MuJoCo and of the model."""
     state = TensorDict({key: given[key] for key in (QPOS, QVEL)}, [len(given[QPOS])])
     torque, terrain = given["joint_torque"], given.get(TERRAIN)
-    both = {
-        "mujoco": MujocoDynamics(scene, num_threads=1),
-        "model": dynamics_of(model),
-    }
-    made = {}
-    for kind, dynamics in both.items():
+    made, mujoco = {}, MujocoDynamics(scene, num_threads=1)
+    for kind, dynamics in (("mujoco", mujoco), ("model", dynamics_of(model))):
         dynamics.reset(state)
         after = dynamics.step(state, torque, terrain)
         made |= {f"{kind}_{key}": after[key] for key in (QPOS, QVEL)}

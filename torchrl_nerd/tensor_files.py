@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -18,12 +17,7 @@ def write_tensors(
     tensors: Mapping[str, Tensor],
     about: Mapping[str, str] | None = None,
 ) -> None:
-    """Replace the file by these tensors of any shapes, from whatever device.
-
-    Args:
-        path: of the file.
-        tensors: by name.
-        about: a few words kept with them.
+    """Replace the file by these tensors of any device; ``about``: words kept with them.
 
     Raises:
         ValueError: it cannot be written, said in one sentence.
@@ -35,7 +29,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name, of any shapes, on the processor.
+    """The tensors of a file by name, on the processor.
 
     Raises:
         ValueError: in one sentence, no file there, or something else in it.
@@ -60,12 +54,8 @@ def expect_fit(
 ) -> None:
     """Refuse tensors of other names, shapes or kinds than expected, or not finite.
 
-    Args:
-        found: what was read.
-        expected: tensors to compare with; their values, and hence their device, do not
-            matter.
-        what: was read, for the sentence: ``"weights in FOLDER"``.
-        of: whom they must fit: ``"scene 'cartpole'"``.
+    For the sentence, ``what`` was read, ``"weights in FOLDER"``, and ``of`` is whom they
+    must fit, ``"scene 'cartpole'"``.
 
     Raises:
         ValueError: naming the first tensor that does not fit.
@@ -77,16 +67,12 @@ def expect_fit(
                 f"{what} do not fit {of}: expected {key!r} of shape {shapes.get(key)}, "
                 f"got {own.get(key)}"
             )
-        if not _casts(found[key].dtype, expected[key].dtype):
+        types = found[key].dtype, expected[key].dtype
+        # loading may change the type from one kind of float to another alone
+        if types[0] != types[1] and not all(t.is_floating_point for t in types):
             raise ValueError(
                 f"{what} do not fit {of}: expected {key!r} of type "
                 f"{expected[key].dtype}, got {found[key].dtype}"
             )
         if not found[key].to(expected[key].dtype).isfinite().all():
             raise ValueError(f"expected finite {what}, got NaN or infinity in {key!r}")
-
-
-def _casts(found: torch.dtype, expected: torch.dtype) -> bool:
-    """Whether loading may change the type: from one kind of float to another alone."""
-    floats = found.is_floating_point and expected.is_floating_point
-    return floats or found == expected

@@ -116,7 +116,7 @@ def test_every_strategy_gives_sound_data_of_the_same_layout(name, seed):
 def test_presets_name_strategies_that_fit_their_scenes():
     chosen = {name: preset_strategy(load_scene(name)) for name in PRESETS}
     names = {name: pair[0] for name, pair in chosen.items() if pair}
-    assert names["franka"] == "correlated" and names["cube"] == "resting"
+    assert names["franka_gravity"] == "correlated" and names["cube"] == "resting"
     assert names["double_pendulum"] == "level" and "cartpole" not in names
     for name in ("level", "unknown"):
         with pytest.raises(ValueError, match=f"for 'cartpole', got {name}"):

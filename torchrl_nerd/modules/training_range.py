@@ -24,13 +24,7 @@ MAX_SAMPLES = 200_000  # for covariance and quantile
 
 
 class TrainingRange(nn.Module):
-    """Bounds of the training data; bounds nothing until `fit`.
-
-    Args:
-        scene: the robot.
-        num_features: width F of features.
-        num_outputs: width D of targets.
-    """
+    """Bounds of F features, D targets and a robot's states; bounds nothing until `fit`."""
 
     feature_low: Tensor
     feature_high: Tensor
@@ -105,20 +99,13 @@ class TrainingRange(nn.Module):
     def clamp_change(self, change: Tensor, step: float) -> Tensor:
         """Changes ``(*batch, 2 nv)`` within those from the largest speed to its opposite.
 
-        Args:
-            change: see `StateDelta`.
-            step: s, in which they happen.
+        ``step`` is the time that they take, s; see `StateDelta`.
         """
         largest = torch.cat((2.0 * self.speed, step * self.speed))
         return change.clamp(-largest, largest)
 
     def limit_motion(self, motion: Tensor, time: float = 1.0) -> Tensor:
-        """Motions ``(*batch, nv)`` no farther than the largest speed leads.
-
-        Args:
-            motion: velocities, or tangents of positions.
-            time: s, that it takes.
-        """
+        """Motions ``(*batch, nv)`` within what the largest speed reaches in ``time`` s."""
         farthest = time * self.speed
         size = magnitudes(self.vectors, motion)
         return motion * (farthest / torch.maximum(size, farthest))
@@ -141,11 +128,7 @@ class TrainingRange(nn.Module):
 
 
 class OODScore(nn.Module):
-    """Mahalanobis distance to the training features, scaled; zero until `fit`.
-
-    Args:
-        num_features: width F of normalised features.
-    """
+    """Mahalanobis distance to F normalised features of training; zero until `fit`."""
 
     center: Tensor
     whitening: Tensor
@@ -182,10 +165,7 @@ class OODScore(nn.Module):
         """Score ``(*batch,)``: up to 1 for 99% of training, above 1 outside the range.
 
         The sum of both parts predicts large one-step errors best, see docs/stability.md.
-
-        Args:
-            features: normalised, ``(*batch, F)``.
-            excess: ``(*batch,)``, see `TrainingRange.excess`.
+        ``excess (*batch,)`` is that of `TrainingRange.excess`.
         """
         spread = self.mahalanobis(features) / self.reach
         return torch.where(excess > 0.0, 1.0 + spread + excess.sqrt(), spread)
@@ -220,12 +200,7 @@ class Sleep(nn.Module):
     def apply_sleep(
         self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """The state after, or the one before at zero velocity where the robot sleeps.
-
-        Args:
-            before: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
-            after: the same, one step later.
-        """
+        """The state after, or the one before at zero velocity where the robot sleeps."""
         if not self.can_rest:
             return after
         old, new = (magnitudes(self.vectors, state[1]) for state in (before, after))

@@ -119,8 +119,7 @@ class FeedForward(nn.Module):
     """GELU MLP of four times the width, added to its input.
 
     Without a layer norm: the state is a magnitude, and dividing by a token's own size
-    takes it away. Measured in experiments/first_edition/studies.md: a third to a half of
-    the rollout error.
+    takes it away (a third to a half of the rollout error, see experiments/first_edition).
     """
 
     def __init__(self, width: int) -> None:

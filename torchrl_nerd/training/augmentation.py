@@ -5,10 +5,12 @@ The image of a token or target under an isometry is a signed permutation of its 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
+from tensordict import TensorDict
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Generator, Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import QPOS, QVEL
@@ -21,7 +23,8 @@ from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 RTOL = 1e-7  # of equal entries, relative to the largest of a column
 STATS_TOL = 1e-3  # standard deviations: more than rounding, less than a network notices
 STATES = 512  # whose features tell which entry of an image is which of the original
-MAX_DEPTH = 1.0  # m: deep enough to have every contact point in the ground
+OVERSHOOT = 0.2  # of a joint's range, beyond its limits
+MAX_DEPTHS = 0.01, 1.0  # m: with some of the contact points in the ground, and with all
 
 
 class SignedPermutations:
@@ -30,8 +33,7 @@ class SignedPermutations:
     Sources and signs are found from samples and their images.
 
     Args:
-        original: ``(N, F)``, samples in which every entry that ever differs from zero
-            does so somewhere.
+        original: samples ``(N, F)``; every entry that is ever not zero is so somewhere.
         images: the same samples under each isometry, ``(N, F)``.
 
     Raises:
@@ -94,13 +96,30 @@ class Symmetry:
 
     @classmethod
     def of(cls, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> "Symmetry":
-        """The symmetry of a robot; permutations are found from random states."""
+        """The symmetry of a robot; permutations are found from random states.
+
+        Raises:
+            ValueError: a feature that is zero in all of these states.
+        """
         isometries = find_isometries(scene)
         encode = SceneFeatures(scene, config), StateDelta(scene)
-        states = states_in_contact(scene, STATES, MAX_DEPTH)
+        parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]
+        states, model = cast(TensorDict, TensorDict.cat(parts)), scene.model
+        share = torch.linspace(-OVERSHOOT, 1.0 + OVERSHOOT, STATES).double()
+        order = Generator().manual_seed(0)
+        for joint in model.jnt_limited.nonzero()[0]:  # some beyond either end
+            low, high = model.jnt_range[joint]
+            mixed = share[torch.randperm(STATES, generator=order)]
+            states[QPOS][:, model.jnt_qposadr[joint]] = low + (high - low) * mixed
         for key in (QPOS, QVEL):  # a change between any two states will do
             states["next", key] = states[key].roll(1, 0)
         images = [raw_tokens(*encode, isometry(states)) for isometry in isometries]
+        still = (images[0][0] == 0.0).all(0).nonzero()[:, 0].tolist()
+        if still and len(isometries) > 1:
+            raise ValueError(
+                f"expected random states of '{scene.name}' to fill every feature, got "
+                f"none for {still}: train without use_symmetry"
+            )
         pairs = zip((TOKEN, TARGET), zip(*images, strict=True), strict=True)
         found = {key: SignedPermutations(x[0], x) for key, x in pairs}
         return cls(isometries, found)

@@ -43,12 +43,10 @@ class FineTuner:
     """Trains a model on windows of recorded trajectories; `run` returns the best one.
 
     Args:
-        model: learned or hybrid, or an analytic step; left as it is, and trained on its
-            device.
+        model: a network or an analytic step, left as it is; a copy trains on its device.
         recording: trajectories of its scene.
-        train: numbers of the trajectories to train on, ``(n,)``.
-        validation: numbers of the trajectories that choose the best model and when to
-            stop.
+        train: numbers ``(n,)`` of the trajectories to train on.
+        validation: numbers of those that choose the best model and when to stop.
         config: how.
         quiet: no progress bar.
         keep: called with every model that is better than all before.
@@ -79,16 +77,9 @@ class FineTuner:
         self.config, self.recording, self.quiet = config, recording, quiet
         self.model, self.train, self.keep = copy.deepcopy(model), train, keep
         states = config.states if is_fit else config.sequence_length + 1
-        self.starts = recording.starts(states, train)
-        self.checks = recording.starts(config.states, validation)[::VALIDATION_STRIDE]
-        for name, found, least in (
-            ("training", self.starts, states),
-            ("validation", self.checks, config.states),
-        ):
-            if len(found) == 0:
-                raise ValueError(
-                    f"expected {name} trajectories of at least {least} states, got none"
-                )
+        self.starts = _starts(recording, states, train, "training")
+        checks = _starts(recording, config.states, validation, "validation")
+        self.checks = checks[::VALIDATION_STRIDE]
         self.curve: list[dict[str, float]] = []
         if isinstance(self.model, NeRD):
             chosen = []
@@ -185,13 +176,12 @@ class FineTuner:
     def _consider(self, epoch: float, loss: float = float("nan")) -> bool:
         """Validate, add to the curve, and keep the model if it is the best so far."""
         scene = self.model.scene
-        point = {"epoch": epoch, "seconds": time.monotonic() - self._began}
-        point["loss"] = loss
+        seconds = time.monotonic() - self._began
+        point = {"epoch": epoch, "seconds": seconds, "loss": loss}
         for quantity, error in self.errors(self.checks).items():
             point[error_key(scene, quantity, "_")] = float(error.mean())
-        best = min((score(before) for before in self.curve), default=None)
+        is_better = all(score(point) < score(before) for before in self.curve)
         self.curve.append(point)
-        is_better = best is None or score(point) < best
         if is_better:
             self._best = copy.deepcopy(self.model).requires_grad_(True).eval()
             if self.keep is not None:
@@ -215,13 +205,17 @@ class FineTuner:
         return {"finetuning": {**how, **converged(self.curve)}}
 
 
-def rollout_error(model: Model, window: TensorDict) -> Tensor:
-    """`weighted_error` of a rollout from a window's first state, with gradients.
+def _starts(recording: Recording, states: int, numbers: Tensor, what: str) -> Tensor:
+    found = recording.starts(states, numbers)
+    if len(found) == 0:
+        raise ValueError(
+            f"expected {what} trajectories of at least {states} states, got none"
+        )
+    return found
 
-    Args:
-        model: learned or hybrid.
-        window: ``[rows, steps + 1]``, see `Recording.windows`.
-    """
+
+def rollout_error(model: Model, window: TensorDict) -> Tensor:
+    """`weighted_error` of a rollout from the first state of ``[rows, steps + 1]``."""
     steps = window.batch_size[1] - 1
     dynamics = dynamics_of(model, differentiable=True)
     path = open_loop(dynamics, window[:, 0], steps, window[TORQUE])

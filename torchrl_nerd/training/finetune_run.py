@@ -23,10 +23,9 @@ def start_model(scene: Scene, name: str | None = None) -> Model:
 
     Args:
         scene: of the recording.
-        name: a shipped model, a checkpoint folder, or ``"analytic"``: a step without
-            weights whose physical parameters are the published ones where there are such,
-            else the scene's own. None: analytic where there are published ones, else the
-            scene's shipped model.
+        name: a shipped model, a checkpoint folder, or ``"analytic"``: a step whose
+            physical parameters are the published ones where there are such, else the
+            scene's own. None: analytic where some are published, else the shipped model.
     """
     published = recorded_protocol(scene.name).parameters
     if name != ANALYTIC and (name is not None or not published):
@@ -45,19 +44,10 @@ def finetune(
     quiet: bool = False,
     device: torch.device | str = "cpu",
 ) -> dict[str, Any]:
-    """Train on a log's training trajectories; writes checkpoint and ``curve.json``.
+    """Train on a log (npz or CSV) as `FineTuner`; writes checkpoint and ``curve.json``.
 
-    Args:
-        scene: of the recorded robot.
-        path: of the log, npz or CSV.
-        out: folder of the checkpoint.
-        config: how.
-        start: see `start_model`.
-        quiet: no progress bar.
-        device: of the model; the recording stays on the processor.
-
-    Returns:
-        The card of the best model on the validation trajectories.
+    Returns the card of the best model on the validation trajectories. ``start``: see
+    `start_model`. ``device`` is the model's; the recording stays on the processor.
     """
     recording, split = load_recording(path, scene)
     model = start_model(scene, start).to(device)

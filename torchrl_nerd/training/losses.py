@@ -15,8 +15,7 @@ def relative_error(errors: Tensor, size: Tensor, loss_eps: float) -> Tensor:
     """Length of an error relative to what it is an error of, ``(*batch,)``.
 
     Not its square: impacts are few and their errors large, and squares leave free flight
-    no say beside them. Measured in experiments/first_edition/studies.md: a quarter of the
-    error in free flight.
+    no say beside them (a quarter of the error there, see experiments/first_edition).
 
     Args:
         errors: ``(*batch, D)``, normalised.

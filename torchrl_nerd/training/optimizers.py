@@ -49,13 +49,7 @@ def learning_rate_ratio(config: TrainConfig, step: int) -> float:
 
 
 class RunState:
-    """The tensors of a run, saved to one file and restored in place.
-
-    Args:
-        network: that is trained.
-        average: of its weights, by name.
-        optimizers: by name.
-    """
+    """The tensors of a run, saved to one file and restored in place."""
 
     def __init__(
         self,

@@ -81,10 +81,7 @@ def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, D
 
     The name contains a hash of the weights and the noise: no data set mixes two policies.
 
-    Args:
-        scene: the robot.
-        folder: of a policy that `save_policy` wrote; its card names the task.
-        noise: as for `policy_data`.
+    `save_policy` wrote the folder; its card names the task. ``noise``: see `policy_data`.
 
     Raises:
         ValueError: in one sentence, no such policy, one for another scene, or a

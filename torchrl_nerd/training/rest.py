@@ -33,10 +33,6 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
     ``sleep_speed`` is above the speeds that it gives them within 20 steps, ``sleep_gain``
     above those that it gives them, stopped, within one. Nothing is changed where there are
     too few such states; a model that does not keep them at rest never sleeps.
-
-    Args:
-        model: trained; changed in place.
-        states: see `resting`.
     """
     if len(states) < MIN_ROWS or not model.sleep.can_rest:
         return

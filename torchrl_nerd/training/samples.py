@@ -61,10 +61,7 @@ def cover(
 ) -> None:
     """Fit a model's training range and out-of-distribution score to its data, in place.
 
-    Args:
-        model: whose.
-        data: transitions, ``[trajectories, steps]``.
-        samples: their normalised features and targets, where they are there already.
+    ``samples``: normalised features and targets, where they are there already.
     """
     features, targets = (x.flatten(0, -2) for x in samples or normalised(model, data))
     seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))

@@ -45,13 +45,9 @@ class Inputs(NamedTuple):
 
 
 class Sequences:
-    """Batches of sequences from a data set.
+    """Batches of sequences from a data set ``[trajectories, steps]``, on a device.
 
-    Args:
-        model: its features and statistics.
-        data: ``[trajectories, steps]``.
-        device: where batches are wanted.
-        symmetry: show each sample as a random one of its images.
+    With ``symmetry`` each sample is shown as a random one of its images.
 
     Raises:
         ValueError: symmetry images of a hybrid, whose analytic change has none.

@@ -20,11 +20,6 @@ def make_model(
 ) -> NeRD:
     """The model that a configuration describes, with random weights.
 
-    Args:
-        scene: the robot.
-        config: network, features and, for a hybrid, the analytic step.
-        stats: of its features and targets.
-
     Raises:
         ValueError: no such network or step, or a scene that the step cannot move.
     """

@@ -193,15 +193,11 @@ class Trainer:
             optimizer.zero_grad()
 
     def _one_step_loss(self, generator: Generator) -> Tensor:
-        """Loss of a batch of sequences, or of as many single states from all trajectories.
-
-        Consecutive states are alike, so a batch of single states, each with an empty
-        history, is more diverse.
-        """
+        """Loss of a batch of sequences, or of as many single states."""
         config = self.config
         count, length = config.batch_size, config.sequence_length
         if torch.rand((), generator=generator) < config.single_step_fraction:
-            count, length = count * length, 1
+            count, length = count * length, 1  # more diverse: neighbours are alike
         batch = self.sequences.one_step(count, length, generator)
         inputs, targets = batch[0].each(ranks.share), ranks.share(batch[1])
         changes = inputs.change(self.model.network(inputs.token).float())
@@ -211,11 +207,10 @@ class Trainer:
         """Loss of the model's own rollouts."""
         config = self.config
         sizes = config.rollout_batch_size, config.rollout_length
-        batch = (
-            x if x is None else ranks.share(x)
-            for x in self.sequences.rollout(*sizes, generator)
-        )
-        return rollout_loss(self.model, *batch, config.loss_eps)
+        qpos, qvel, torque, ground = self.sequences.rollout(*sizes, generator)
+        ground = None if ground is None else ranks.share(ground)
+        states = ranks.share(qpos), ranks.share(qvel), ranks.share(torque)
+        return rollout_loss(self.model, *states, ground, config.loss_eps)
 
     def _autocast(self) -> AbstractContextManager:
         is_coarse = self.step < self.config.bf16_fraction * self.config.steps

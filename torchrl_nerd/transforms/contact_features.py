@@ -60,11 +60,7 @@ class ContactFeatures(FeatureTransform):
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
     The K = min(substeps, 5) times are those of `PredictedPenetration`. A scene without
-    contact gives no keys at all.
-
-    Args:
-        scene: the robot and its ground.
-        features: which predictions to add; none by default.
+    contact gives no keys at all. ``features`` adds predictions; none by default.
 
     Examples:
         >>> transform = ContactFeatures(load_scene("cartpole"))
@@ -136,8 +132,7 @@ class ContactFeatures(FeatureTransform):
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
-            joint_torque: ``(*batch, num_actuated)`` of the coming step, for its prediction;
-                None where it is not known, as in an observation.
+            joint_torque: ``(*batch, num_actuated)`` of the coming step; None if unknown.
         """
         if self.terrain is None:
             return []

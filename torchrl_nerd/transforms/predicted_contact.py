@@ -30,11 +30,6 @@ class PredictedPenetration(nn.Module):
 
     The K = min(substeps, 5) times are spaced evenly from the step's start on: with few
     substeps they are those at which MuJoCo evaluates collision.
-
-    Args:
-        scene: the robot and its ground.
-        ground: distances to that ground.
-        pose: of its base.
     """
 
     radii: Tensor
@@ -118,13 +113,9 @@ def num_times(scene: Scene) -> int:
 class PredictedForce(nn.Module):
     """Predicted generalised force ``J^T f`` of all contact points, in B_t.
 
-    The penalty law (see `scenes.penalty_law`) on the predicted motion of every contact point.
+    The penalty law (see `scenes.penalty_law`) on the predicted motion of every point.
     Stiff contacts change velocities within the step, so this is an estimate only; but it
     condenses many points, depths and Jacobians into one number per degree of freedom.
-
-    Args:
-        scene: a robot whose contacts follow the penalty law.
-        axes: its joints.
 
     Raises:
         ValueError: contacts of another kind.

@@ -39,10 +39,6 @@ class RobotCentric(FeatureTransform):
       damper over the step at constant velocity | 1 |
     | ``robot_torque`` | ``("next", "joint_torque")``, where there is one | actuated dofs |
 
-    Args:
-        scene: the robot.
-        features: whether to predict limit torques; not by default.
-
     Examples:
         >>> transform = RobotCentric(load_scene("cartpole"))
         >>> zero = torch.zeros(3, 2).double()

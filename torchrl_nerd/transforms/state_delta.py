@@ -37,9 +37,6 @@ class StateDelta(Transform):
     In an env it is written under ``next`` and is zero at a reset. The inverse integrates:
     from ``qpos``, ``qvel`` and ``state_delta`` it writes the next ``qpos`` and ``qvel``.
 
-    Args:
-        scene: the robot.
-
     Examples:
         >>> transform = StateDelta(load_scene("cartpole"))
         >>> state = torch.zeros(3, 2).double()
@@ -82,13 +79,8 @@ class StateDelta(Transform):
     ) -> tuple[Tensor, Tensor]:
         """The next ``qpos`` and ``qvel``: exact inverse of `delta`.
 
-        Args:
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
-            delta: ``(*batch, 2 nv)``.
-            limit: what keeps a motion ``(*batch, nv)`` over so many seconds within
-                bounds: the next velocities, over one, and how far positions move of
-                what begins within them.
+        ``limit`` keeps a motion ``(*batch, nv)`` over so many seconds within bounds: the
+        next velocities, over one, and how far positions move of what begins within them.
         """
         change, residual = delta.split(self.layout.nv, -1)
         if self.base.is_floating:
