@@ -15,8 +15,7 @@ from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import dynamics_of
 from torchrl_nerd.evaluation.recorded_error import STATES, compare, errors_as_text
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.training.finetune import FineTuner
-from torchrl_nerd.training.finetune_run import start_model
+from torchrl_nerd.training.finetune import FineTuner, start_model
 
 
 def main() -> None:

@@ -6,12 +6,12 @@ from typing import cast
 
 from tensordict import TensorDict
 
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures, unit_stats
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import GRUConfig, MLPConfig, NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.samples import stats_of
-from torchrl_nerd.transforms import StateDelta
+from torchrl_nerd.transforms import StateDelta, Stats
 
 from . import features, targets
 from .networks import LSTMConfig, MarkovConfig
@@ -49,7 +49,7 @@ class Variant:
         stats = stats_of(tokens, target, cast(TensorDict, data[::THINNING]))
         for name, size in ((TOKEN, tokens.size), (TARGET, target.size)):
             if name in self.raw:
-                stats[name] = unit_stats(size)
+                stats[name] = Stats.unit(size)
         network = cast(NetworkConfig, self.network)
         return NeRD(scene, tokens.config, network, stats, tokens, target)
 

@@ -19,7 +19,7 @@ from torchrl_nerd.evaluation.recorded_error import STATES, compare, errors_as_te
 from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import recorded_protocol
-from torchrl_nerd.training.finetune_run import start_model
+from torchrl_nerd.training.finetune import start_model
 
 
 def main() -> None:

@@ -31,8 +31,7 @@ from torchrl_nerd.evaluation.recorded_error import (
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
 from torchrl_nerd.files import write_json
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.finetune import weighted_error
-from torchrl_nerd.training.finetune_run import start_model
+from torchrl_nerd.training.finetune import start_model, weighted_error
 from torchrl_nerd.training.physics_fit import fit_flight, fit_parameters
 
 VALIDATION_STRIDE = 5  # of the validation windows, which overlap

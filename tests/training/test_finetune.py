@@ -17,9 +17,9 @@ from torchrl_nerd.training.finetune import (
     converged,
     rollout_error,
     score,
+    start_model,
     weighted_error,
 )
-from torchrl_nerd.training.finetune_run import start_model
 from torchrl_nerd.training.samples import cover, data_stats
 
 QUICK = FinetuneConfig(

@@ -4,14 +4,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import tyro
 
+from torchrl_nerd.analytic import FreeBodyPenaltyStep
+from torchrl_nerd.checkpoint import CARD, make_card, save_checkpoint
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, SceneName, recorded_scene
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.log_files import load_recording
-from torchrl_nerd.files import writable_folder
-from torchrl_nerd.training.finetune_run import finetune
+from torchrl_nerd.dynamics import Model
+from torchrl_nerd.files import read_json, writable_folder, write_json
+from torchrl_nerd.training.finetune import ANALYTIC, FineTuner, start_model
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,32 @@ class Finetune(DeviceCommand):
         ]
 
     def run(self) -> dict[str, Any]:
-        """Train, save the best model on validation trajectories and return its card."""
+        """Train on the log's training trajectories; return the best model's card.
+
+        The folder gets its checkpoint and the validation errors, ``curve.json``.
+        """
         scene = recorded_scene(self.scene)
         out = writable_folder(self.out or Path("runs") / f"{scene.name}_finetuned")
-        how = self.config, self.model, self.quiet, self.device
-        card = finetune(scene, self.recorded, out, *how)
+        recording, split = load_recording(self.recorded, scene)
+        model = start_model(scene, self.model).to(self.device)
+        made = {
+            "start": self.model or (ANALYTIC if model.kind == ANALYTIC else scene.name),
+            "device": self.device,
+            "threads": torch.get_num_threads(),
+            "trajectories": {name: len(members) for name, members in split.items()},
+        }
+
+        def keep(best: Model) -> None:
+            results = {**made, **tuner.card()["finetuning"]}
+            if isinstance(best, FreeBodyPenaltyStep):
+                results["parameters"] = best.values()
+            save_checkpoint(best, out, make_card(best, {"finetuning": results}))
+            write_json(out / "curve.json", {"curve": tuner.curve})
+
+        parts = split["train"], split["validation"]
+        tuner = FineTuner(model, recording, *parts, self.config, self.quiet, keep)
+        keep(tuner.run())
+        card = read_json(out / CARD)
         results = card["finetuning"]
         errors = ", ".join(
             f"{name.removeprefix('validation_')} {value:.4f}"

@@ -125,7 +125,7 @@ class NeRD(nn.Module):
         num_features, num_outputs = self.scene_features.size, self.state_delta.size
         sizes: dict[NestedKey, int] = {TOKEN: num_features, TARGET: num_outputs}
         self.normalize = Normalize(
-            stats or {key: unit_stats(size) for key, size in sizes.items()}
+            stats or {key: Stats.unit(size) for key, size in sizes.items()}
         )
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
@@ -245,8 +245,3 @@ class NeRD(nn.Module):
     def device(self) -> torch.device:
         """Where it computes."""
         return next(self.network.parameters()).device
-
-
-def unit_stats(size: int) -> Stats:
-    """Statistics that leave ``(*, size)`` as it is."""
-    return Stats(1, torch.zeros(size).double(), torch.ones(size).double())

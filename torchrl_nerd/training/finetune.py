@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from torchrl_nerd.analytic import FreeBodyPenaltyStep
 from torchrl_nerd.analytic.free_body import PARAMETERS
+from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import TORQUE, Recording
 from torchrl_nerd.dynamics import Model, dynamics_of
@@ -25,11 +26,13 @@ from torchrl_nerd.evaluation.recorded_error import Errors, error_key, window_err
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import recorded_protocol
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.physics_fit import WINDOWS, fit_flight, fit_parameters
 
 VALIDATION_STRIDE = 5  # of the validation windows, which overlap
+ANALYTIC = "analytic"  # name of a step without weights, where models are named
 WARMUP = 10  # updates over which the step size rises
 CAN_LEARN = (NeRD, FreeBodyPenaltyStep)
 SCALES = {"m": 0.05, "rad": 1.0}  # errors that weigh alike
@@ -37,6 +40,23 @@ BAR = "epochs {n:.2f}/{total:.2f} |{bar}| {elapsed}<{remaining}{postfix}"
 
 Curve = Sequence[Mapping[str, float]]
 """Validation errors by ``epoch`` and ``seconds``, such as ``position_m``."""
+
+
+def start_model(scene: Scene, name: str | None = None) -> Model:
+    """The model that fine-tuning starts from.
+
+    Args:
+        scene: of the recording.
+        name: a shipped model, a checkpoint folder, or ``"analytic"``: a step whose
+            physical parameters are the published ones where there are such, else the
+            scene's own. None: analytic where some are published, else the shipped model.
+    """
+    published = recorded_protocol(scene.name).parameters
+    if name != ANALYTIC and (name is not None or not published):
+        return from_pretrained(name or scene.name, scene)
+    step = FreeBodyPenaltyStep(scene)
+    step.set_values(dict(published))
+    return step
 
 
 class FineTuner:

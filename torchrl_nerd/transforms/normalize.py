@@ -35,6 +35,11 @@ class Stats:
         mean = x.mean(0)
         return cls(len(x), mean, ((x - mean) ** 2).sum(0))
 
+    @classmethod
+    def unit(cls, size: int) -> "Stats":
+        """Statistics that leave ``(*, size)`` as it is."""
+        return cls(1, torch.zeros(size).double(), torch.ones(size).double())
+
     def merge(self, other: "Stats") -> "Stats":
         """Statistics of both sets of samples together."""
         count = self.count + other.count
