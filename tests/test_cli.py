@@ -12,18 +12,21 @@ import pytest
 from helpers import EXCERPT, slow_but
 
 from torchrl_nerd import __version__
+from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.configs import FinetuneConfig
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import mujoco_name, simulators
 from torchrl_nerd.evaluation.bench.error_table import PAPER
 from torchrl_nerd.evaluation.bench.evaluation_set import cases_of
 from torchrl_nerd.evaluation.results import read_results
+from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.robots import PRESETS, SCENES, load_scene
+from torchrl_nerd.robots import PRESETS, SCENES, load_scene, protocol_of
 
 NOTHING_RANDOM = ("doctor", "replay", "explain")
 SOON_DONE = ("plot", "explain", "replay")
-QUICK = ("cartpole",)  # the others take minutes in all
+QUICK = ("cube",)  # the others take minutes in all
 TINY = [
     "--network",
     "mlp-4x64",
@@ -400,11 +403,11 @@ def test_names_of_robots_are_names_of_folders(name, expected):
 
 
 def test_progress_is_shown_apart_from_the_table(tmp_path, monkeypatch, capsys):
-    model = ["--model", "cartpole-mlp", "--num-trajectories", "2"]
-    assert main(["eval", "cartpole", *model]) == 0
+    model = ["--model", "cube-mlp", "--num-trajectories", "2"]
+    assert main(["eval", "cube", *model]) == 0
     shown = capsys.readouterr()
-    assert "cartpole:" in shown.err and "it/s" in shown.err
-    assert main(["eval", "cartpole", *model, "--quiet"]) == 0
+    assert "cube:" in shown.err and "it/s" in shown.err
+    assert main(["eval", "cube", *model, "--quiet"]) == 0
     assert capsys.readouterr() == (shown.out, "")
 
 
@@ -416,15 +419,10 @@ def test_a_scene_is_explained(scene, tmp_path, capsys):
     assert all(feature["key"] in text for feature in content["features"])
 
 
-def test_the_shipped_cartpole_is_as_good_as_the_paper(tmp_path):
-    path = tmp_path / "results.json"
-    sizes = ["--num-trajectories", "64", "--model", "cartpole", "--json", str(path)]
-    assert main(["eval", "cartpole", *sizes, "--quiet"]) == 0
-    rows = read_results(path)["results"]["errors"]
-    found = {
-        (row["name"], row["quantity"]): row["mean"]
-        for row in rows
-        if (row["case"], row["steps"]) == ("passive", 100)
-    }
+def test_the_shipped_cartpole_is_as_good_as_the_paper(seed):
+    model, protocol = from_pretrained("cartpole"), protocol_of(load_scene("cartpole"))
+    source, truth = protocol.cases["passive"], MujocoDynamics(model.scene)
+    found = passive_errors(source, NeRDDynamics(model), truth, [100], 64, seed)[100]
     for quantity in ("slider", "hinge"):
-        assert 0.0 < found["cartpole", quantity] < 2.0 * found[PAPER, quantity]
+        published = protocol.published["passive", 100, quantity]
+        assert 0.0 < found[quantity].mean < 2.0 * published

@@ -81,7 +81,7 @@ def test_two_ranks_make_the_model_of_one(name, more, tmp_path, capsys):
             else:
                 torch.testing.assert_close(states[1][key], value, atol=2e-4, rtol=1e-3)
     assert len(losses[0]) == 5
-    torch.testing.assert_close(*map(torch.tensor, losses), atol=0.0, rtol=1e-5)
+    torch.testing.assert_close(*map(torch.tensor, losses), atol=0.0, rtol=1e-3)
 
 
 @pytest.mark.slow

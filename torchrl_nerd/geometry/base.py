@@ -14,14 +14,14 @@ from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
 def keep_constants(module: nn.Module, **values: object) -> None:
     """Keep copies as float64 buffers: they move with the module, checkpoints omit them."""
     for name, value in values.items():
-        tensor = torch.from_numpy(np.array(value, dtype=np.float64))
+        tensor = torch.from_numpy(np.asarray(value, np.float64).copy())
         module.register_buffer(name, tensor, persistent=False)
 
 
 def keep_indices(module: nn.Module, **values: object) -> None:
     """Keep integers as buffers: `torch.compile` would guard every entry of a list."""
     for name, value in values.items():
-        tensor = torch.from_numpy(np.array(value, dtype=np.int64))
+        tensor = torch.from_numpy(np.asarray(value, np.int64).copy())
         module.register_buffer(name, tensor, persistent=False)
 
 
