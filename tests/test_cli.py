@@ -421,8 +421,8 @@ def test_a_scene_is_explained(scene, tmp_path, capsys):
 
 def test_the_shipped_cartpole_is_as_good_as_the_paper(seed):
     model, protocol = from_pretrained("cartpole"), protocol_of(load_scene("cartpole"))
-    source, truth = protocol.cases["passive"], MujocoDynamics(model.scene)
-    found = passive_errors(source, NeRDDynamics(model), truth, [100], 64, seed)[100]
+    source, mujoco = protocol.cases["passive"], MujocoDynamics(model.scene)
+    found = passive_errors(source, NeRDDynamics(model), mujoco, [100], 64, seed)[100]
     for quantity in ("slider", "hinge"):
         published = protocol.published["passive", 100, quantity]
         assert 0.0 < found[quantity].mean < 2.0 * published
