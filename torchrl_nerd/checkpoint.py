@@ -91,6 +91,7 @@ def read_checkpoint(
     return model, self_check(model, solver_scene, tensors, str(folder / WEIGHTS))
 
 
+@torch.inference_mode(False)
 def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> Model:
     """A shipped model by its name, or one of your own by its folder.
 

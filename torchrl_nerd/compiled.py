@@ -4,7 +4,7 @@ import os
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, wraps
 from threading import Barrier
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
@@ -22,6 +22,30 @@ WARM = 2  # calls of one part after the other: an eager one, and one that compil
 def uncompiled(function: Function) -> Function:
     """Keep what a simulator or NumPy does out of compiled code, which runs up to it."""
     return torch.compiler.disable(function)  # pyright: ignore
+
+
+def unaffected(method: Function) -> Function:
+    """A method that inference mode and autocast round it leave alone; autograd does not.
+
+    A tensor made in inference mode can never be written to or differentiated again, and
+    what autocast rounds is no state. Such modes are the policy's; ``self.device`` is ours.
+    """
+
+    @wraps(method)
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        device = self.device.type
+        is_inference, has_grad = (
+            torch.is_inference_mode_enabled(),
+            torch.is_grad_enabled(),
+        )
+        is_plain = not (is_inference or torch.is_autocast_enabled(device))
+        if is_plain or torch.compiler.is_compiling():
+            return method(self, *args, **kwargs)
+        with torch.autocast(device, enabled=False), torch.inference_mode(False):
+            with torch.set_grad_enabled(has_grad):
+                return method(self, *args, **kwargs)
+
+    return cast(Function, run)
 
 
 class Compiled(Generic[Given, Result]):

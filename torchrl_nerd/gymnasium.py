@@ -26,8 +26,6 @@ from torchrl_nerd.keys import ACTION, OBSERVATION
 from torchrl_nerd.robots import TASKS
 from torchrl_nerd.tasks import Task
 
-SEEDS = 2**31  # of envs that nobody has seeded
-
 Info = dict[str, Any]
 
 
@@ -56,7 +54,6 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seed: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
         self.env: SceneEnv = make_env(task, dynamics, num_envs, seed, device)
         self.num_envs = num_envs
         width, size = (

@@ -85,6 +85,27 @@ def test_a_row_that_the_physics_cannot_step_ends_alone(task_id, dynamics, genera
     assert state.isfinite().all()
 
 
+@each_dynamics
+@pytest.mark.parametrize(
+    ("key", "junk"), [("qvel", 1e12), ("qvel", -1e5), ("qpos", 1e12)]
+)
+def test_huge_and_finite_is_a_fault_of_its_row(task_id, dynamics, key, junk, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, sound = make(ROWS), make(ROWS)
+    start = sound.reset()
+    row = int(torch.randint(ROWS, (), generator=generator))
+    others = torch.arange(ROWS) != row
+    wild = start.clone()
+    wild[key][row, 0] = junk
+    start_at(env, wild)
+    start_at(sound, start)
+    action = random_actions(env, 1, generator)[0]
+    after, expected = act(env, action), act(sound, action)
+    assert after["terminated"][row] and after["fault"][row] in (2, 3)
+    assert not after["fault"][others].any()
+    assert not unequal_keys(after[others], expected[others])
+
+
 @each_with_actions
 @each_dynamics
 def test_actions_beyond_the_limits_act_like_the_limits(task_id, dynamics, generator):

@@ -1,5 +1,6 @@
 """Same seed, same bits; another seed, other numbers; global generators left alone."""
 
+import functools
 import hashlib
 import os
 import random
@@ -20,6 +21,7 @@ from dynamics_helpers import (
     unequal_keys,
 )
 from torch import Generator, Tensor
+from torchrl.envs import SerialEnv
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
@@ -57,6 +59,20 @@ def test_setting_the_seed_begins_again(task_id, dynamics, generator, seed):
     env.set_seed(seed)
     again = life(env, Generator().manual_seed(1))
     assert not unequal_keys(again, life(make(ROWS, seed), Generator().manual_seed(1)))
+
+
+def test_a_seed_is_drawn_where_none_is_given_and_workers_differ(generator):
+    serial = SerialEnv(3, functools.partial(GroundTruthEnv, TASK, num_envs=ROWS))
+    starts = serial.reset()["qpos"].flatten(0, 1)
+    assert len(starts.unique(dim=0)) == 3 * ROWS
+    serial.set_seed(7)
+    seeded = serial.reset()["qpos"]
+    assert len(seeded.flatten(0, 1).unique(dim=0)) == 3 * ROWS
+    serial.set_seed(7)
+    assert torch.equal(serial.reset()["qpos"], seeded)
+    makers = [make_env, NeRDEnv, GroundTruthEnv]
+    assert len({make(TASK).seed for make in makers + makers}) == 6
+    assert all(make(TASK, seed=3).seed == 3 for make in makers)
 
 
 def test_any_seed_that_torchrl_hands_on_is_taken(seed):

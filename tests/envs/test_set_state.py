@@ -7,6 +7,7 @@ import pytest
 import torch
 from dynamics_helpers import (
     LEARNED,
+    MODELS,
     EnvMaker,
     act_all,
     assert_same_motion,
@@ -19,6 +20,11 @@ from dynamics_helpers import (
     unequal_keys,
 )
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
+
+from torchrl_nerd.envs.frame_stack import stack_frames
 
 ROWS, STEPS = 4, 3
 
@@ -113,7 +119,7 @@ def test_bad_states_are_refused_in_one_sentence(task_id, generator):
 @each_dynamics
 def test_state_dict_restores_the_physical_state(task_id, dynamics, generator):
     make = EnvMaker(task_id, dynamics, generator)
-    env, other = make(ROWS, seed=5), make(ROWS, seed=5)
+    env, other = make(ROWS, seed=5), make(ROWS, seed=6)
     actions = random_actions(env, 2 * STEPS, generator)
     env.reset()
     act_all(env, actions[:STEPS])
@@ -125,7 +131,7 @@ def test_state_dict_restores_the_physical_state(task_id, dynamics, generator):
         after, expected = (act_all(each, actions[STEPS:]) for each in (other, env))
         assert_same_motion(after, expected, 1e-9)  # a solver's warm start is no state
     again, expected = (each.reset() for each in (other, env))
-    assert torch.equal(again["qpos"], expected["qpos"])
+    assert torch.equal(again["qpos"], expected["qpos"]) and other.seed == 5
 
 
 @each_dynamics
@@ -158,3 +164,66 @@ def test_a_copied_env_lives_a_life_of_its_own(task_id, dynamics, way, generator)
     copied, path = act_all(twin, actions), act_all(env, actions)
     wanted = act_all(expected, actions)
     assert not unequal_keys(copied, wanted) and not unequal_keys(path, wanted)
+
+
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda make: TransformedEnv(make(ROWS), StepCounter()),
+        lambda make: stack_frames(make(ROWS), 3),
+        lambda make: SerialEnv(1, lambda: make(ROWS)),
+    ],
+    ids=["transformed", "frames", "serial"],
+)
+def test_a_wrapped_env_starts_where_it_is_told(task_id, dynamics, wrap, generator):
+    make = EnvMaker(task_id, dynamics, generator)
+    env, plain = wrap(make), make(ROWS)
+    state = random_state(plain, generator)
+    action = random_actions(plain, 1, generator)[0]
+    shape = env.batch_size
+    after = env.reset(state.clone().reshape(shape), set_state=True)
+    path = env.rollout(
+        2,
+        lambda td: td.set("action", action.reshape(*shape, -1)),
+        tensordict=state.clone().reshape(shape),
+        set_state=True,
+    )
+    plain.reset(state.clone(), set_state=True)
+    expected = act_all(plain, action[None])[:, 0]
+    for key, value in state.items():
+        assert torch.equal(after[key].reshape(value.shape), value)
+    got = path.reshape(ROWS, -1)[:, 0]["next"]
+    assert torch.equal(got["qpos"], expected["qpos"])
+    if not isinstance(env, SerialEnv):  # a state that is only there is not set
+        assert (env.reset(state.clone())["qpos"] != state["qpos"]).any(-1).all()
+
+
+@each_dynamics
+@pytest.mark.parametrize("task_id", ["ant/run", "cube/toss"])
+def test_quaternions_of_any_length_stand_for_unit_ones(task_id, dynamics, generator):
+    env = EnvMaker(task_id, dynamics, generator)(ROWS)
+    unit, q = random_state(env, generator), env.scene.base.qpos_address
+    scaled, torque = unit.clone(), torch.zeros(ROWS, len(env.scene.actuated))
+    scaled["qpos"][:, q + 3 : q + 7] *= torch.tensor([[1.0], [0.6], [2.5], [1 + 1e-9]])
+    after = env.reset(scaled.clone(), set_state=True)
+    torch.testing.assert_close(after["qpos"], unit["qpos"], atol=1e-15, rtol=1e-15)
+    ends = []
+    for state in (unit, scaled):
+        env.dynamics.reset(state)
+        given = state.select("qpos", "qvel")
+        ends.append(env.dynamics.step(given, torque, state.get("terrain", None)))
+    assert_same_motion(*ends, 1e-9 if dynamics in MODELS else 1e-12)
+
+
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+def test_a_collector_goes_on_from_its_state_dict(dynamics, generator):
+    env = EnvMaker("cartpole/swingup", dynamics, generator)(ROWS)
+    size, actions = env.observation_spec["observation"].shape[-1], env.action_spec
+    net = torch.nn.Linear(size, actions.shape[-1])
+    policy = TensorDictModule(net, ["observation"], ["action"])
+    collector = Collector(env, policy, frames_per_batch=12, total_frames=36)
+    before = next(iter(collector))
+    collector.load_state_dict(collector.state_dict())
+    assert torch.equal(env.state["qpos"], before["next", "qpos"][:, -1])
+    collector.shutdown()

@@ -2,6 +2,8 @@
 
 from dataclasses import asdict
 
+import torch
+
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult
 from torchrl_nerd.analytic.free_body import FreeBodyPenaltyStep
 from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
@@ -63,6 +65,7 @@ def default_step(scene: Scene) -> StepConfig:
     return PenaltyContactConfig(num_outer_steps=2 - scene.substeps % 2)
 
 
+@torch.inference_mode(False)
 def make_step(scene: Scene, config: StepConfig | None = None) -> AnalyticStep:
     """The step of that configuration for a scene, or its default step.
 

@@ -1,7 +1,8 @@
 """The interface of all dynamics: state and torque in, next state out."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -23,6 +24,14 @@ class Dynamics(Protocol):
         """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all envs)."""
         ...
 
+    def history(self) -> Any:
+        """A copy of the past that is kept of all envs, for `restore`."""
+        ...
+
+    def restore(self, history: Any, rows: Tensor) -> None:
+        """Give ``rows`` (bool ``(num_envs,)``) back the past they had at `history`."""
+        ...
+
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
@@ -38,6 +47,11 @@ class Dynamics(Protocol):
             ground truth of a model that senses forces adds ``sensordata``.
         """
         ...
+
+
+def as_numpy(x: Tensor) -> np.ndarray:
+    """The numbers of a tensor on any device, float64, without its gradients."""
+    return x.detach().cpu().double().numpy()
 
 
 def check_step(

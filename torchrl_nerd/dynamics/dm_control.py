@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step, ground_pose
+from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
 from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
@@ -60,6 +60,15 @@ class DMControlDynamics:
             if rows is None or rows[row]:
                 physics.reset()
 
+    def history(self) -> list["Physics"]:
+        """See `Dynamics.history`."""
+        return [physics.copy(share_model=True) for physics in self._rows]
+
+    def restore(self, history: list["Physics"], rows: Tensor) -> None:
+        """See `Dynamics.restore`."""
+        for row in rows.nonzero()[:, 0].tolist():
+            self._rows[row] = history[row] if history else make_physics(self.scene)
+
     @uncompiled
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
@@ -69,11 +78,10 @@ class DMControlDynamics:
         if len(self._rows) != len(joint_torque):
             self.reset(state)
         qpos, qvel, force = (
-            np.asarray(x.double().cpu())
-            for x in (state[QPOS], state[QVEL], joint_torque)
+            as_numpy(x) for x in (state[QPOS], state[QVEL], joint_torque)
         )
         pose = ground_pose(self.scene, terrain)
-        poses = [None] * len(qpos) if pose is None else np.asarray(pose.cpu())
+        poses = [None] * len(qpos) if pose is None else as_numpy(pose)
         next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
         felt = np.empty((len(qpos), self.scene.model.nsensordata))
         for row, physics in enumerate(self._rows):

@@ -1,6 +1,6 @@
 """Learned dynamics that know where they were trained, and what to do elsewhere."""
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -74,6 +74,18 @@ class GuardedDynamics:
             self._calm = self._calm[:0]
         elif len(self._calm) == rows.numel():
             self._calm = self._calm.masked_fill(rows.reshape(-1), self.patience)
+
+    def history(self) -> tuple[Tensor, Any]:
+        """See `Dynamics.history`."""
+        return self._calm, self.learned.history()
+
+    def restore(self, history: tuple[Tensor, Any], rows: Tensor) -> None:
+        """See `Dynamics.restore`."""
+        calm, past = history
+        self.learned.restore(past, rows)
+        if len(self._calm) == len(rows):
+            known = calm if len(calm) == len(rows) else self.patience
+            self._calm = torch.where(rows, known, self._calm)
 
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None

@@ -1,5 +1,6 @@
 """Dynamics that torch computes: learned, hybrid and analytic models as `Dynamics`."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any, Literal, cast
 
@@ -8,8 +9,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.analytic import AnalyticStep
-from torchrl_nerd.compiled import Compiled, RowThreads, parts_of
+from torchrl_nerd.compiled import Compiled, RowThreads, parts_of, unaffected
 from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD, Network
 from torchrl_nerd.modules.transformer import WindowNetwork
@@ -85,12 +87,25 @@ class TorchDynamics:
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """See `Dynamics.reset`; there is no history to empty."""
 
+    def history(self) -> Any:
+        """See `Dynamics.history`."""
+        return copy.copy(self._memory)
+
+    @unaffected
+    def restore(self, history: Any, rows: Tensor) -> None:
+        """See `Dynamics.restore`."""
+        if history is not None:
+            self._memory.restore(history, rows.to(self.device))
+        elif self._memory is not None:
+            self._memory.clear(rows.to(self.device))
+
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`."""
         return self.scored_step(state, joint_torque, terrain, is_scored=False)[0]
 
+    @unaffected
     def scored_step(
         self,
         state: TensorDictBase,
@@ -105,6 +120,7 @@ class TorchDynamics:
         check_step(self.scene, state, joint_torque, terrain)
         there, here = state[QPOS].device, self.device
         qpos, qvel = state[QPOS].to(here), state[QVEL].to(here)
+        qpos = normalize_pos(self.scene.layout, qpos)
         ground = None if terrain is None else terrain.to(here)
         self._prepare(len(qpos))
         given = qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
@@ -172,6 +188,7 @@ class NeRDDynamics(TorchDynamics):
         self.network: Network = network
         super().__init__(model, compile, differentiable)
 
+    @unaffected
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""
         count = state[QPOS].shape[0]

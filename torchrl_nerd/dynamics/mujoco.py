@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step, ground_pose
+from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import silence_mujoco
@@ -97,6 +97,15 @@ class MujocoDynamics:
         else:
             self._warmstart[rows.cpu().numpy()] = 0.0
 
+    def history(self) -> np.ndarray:
+        """See `Dynamics.history`: the warm start."""
+        return self._warmstart.copy()
+
+    def restore(self, history: np.ndarray, rows: Tensor) -> None:
+        """See `Dynamics.restore`."""
+        mask = rows.cpu().numpy()
+        self._warmstart[mask] = history[mask] if len(history) == len(mask) else 0.0
+
     @uncompiled
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
@@ -123,7 +132,7 @@ class MujocoDynamics:
             ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo
             gave up on.
         """
-        qpos, qvel = (np.asarray(state[key].double().cpu()) for key in (QPOS, QVEL))
+        qpos, qvel = (as_numpy(state[key]) for key in (QPOS, QVEL))
         fine = self._substeps(qpos, qvel, self._control(joint_torque, terrain))
         timestep, nq, nv = self._model.opt.timestep, self._model.nq, self._model.nv
         velocity = slice(1 + nq, 1 + nq + nv)  # of MuJoCo's state: time, qpos, qvel
@@ -147,10 +156,10 @@ class MujocoDynamics:
         """MuJoCo's control vector, ``(rows, T, size)``: applied force, ground's pose."""
         size = mujoco.mj_stateSize(self._model, CONTROL)
         control = np.zeros((*joint_torque.shape[:-1], size))
-        control[..., self.scene.actuated] = joint_torque.double().cpu().numpy()
+        control[..., self.scene.actuated] = as_numpy(joint_torque)
         pose, data = ground_pose(self.scene, terrain), self._data[0]
         fixed = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
-        varied = fixed if pose is None else pose.cpu().numpy()[:, None]
+        varied = fixed if pose is None else as_numpy(pose)[:, None]
         control[..., self._model.nv :] = varied
         return control
 

@@ -106,6 +106,15 @@ class MujocoWarpDynamics:
             every = slice(None) if rows is None else rows.to(self.device)
             self._view("qacc_warmstart")[every] = 0.0
 
+    def history(self) -> Tensor | None:
+        """See `Dynamics.history`: the warm start."""
+        return self._view("qacc_warmstart").clone() if self._rows else None
+
+    def restore(self, history: Tensor | None, rows: Tensor) -> None:
+        """See `Dynamics.restore`."""
+        mask, now = rows.to(self.device), self._view("qacc_warmstart")
+        now[mask] = 0.0 if history is None else history[mask]
+
     @torch.no_grad()
     @uncompiled
     def step(

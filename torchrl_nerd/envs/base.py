@@ -1,5 +1,6 @@
 """A scene, a task and a dynamics joined into a batched TorchRL env."""
 
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -11,18 +12,20 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_nerd.compat import tensordict_of
-from torchrl_nerd.compiled import Compiled
+from torchrl_nerd.compiled import Compiled, unaffected
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition
+from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_at_least, expect_device
 from torchrl_nerd.tasks import Task
 
 MAX_SEED = 2**63
+SEED_BITS = 32  # of a seed that is drawn
 
 
 class SceneEnv(EnvBase):
@@ -42,7 +45,8 @@ class SceneEnv(EnvBase):
         task: reset distribution, observation, reward, end.
         dynamics: what steps the state.
         num_envs: how many envs step together.
-        seed: of the resets.
+        seed: of the resets; where none is given one is drawn, so that workers that make
+            their own env differ.
         device: where states, observations and rewards live.
         dump_dir: where the first fault of each kind leaves a dump for `nerd replay`.
 
@@ -56,13 +60,15 @@ class SceneEnv(EnvBase):
     _age: Tensor
     _keys: Tensor
     _offsets: Tensor
+    _seed: Tensor
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         task: Task,
         dynamics: Dynamics,
         num_envs: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str = "cpu",
         dump_dir: Path | None = None,
     ) -> None:
@@ -87,6 +93,8 @@ class SceneEnv(EnvBase):
             inner = self._torch_dynamics
             model = inner.model if isinstance(inner, NeRDDynamics) else None
             self.recorder = FaultRecorder(dump_dir, about, model)
+        inner = self._torch_dynamics
+        self._is_differentiable = inner is not None and inner.differentiable
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
         for name in ("_episode", "_age"):
@@ -96,7 +104,8 @@ class SceneEnv(EnvBase):
         offsets = stream_offsets(task.num_uniforms, self.device)
         self.register_buffer("_offsets", offsets, persistent=False)
         self.register_buffer("_keys", zeros.long(), persistent=False)
-        self._set_seed(seed)
+        self.register_buffer("_seed", zeros[0].long())
+        self._set_seed(secrets.randbits(SEED_BITS) if seed is None else seed)
 
     def __repr__(self) -> str:
         model = "" if self.model_name is None else f", model={self.model_name!r}"
@@ -165,6 +174,9 @@ class SceneEnv(EnvBase):
         }
         if self.guard:
             state[TRUST] = Bounded(0.0, 1.0, shape(1), device, torch.float32)
+        # what `reset` takes with ``set_state``: transforms hand on nothing else
+        given = {key: state[key].clone() for key in self._state_sizes}
+        self.state_spec = Composite(given, shape=rows, device=device)
         state[FAULT] = column(len(REASONS), torch.int64)
         observed = shape(self.task.observation_size)
         state[OBSERVATION] = Unbounded(observed, device, torch.float32)
@@ -177,17 +189,33 @@ class SceneEnv(EnvBase):
             {name: column(2, torch.bool) for name in flags}, shape=rows, device=device
         )
 
+    def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
+        """A state is set where ``set_state=True`` says so, never because it is there."""
+        return False
+
+    @property
+    def seed(self) -> int:
+        """Of the resets."""
+        return int(self._seed)
+
+    @unaffected
     def _set_seed(self, seed: int | None) -> None:
         """Begin each env's stream anew."""
         if seed is None or not 0 <= seed < MAX_SEED:
             raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed}")
-        self.seed = seed
+        self._seed = torch.full_like(self._seed, seed)
         self._keys = row_keys(seed, len(self._episode), self.device)
         self._episode = torch.zeros_like(self._episode)
 
     def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
-        """Restore states and episode counts; the history of every env starts empty."""
+        """Restore states, seed and episode counts; the history of every env starts empty.
+
+        An empty one, which TorchRL's collectors keep of an env, changes nothing.
+        """
+        if not state_dict:
+            state_dict = self.state_dict()
         result = super().load_state_dict(state_dict, *args, **kwargs)
+        self._keys = row_keys(self.seed, len(self._episode), self.device)
         self.dynamics.reset(self.state)
         return result
 
@@ -200,6 +228,7 @@ class SceneEnv(EnvBase):
         kept = cast(dict[str, Tensor], self._buffers)
         return {key: kept[f"_state_{key}"] for key in self._state_sizes}
 
+    @unaffected
     def _reset(
         self,
         tensordict: TensorDictBase | None = None,
@@ -240,9 +269,11 @@ class SceneEnv(EnvBase):
                 )
             if not value[rows].isfinite().all():
                 raise ValueError(f"expected finite {key} to set the state to")
-            values[key] = value.to(torch.float64, copy=True)
-        return values
+            value = value.to(self.device, torch.float64, copy=True)
+            values[key] = value if self._is_differentiable else value.detach()
+        return values | {QPOS: normalize_pos(self.scene.layout, values[QPOS])}
 
+    @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict[ACTION]
         if action.shape != self.action_spec.shape:
@@ -250,11 +281,34 @@ class SceneEnv(EnvBase):
                 f"expected an action of shape {tuple(self.action_spec.shape)}, "
                 f"got {tuple(action.shape)}"
             )
-        state = self._state()
+        if not self._is_differentiable:
+            action = action.detach()
+        state, moves = self._state(), tensordict.get("_step", None)
+        is_partial = moves is not None and not moves.all()
+        past = self.dynamics.history() if is_partial else None
         found = self._transit(state, action, self._age)
+        moves = 1 if moves is None else moves.reshape(self.batch_size)
+        if is_partial:
+            self.dynamics.restore(past, ~moves)
+            found = self._hold(found, ~moves, tensordict)
         if self.recorder is not None:
             self.recorder.record(state, action, found["joint_torque"], found[FAULT])
-        return self._hand_out(found, {"_age": self._age + 1})
+        return self._hand_out(found, {"_age": self._age + moves})
+
+    def _hold(
+        self, found: dict[str, Tensor], rows: Tensor, tensordict: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """``found``, but ``rows`` are as they were before the step and earn nothing.
+
+        Flags and the like are those that ``tensordict`` shows; its observation may be one
+        of a transform, so it is made anew of the state.
+        """
+        none, streams = rows & False, (self._keys, self._episode, self._offsets)
+        shown = self._restart(self._state(), none, streams, {})
+        for key in ("joint_torque", FAULT, TRUST, "done", "terminated", "truncated"):
+            shown[key] = tensordict.get(key, shown[key])
+        held = rows[:, None]
+        return {k: torch.where(held, shown.get(k, 0.0), v) for k, v in found.items()}
 
     def _hand_out(
         self, found: dict[str, Tensor], counts: dict[str, Tensor]

@@ -23,7 +23,7 @@ class DmEnvironment(dm_env.Environment):
     Args:
         task: id of a task, or a task.
         dynamics: as for `make_env`.
-        seed: of the resets.
+        seed: of the resets; drawn where none is given.
         device: where the env computes.
 
     Examples:
@@ -36,7 +36,7 @@ class DmEnvironment(dm_env.Environment):
         self,
         task: str | Task,
         dynamics: str | Path = "nerd",
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self.env: SceneEnv = make_env(task, dynamics, 1, seed, device)

@@ -26,19 +26,22 @@ FARTHEST = 1e9  # m and rad
 HISTORY = 16  # control steps in a dump
 
 
-def find_faults(action: Tensor, moved: Mapping[str, Tensor]) -> Tensor:
+def find_faults(
+    action: Tensor, state: Mapping[str, Tensor], moved: Mapping[str, Tensor]
+) -> Tensor:
     """The reason of each env's fault, an index of `REASONS`.
 
     Args:
         action: ``(num_envs, num_actions)``.
+        state: before the step; a model may slow down what ran away.
         moved: next ``qpos (num_envs, nq)`` and ``qvel (num_envs, nv)``.
 
     Returns:
         ``(num_envs, 1)``, int64.
     """
     qpos, qvel = moved[QPOS], moved[QVEL]
-    is_fast, is_far = qvel.abs() > LARGEST_SPEED, qpos.abs() > FARTHEST
-    runs = torch.any(is_fast, -1) | torch.any(is_far, -1)
+    far, fast = (torch.maximum(state[k].abs(), moved[k].abs()) for k in (QPOS, QVEL))
+    runs = torch.any(fast > LARGEST_SPEED, -1) | torch.any(far > FARTHEST, -1)
     is_finite = torch.all(qpos.isfinite(), -1) & torch.all(qvel.isfinite(), -1)
     fault = torch.where(is_finite, 3 * runs.long(), 2)  # (num_envs,)
     return torch.where(torch.all(action.isfinite(), -1), fault, 1)[:, None]

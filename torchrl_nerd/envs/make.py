@@ -39,7 +39,7 @@ class GroundTruthEnv(SceneEnv):
         task: str | Task,
         engine: Engine = "mujoco",
         num_envs: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str = "cpu",
         dump_dir: Path | None = None,
     ) -> None:
@@ -82,7 +82,7 @@ class NeRDEnv(SceneEnv):
         task: str | Task,
         model: Model | str | Path = "nerd",
         num_envs: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str = "cpu",
         inference: Inference = "streaming",
         guard: Guard | None = None,
@@ -110,7 +110,7 @@ def make_env(
     task: str | Task,
     dynamics: str | Path = "nerd",
     num_envs: int = 1,
-    seed: int = 0,
+    seed: int | None = None,
     device: torch.device | str = "cpu",
     guard: Guard | None = None,
     dump_dir: Path | None = None,
@@ -125,7 +125,7 @@ def make_env(
             ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
             analytic step's name, or a checkpoint folder.
         num_envs: how many envs step together.
-        seed: of the resets.
+        seed: of the resets; drawn where none is given.
         device: where all tensors live.
         guard: see `NeRDEnv`; of learned and hybrid dynamics alone.
         dump_dir: see `SceneEnv`.

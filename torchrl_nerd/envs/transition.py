@@ -70,7 +70,7 @@ class Transition:
             graph_break()  # two steps in one piece take minutes to compile
             moved, torque = self._control_step(moved, given, terrain)
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])
-        fault = find_faults(action, moved)  # (num_envs, 1)
+        fault = find_faults(action, state, moved)  # (num_envs, 1)
         is_good = fault == 0
         kept = {
             key: torch.where(is_good, moved[key], state[key]) for key in (QPOS, QVEL)

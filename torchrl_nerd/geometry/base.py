@@ -11,6 +11,8 @@ from torchrl_nerd.geometry.manifold import FREE, HINGE, SLIDE
 from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
 
 
+# a scene keeps them: they must not be inference tensors, whoever asks first
+@torch.inference_mode(False)
 def keep_constants(module: nn.Module, **values: object) -> None:
     """Keep copies as float64 buffers: they move with the module, checkpoints omit them."""
     for name, value in values.items():
@@ -18,6 +20,7 @@ def keep_constants(module: nn.Module, **values: object) -> None:
         module.register_buffer(name, tensor, persistent=False)
 
 
+@torch.inference_mode(False)
 def keep_indices(module: nn.Module, **values: object) -> None:
     """Keep integers as buffers: `torch.compile` would guard every entry of a list."""
     for name, value in values.items():

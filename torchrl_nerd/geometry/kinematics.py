@@ -249,6 +249,7 @@ def _side_by_side(parts: tuple[Tensor, ...]) -> Tensor:
     return torch.cat([part.expand(*part.shape[:-1], rows) for part in parts], -2)
 
 
+@torch.inference_mode(False)
 def _keep(module: nn.Module, **per_body: object) -> None:
     """Keep numbers of n bodies ``(n, *size)`` as buffers ``(*size, n, 1)``."""
     for name, value in per_body.items():

@@ -26,6 +26,9 @@ FREE, BALL, SLIDE, HINGE = (
 )
 
 
+UNIT = 1e-15  # mjMINVAL
+
+
 @dataclass(frozen=True)
 class JointLayout:
     """Where each joint lives in ``qpos`` and ``qvel``: (qpos address, dof address)."""
@@ -78,6 +81,19 @@ def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
         turned = quat_multiply(qpos[..., q : q + 4], quat_exp(tangent[..., v : v + 3]))
         moved[..., q : q + 4] = quat_normalize(turned)
     return moved
+
+
+def normalize_pos(layout: JointLayout, qpos: Tensor) -> Tensor:
+    """``qpos (*batch, nq)`` with unit quaternions, as MuJoCo reads it.
+
+    By MuJoCo's rule: one within `UNIT` of length one stays as it is, bit for bit.
+    """
+    for q, _ in layout.rotations:
+        quat = qpos[..., q : q + 4]
+        error = torch.linalg.vector_norm(quat, dim=-1, keepdim=True) - 1.0
+        quat = torch.where(error.abs() > UNIT, quat_normalize(quat), quat)
+        qpos = torch.cat((qpos[..., :q], quat, qpos[..., q + 4 :]), -1)
+    return qpos
 
 
 def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor:

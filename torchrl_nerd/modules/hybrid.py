@@ -14,6 +14,7 @@ from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Stats
 
 GATE_SCALE = 1.0  # rms of the normalised velocity defect at which the gate is open
+TINY = 1e-24
 MAX_CHANGE = 1e6  # normalised; the analytic change of absurd torques overflows
 
 
@@ -70,7 +71,8 @@ class HybridNeRD(NeRD):
         scale = self.normalize.std(TARGET)[: self.scene.layout.nv]
         defect = result.velocity_defect  # (*batch, nv) or several of them
         defect = _finite(defect / scale.repeat(defect.shape[-1] // len(scale)))
-        rms = defect.square().mean(-1, keepdim=True).sqrt()
+        squared = defect.square().mean(-1, keepdim=True)
+        rms = (squared + TINY).sqrt() - TINY**0.5  # finite slope at rest
         token = self.training_range.clamp_features(features)
         token = torch.cat((token, defect, change), -1).to(self.dtype)
         return Encoded(features, token, change, (rms / GATE_SCALE).clamp_max(1.0))

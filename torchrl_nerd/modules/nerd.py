@@ -41,6 +41,9 @@ class History(Protocol):
         """Empty the history of ``rows`` (bool ``(num_envs,)``)."""
         ...
 
+    def restore(self, past: Any, rows: Tensor) -> None:
+        """Take the history of ``rows`` from a `copy.copy` of this one, made before."""
+
 
 class Network(Protocol):
     """What every network can do; `step` takes the history that its own kind makes."""

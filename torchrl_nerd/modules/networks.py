@@ -37,6 +37,9 @@ class NoMemory:
     def clear(self, rows: Tensor) -> None:
         """Nothing to forget."""
 
+    def restore(self, past: "NoMemory", rows: Tensor) -> None:
+        """Nothing to remember."""
+
 
 class MLP(nn.Module):
     """The transformer without its attention: a history of one (the Markov model)."""
@@ -88,6 +91,10 @@ class HiddenState:
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
         self.value = torch.where(rows[:, None], 0.0, self.value)
+
+    def restore(self, past: "HiddenState", rows: Tensor) -> None:
+        """See `History.restore`."""
+        self.value = torch.where(rows[:, None], past.value, self.value)
 
 
 class GRU(nn.Module):

@@ -50,6 +50,22 @@ class KeyValueCache:
         for past in (*self.keys, *self.values):
             past[rows] = 0.0  # whatever stood there, a masked NaN would still spread
 
+    def __copy__(self) -> "KeyValueCache":
+        """Apart from the original, which is written to in place."""
+        keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
+        return KeyValueCache(keys, values, self.age, self.slot)
+
+    def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
+        """See `History.restore`: its rings turned to where the oldest token lies now."""
+        size, mask = self.keys[0].shape[2], rows[:, None, None, None]
+        slots = torch.arange(size, device=rows.device)
+        turned = (slots + past.slot - self.slot) % size
+        for now, then in ((self.keys, past.keys), (self.values, past.values)):
+            for layer, ring in enumerate(then):
+                ring = ring.index_select(2, turned)
+                now[layer] = torch.where(mask, ring, now[layer])
+        self.age = torch.where(rows, past.age, self.age)
+
     def write(self, layer: int, key: Tensor, value: Tensor) -> None:
         """Store one token ``(rows, heads, head width)``; with gradients, out of place."""
         for past, new in ((self.keys, key), (self.values, value)):
@@ -240,6 +256,11 @@ class TokenWindow:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
         self.tokens = torch.where(rows[:, None, None], 0.0, self.tokens)
         self.age = self.age.masked_fill(rows, 0)
+
+    def restore(self, past: "TokenWindow", rows: Tensor) -> None:
+        """See `History.restore`."""
+        self.tokens = torch.where(rows[:, None, None], past.tokens, self.tokens)
+        self.age = torch.where(rows, past.age, self.age)
 
     def append(self, token: Tensor) -> Tensor:
         """Add a token to every row; returns the index it got, ``(rows,)``."""

@@ -283,6 +283,7 @@ class Scene:
         return BasePose(self.base, self.fixed_base_pose)
 
     @cached_property
+    @torch.inference_mode(False)
     def _radii(self) -> Tensor:
         return torch.as_tensor(self.contacts.radii)
 

@@ -95,4 +95,5 @@ class FrankaGravityReachTorque(FrankaReachTorque):
 
 def _peak(x: Tensor) -> Tensor:
     """About one half at zero, falling like e^-x; x must not be negative."""
-    return 1.0 / (x.exp() + (-x).exp() + EPSILON)
+    small = (-x).exp()  # never e^x, which overflows, and its slope with it
+    return small / (1.0 + small.square() + EPSILON * small)
