@@ -33,13 +33,10 @@ def unaffected(method: Function) -> Function:
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        device = self.device.type
-        is_inference, has_grad = (
-            torch.is_inference_mode_enabled(),
-            torch.is_grad_enabled(),
-        )
-        is_plain = not (is_inference or torch.is_autocast_enabled(device))
-        if is_plain or torch.compiler.is_compiling():
+        if torch.compiler.is_compiling():  # round it, this has been done
+            return method(self, *args, **kwargs)
+        device, has_grad = self.device.type, torch.is_grad_enabled()
+        if not (torch.is_inference_mode_enabled() or torch.is_autocast_enabled(device)):
             return method(self, *args, **kwargs)
         with torch.autocast(device, enabled=False), torch.inference_mode(False):
             with torch.set_grad_enabled(has_grad):

@@ -284,16 +284,16 @@ class SceneEnv(EnvBase):
         if not self._is_differentiable:
             action = action.detach()
         state, moves = self._state(), tensordict.get("_step", None)
-        is_partial = moves is not None and not moves.all()
-        past = self.dynamics.history() if is_partial else None
-        found = self._transit(state, action, self._age)
-        moves = 1 if moves is None else moves.reshape(self.batch_size)
-        if is_partial:
-            self.dynamics.restore(past, ~moves)
-            found = self._hold(found, ~moves, tensordict)
+        held = None if moves is None or moves.all() else ~moves.reshape(self.batch_size)
+        past = None if held is None else self.dynamics.history()
+        found, age = self._transit(state, action, self._age), self._age + 1
+        if held is not None:
+            self.dynamics.restore(past, held)
+            found = self._hold(found, held, tensordict)
+            age = torch.where(held, self._age, age)
         if self.recorder is not None:
             self.recorder.record(state, action, found["joint_torque"], found[FAULT])
-        return self._hand_out(found, {"_age": self._age + moves})
+        return self._hand_out(found, {"_age": age})
 
     def _hold(
         self, found: dict[str, Tensor], rows: Tensor, tensordict: TensorDictBase

@@ -58,6 +58,12 @@ class NoMotion:
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """See `Dynamics.reset`; there is no past."""
 
+    def history(self) -> None:
+        """See `Dynamics.history`."""
+
+    def restore(self, history: object, rows: Tensor) -> None:
+        """See `Dynamics.restore`."""
+
     def step(
         self,
         state: TensorDictBase,
