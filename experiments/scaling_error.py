@@ -18,7 +18,7 @@ from torch import Generator
 
 from torchrl_nerd.checkpoint import CARD, load_checkpoint
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import is_sound, simulate
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors

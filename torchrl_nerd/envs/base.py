@@ -17,7 +17,7 @@ from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import REASONS, FaultRecorder
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
-from torchrl_nerd.envs.transition import Transition
+from torchrl_nerd.envs.transition import Transition, given_state
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
@@ -73,10 +73,10 @@ class SceneEnv(EnvBase):
         dump_dir: Path | None = None,
     ) -> None:
         expect_at_least(1, num_envs=num_envs)
+        names = [f"'{part.scene.name}'" for part in (task, dynamics)]
         if dynamics.scene.hash != task.scene.hash:
             raise ValueError(
-                f"the task is for scene '{task.scene.name}', the dynamics for "
-                f"'{dynamics.scene.name}'"
+                "the task is for scene {}, the dynamics for {}".format(*names)
             )
         super().__init__(
             device=expect_device(str(device)), batch_size=torch.Size([num_envs])
@@ -87,14 +87,13 @@ class SceneEnv(EnvBase):
         self._transition = Transition(task, dynamics)
         self._transit = self._transition.step
         self._restart = self._transition.restart
+        inner = self._torch_dynamics
+        self._is_differentiable = inner is not None and inner.differentiable
         self.recorder: FaultRecorder | None = None
         if dump_dir is not None:
             about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
-            inner = self._torch_dynamics
             model = inner.model if isinstance(inner, NeRDDynamics) else None
             self.recorder = FaultRecorder(dump_dir, about, model)
-        inner = self._torch_dynamics
-        self._is_differentiable = inner is not None and inner.differentiable
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
         for name in ("_episode", "_age"):
@@ -118,8 +117,7 @@ class SceneEnv(EnvBase):
     def compile(self, *, warmup: int | None = None, **kwargs: Any) -> "SceneEnv":
         """Make one compiled piece of a step, and one of a reset; returns the env itself.
 
-        TorchRL calls it for ``compile=`` in a constructor; its own would compile the
-        bookkeeping, in many pieces. Without a compiler, eager with one warning.
+        TorchRL calls it for ``compile=``. Without a compiler, eager with one warning.
 
         Args:
             warmup: eager steps before the first compiled one; 1 where not given.
@@ -184,14 +182,11 @@ class SceneEnv(EnvBase):
         actions = shape(self.task.controller.num_actions)
         self.action_spec = Bounded(-1.0, 1.0, actions, device, torch.float32)
         self.reward_spec = Unbounded(shape(1), device, torch.float32)
-        flags = ("done", "terminated", "truncated")
-        self.full_done_spec = Composite(
-            {name: column(2, torch.bool) for name in flags}, shape=rows, device=device
-        )
+        flags = {k: column(2, torch.bool) for k in ("done", "terminated", "truncated")}
+        self.full_done_spec = Composite(flags, shape=rows, device=device)
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
-        """A state is set where ``set_state=True`` says so, never because it is there."""
-        return False
+        return False  # a state is set only where ``set_state=True`` says so
 
     @property
     def seed(self) -> int:
@@ -239,7 +234,12 @@ class SceneEnv(EnvBase):
         if rows is None:
             rows = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         rows = rows.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
-        given = self._given_state(tensordict, rows) if set_state else {}
+        given: dict[str, Tensor] = {}
+        if set_state:
+            given = given_state(tensordict, rows, self._state_sizes)
+            given[QPOS] = normalize_pos(self.scene.layout, given[QPOS])
+            if not self._is_differentiable:
+                given = {key: value.detach() for key, value in given.items()}
         old = self._state()
         if rows.all():  # nothing of the past is left: no gradients of it either
             old = {key: value.detach() for key, value in old.items()}
@@ -249,29 +249,6 @@ class SceneEnv(EnvBase):
         result = self._hand_out(found, {"_episode": episode, "_age": age})
         self.dynamics.reset(result, rows)
         return result
-
-    def _given_state(
-        self, tensordict: TensorDictBase | None, rows: Tensor
-    ) -> dict[str, Tensor]:
-        """The state that ``reset(td, set_state=True)`` asks for."""
-        given = {} if tensordict is None else tensordict
-        missing = [key for key in (QPOS, QVEL) if key not in given.keys()]
-        if missing:
-            raise ValueError(f"set_state needs {missing} in the tensordict")
-        values = {}
-        for key, size in self._state_sizes.items():
-            value, expected = given.get(key, None), (*self.batch_size, size)
-            if value is None:
-                continue
-            if value.shape != expected:
-                raise ValueError(
-                    f"expected {key} of shape {expected}, got {tuple(value.shape)}"
-                )
-            if not value[rows].isfinite().all():
-                raise ValueError(f"expected finite {key} to set the state to")
-            value = value.to(self.device, torch.float64, copy=True)
-            values[key] = value if self._is_differentiable else value.detach()
-        return values | {QPOS: normalize_pos(self.scene.layout, values[QPOS])}
 
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -300,8 +277,7 @@ class SceneEnv(EnvBase):
     ) -> dict[str, Tensor]:
         """``found``, but ``rows`` are as they were before the step and earn nothing.
 
-        Flags and the like are those that ``tensordict`` shows; its observation may be one
-        of a transform, so it is made anew of the state.
+        Flags are those of ``tensordict``; a transform may have changed its observation.
         """
         none, streams = rows & False, (self._keys, self._episode, self._offsets)
         shown = self._restart(self._state(), none, streams, {})

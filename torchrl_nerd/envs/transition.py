@@ -4,8 +4,10 @@ Functions of tensors with one memory, the history that the dynamics keeps, so th
 of a control step can be compiled into one piece.
 """
 
+from collections.abc import Mapping
+
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compat import graph_break
@@ -144,3 +146,35 @@ class Transition:
             OBSERVATION: self.task.observation(start).to(torch.float32),
             **{flag: torch.zeros_like(column) for flag in flags},  # (num_envs, 1) each
         }
+
+
+def given_state(
+    tensordict: TensorDictBase | None, rows: Tensor, sizes: Mapping[str, int]
+) -> dict[str, Tensor]:
+    """The state that ``reset(td, set_state=True)`` asks for, float64 copies.
+
+    Args:
+        tensordict: with ``qpos``, ``qvel`` and, where they vary, the task's parameters.
+        rows: ``(num_envs,)``, envs that are reset; only their state must be finite.
+        sizes: width of each key of the state.
+
+    Raises:
+        ValueError: a key that is missing, of another shape or not finite.
+    """
+    given = {} if tensordict is None else tensordict
+    missing = [key for key in (QPOS, QVEL) if key not in given.keys()]
+    if missing:
+        raise ValueError(f"set_state needs {missing} in the tensordict")
+    values = {}
+    for key, size in sizes.items():
+        value, expected = given.get(key, None), (len(rows), size)
+        if value is None:
+            continue
+        if value.shape != expected:
+            raise ValueError(
+                f"expected {key} of shape {expected}, got {tuple(value.shape)}"
+            )
+        if not value[rows].isfinite().all():
+            raise ValueError(f"expected finite {key} to set the state to")
+        values[key] = value.to(rows.device, torch.float64, copy=True)
+    return values
