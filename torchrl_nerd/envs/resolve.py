@@ -65,9 +65,11 @@ def resolve_model(name: str | Path, scene: Scene) -> Model:
         return from_pretrained(scene.name, scene)  # its refusal says how to make one
     if found in KINDS:
         kind = {"nerd": "learned"}.get(found, found)
+        step = " --step STEP" if found == "hybrid" else ""
         raise ValueError(
             f"no {kind} model of '{scene.name}' is shipped: train one with `nerd train "
-            f"{scene.name} --kind {kind}` and give its folder, or use dynamics 'analytic'"
+            f"{scene.name} --kind {kind}{step}` and give its folder; `nerd explain "
+            f"{scene.name}` names the analytic steps that suit it"
         )
     if found in ENGINES:
         raise ValueError(f"expected a model, got the engine '{found}'")

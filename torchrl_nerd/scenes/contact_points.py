@@ -143,8 +143,9 @@ def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
         local, radius = np.array(list(product((-1, 1), repeat=3))) * size, 0.0
     else:
         raise ValueError(
-            f"{name} that can touch the ground is a {kind}; expected sphere, capsule or "
-            "box"
+            f"{name} of body '{model.body(model.geom_bodyid[geom]).name}', which can touch "
+            f"the ground, is a {kind}; expected sphere, capsule or box, or contype and "
+            "conaffinity that keep it from the ground"
         )
     turn = quat_matrix(model.geom_quat[geom])
     return local @ turn.T + model.geom_pos[geom], float(radius)
