@@ -21,7 +21,7 @@ STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu bench-check results model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu bench-check results model-ant model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -88,16 +88,26 @@ results: $(STAMP) ## errors and rates of every dynamics of every robot, to resul
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained
 
+model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
+	$(NERD) data ant --out datasets/ant
+	$(NERD) train ant --data datasets/ant --threads 1 --out runs/ant
+	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 8000 --seed 11 \
+		--out datasets/ant_run
+	$(NERD) train ant --init-from runs/ant/best --data datasets/ant datasets/ant_run \
+		--steps 12000 --rollout-steps 4000 --rollout-lr-ratio 0.25 --bf16-fraction 0.8 \
+		--lr 0.005 --adamw-lr 0.0015 --validate-every 2000 --threads 1 --out runs/ant_on
+	cp runs/ant_on/best/* $(PRETRAINED)/ant/
+
 model-ant-mlp: $(STAMP) ## the Ant's learned model: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp
-	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --use-symmetry \
+	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --single-step-fraction 1 \
 		--steps 46000 --rollout-steps 6000 --rollout-restarts 2 --bf16-fraction 0.85 \
 		--validate-every 5000 --out runs/ant_mlp
 	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant_mlp/best --out runs/ppo_ant \
 		--horizon 16 --minibatch 8192 --lr 1e-3 --total-frames 8000000 --episodes 512
 	$(NERD) data ant --policy runs/ppo_ant --trajectories 12000 --out datasets/ant_policy
 	$(NERD) train ant --init-from runs/ant_mlp/best --data datasets/ant_mlp datasets/ant_policy \
-		--network mlp-4x160 --use-symmetry --bf16-fraction 0.85 \
+		--network mlp-4x160 --single-step-fraction 1 --bf16-fraction 0.85 \
 		--steps 12000 --rollout-steps 4000 --rollout-restarts 1 --lr 0.004 --adamw-lr 0.0012 \
 		--rollout-lr-ratio 0.25 --validate-every 2000 --out runs/ant_policy
 	cp runs/ant_policy/best/* $(PRETRAINED)/ant-mlp/

@@ -57,7 +57,7 @@ GENERATED = [
 RESULTS = {  # row of README -> scene, case, learned model
     "Cartpole": ("cartpole", "passive", "cartpole"),
     "double pendulum": ("double_pendulum", "terrain 1", "double_pendulum"),
-    "Ant": ("ant", "passive", "ant-mlp"),
+    "Ant": ("ant", "passive", "ant"),
     "ANYmal": ("anymal", "standing", "anymal-mlp"),
     "Franka": ("franka", "random", "franka-mlp"),
     "cube": ("cube", "toss", "cube-mlp"),

@@ -95,7 +95,7 @@ def read_checkpoint(
 def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> Model:
     """A shipped model by its name, or one of your own by its folder.
 
-    The name of a scene stands for its learned model, ``ant`` for ``ant-mlp``, where no
+    The name of a scene stands for its learned model, ``cube`` for ``cube-mlp``, where no
     folder has that name.
 
     Raises:

@@ -29,7 +29,7 @@ KINDS = ("nerd", "hybrid", "analytic")
 
 
 def model_name(name: str | Path, scene: Scene) -> str:
-    """The model that a name stands for: ``"ant-mlp"`` for ``"nerd"`` or ``"ant"``.
+    """The model that a name stands for: ``"cube-mlp"`` for ``"nerd"`` or ``"cube"``.
 
     What stands for nothing else, or for nothing at all, is returned as it is.
     """

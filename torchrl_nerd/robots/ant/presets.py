@@ -14,18 +14,17 @@ PUBLISHED = {  # paper, Fig. 3
 }
 PRESET = Preset(
     EvaluationProtocol({"passive": AntRun()}, (100, 500), PUBLISHED),
-    DataConfig(trajectories=50_000, steps=100),
-    TrainConfig(  # the first stage of ant-mlp; `make model-ant-mlp` continues it
-        network="mlp-4x160",
+    DataConfig(trajectories=30_000, steps=100),
+    TrainConfig(  # the first stage of the model ant; `make model-ant` continues it
+        network="transformer-4x128",
         predicted_force=True,
-        steps=46_000,
-        rollout_steps=6_000,
-        rollout_restarts=2,
-        single_step_fraction=1.0,
+        steps=24_000,
+        rollout_steps=2_000,
+        single_step_fraction=0.85,
         use_symmetry=True,
         loss_eps=0.02,
-        validate_every=5_000,
-        bf16_fraction=0.85,
+        validate_every=4_000,
+        bf16_fraction=0.9,
     ),
     task="ant/run",
 )
