@@ -88,14 +88,17 @@ results: $(STAMP) ## errors and rates of every dynamics of every robot, to resul
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained
 
+ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rollout-restarts 1 --threads 1
+
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
-	$(NERD) data ant --out datasets/ant
-	$(NERD) train ant --data datasets/ant --threads 1 --out runs/ant
+	$(NERD) data ant --trajectories 30000 --out datasets/ant
+	$(NERD) train ant --data datasets/ant $(ANT_TRANSFORMER) --steps 24000 --rollout-steps 2000 \
+		--bf16-fraction 0.9 --validate-every 4000 --out runs/ant_transformer
 	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 8000 --seed 11 \
 		--out datasets/ant_run
-	$(NERD) train ant --init-from runs/ant/best --data datasets/ant datasets/ant_run \
-		--steps 12000 --rollout-steps 4000 --rollout-lr-ratio 0.25 --bf16-fraction 0.8 \
-		--lr 0.005 --adamw-lr 0.0015 --validate-every 2000 --threads 1 --out runs/ant_on
+	$(NERD) train ant --init-from runs/ant_transformer/best --data datasets/ant datasets/ant_run \
+		$(ANT_TRANSFORMER) --steps 12000 --rollout-steps 4000 --rollout-lr-ratio 0.25 \
+		--bf16-fraction 0.8 --lr 0.005 --adamw-lr 0.0015 --validate-every 2000 --out runs/ant_on
 	cp runs/ant_on/best/* $(PRETRAINED)/ant/
 
 model-ant-mlp: $(STAMP) ## the Ant's learned model: two stages, the second with data along a policy

@@ -209,6 +209,8 @@ def test_an_unknown_scene_is_refused(command, capsys):
         ("train cartpole --batch-size -8", "batch_size of at least 1, got -8"),
         ("train cartpole --network huge", "unknown network 'huge'"),
         ("train cartpole --save-every 0", "save_every of at least 1"),
+        ("train cartpole --lr nan", "lr of at least 0, got nan"),
+        ("eval cartpole --split test", "expected --data with --baselines, --split"),
         ("train cartpole --threads -1", "threads"),
         ("train cartpole --device nowhere", "nowhere"),
         ("eval cartpole --num-trajectories 1", "at least 2, got 1"),

@@ -14,7 +14,7 @@ def expect_at_least(least: float, **settings: float) -> None:
         SettingError: naming the first such setting.
     """
     for name, value in settings.items():
-        if value < least:
+        if not value >= least:  # NaN is not either
             raise SettingError(f"expected {name} of at least {least}, got {value}")
 
 

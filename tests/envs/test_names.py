@@ -1,5 +1,7 @@
 """Names and options of `make_env`: what they mean, and refusals in one sentence."""
 
+from pathlib import Path
+
 import pytest
 from dynamics_helpers import random_model
 
@@ -92,3 +94,10 @@ def test_an_env_of_ones_own_says_what_it_is(generator):
     assert "task='dm_control/pendulum-swingup'" in repr(
         make_env("dm_control/pendulum-swingup", "mujoco")
     )
+
+
+@pytest.mark.parametrize("task", [None, 5, Path("robot")])
+@pytest.mark.parametrize("dynamics", ["analytic", "mujoco"])
+def test_what_is_no_task_is_refused(task, dynamics):
+    said = refusal(lambda: make_env(task, dynamics))
+    assert f"unknown task {task!r}, expected one of" in said

@@ -87,6 +87,8 @@ class Eval(MeasuringCommand):
         """
         if self.data is not None:
             return self.run_recorded(self.data)
+        if self.baselines or self.split != "all" or self.states != STATES:
+            raise ValueError("expected --data with --baselines, --split or --states")
         scene = load_scene(self.scene)
         expect_at_least(2, num_trajectories=self.num_trajectories)
         solver_name = mujoco_name(self.ground_truth(scene).scene)

@@ -119,9 +119,9 @@ class TorchDynamics:
         """
         check_step(self.scene, state, joint_torque, terrain)
         there, here = state[QPOS].device, self.device
-        qpos, qvel = state[QPOS].to(here), state[QVEL].to(here)
+        qpos, qvel = (state[key].to(here, torch.float64) for key in (QPOS, QVEL))
         qpos = normalize_pos(self.scene.layout, qpos)
-        ground = None if terrain is None else terrain.to(here)
+        ground = None if terrain is None else terrain.to(qpos)
         self._prepare(len(qpos))
         given = qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
         with torch.set_grad_enabled(self.differentiable):

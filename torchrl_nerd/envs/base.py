@@ -70,7 +70,7 @@ class SceneEnv(EnvBase):
         num_envs: int = 1,
         seed: int | None = None,
         device: torch.device | str = "cpu",
-        dump_dir: Path | None = None,
+        dump_dir: Path | str | None = None,
     ) -> None:
         expect_at_least(1, num_envs=num_envs)
         names = [f"'{part.scene.name}'" for part in (task, dynamics)]
@@ -93,7 +93,7 @@ class SceneEnv(EnvBase):
         if dump_dir is not None:
             about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
             model = inner.model if isinstance(inner, NeRDDynamics) else None
-            self.recorder = FaultRecorder(dump_dir, about, model)
+            self.recorder = FaultRecorder(Path(dump_dir), about, model)
         self._make_specs()
         zeros = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
         for name in ("_episode", "_age"):

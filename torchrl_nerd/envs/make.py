@@ -41,13 +41,13 @@ class GroundTruthEnv(SceneEnv):
         num_envs: int = 1,
         seed: int | None = None,
         device: torch.device | str = "cpu",
-        dump_dir: Path | None = None,
+        dump_dir: Path | str | None = None,
     ) -> None:
         if engine not in ENGINES:
             raise ValueError(
                 f"unknown engine {engine!r}, expected one of {', '.join(ENGINES)}"
             )
-        task = make_task(task) if isinstance(task, str) else task
+        task = task if isinstance(task, Task) else make_task(task)
         dynamics = ENGINES[engine](task.scene, expect_device(str(device)))
         super().__init__(task, dynamics, num_envs, seed, device, dump_dir)
 
@@ -86,10 +86,10 @@ class NeRDEnv(SceneEnv):
         device: torch.device | str = "cpu",
         inference: Inference = "streaming",
         guard: Guard | None = None,
-        dump_dir: Path | None = None,
+        dump_dir: Path | str | None = None,
         differentiable: bool = False,
     ) -> None:
-        task = make_task(task) if isinstance(task, str) else task
+        task = task if isinstance(task, Task) else make_task(task)
         name = type(model).__name__
         if not isinstance(model, Model):
             given, model = model, resolve_model(model, task.scene)
@@ -113,7 +113,7 @@ def make_env(
     seed: int | None = None,
     device: torch.device | str = "cpu",
     guard: Guard | None = None,
-    dump_dir: Path | None = None,
+    dump_dir: Path | str | None = None,
     compile: bool = False,
     differentiable: bool = False,
 ) -> SceneEnv:

@@ -67,10 +67,10 @@ def make_task(name: str) -> Task:
     """
     if name in TASKS:
         return TASKS[name]()
-    if name.startswith("dm_control/"):
+    if isinstance(name, str) and name.startswith("dm_control/"):
         return SuiteTask(name)
     raise ValueError(
-        f"unknown task '{name}', expected one of {', '.join(TASKS)} or "
+        f"unknown task {name!r}, expected one of {', '.join(TASKS)} or "
         "dm_control/DOMAIN-TASK"
     )
 
