@@ -88,7 +88,8 @@ results: $(STAMP) ## errors and rates of every dynamics of every robot, to resul
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained
 
-ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rollout-restarts 1 --threads 1
+ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rollout-restarts 1 \
+	--save-every 500 --threads 1
 
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 30000 --out datasets/ant
