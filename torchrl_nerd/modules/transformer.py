@@ -3,9 +3,8 @@
 NeRD section 3.4 recomputes its last ten tokens at every step, with absolute positions.
 Here each layer sees a token and the ``band - 1`` before it, and positions are relative (a
 learned bias per head and offset). A token is written in its own base frame and never
-changes as time moves on, so its keys and values are kept in a ring. Depth widens the
-view: ``layers * (band - 1) + 1`` tokens reach the output, in training as in streaming.
-`WindowNetwork` is the paper's inference.
+changes as time moves on, so its keys and values are kept in a ring. The output depends on
+``layers * (band - 1) + 1`` tokens. `WindowNetwork` is the paper's way.
 """
 
 from dataclasses import asdict, dataclass
@@ -211,9 +210,8 @@ class CausalTransformer(nn.Module):
             if size < (2 if name == "band" else 1):
                 raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
-            raise ValueError(
-                f"expected heads to divide width {config.width}, got {config.heads}"
-            )
+            sizes = f"width {config.width}, got {config.heads}"
+            raise ValueError(f"expected heads to divide {sizes}")
         self.config = config
         self.embed = FullLinear(num_inputs, config.width)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
@@ -231,8 +229,9 @@ class CausalTransformer(nn.Module):
         """A history of nothing for ``rows`` rows."""
         c, weight = self.config, self.embed.weight
         shape = (rows, c.heads, c.band - 1, c.width // c.heads)
-        keys = [weight.new_zeros(shape) for _ in range(c.layers)]
-        values = [torch.zeros_like(key) for key in keys]
+        keys, values = (
+            [weight.new_zeros(shape) for _ in range(c.layers)] for _ in "kv"
+        )
         age = torch.zeros(rows, dtype=torch.long, device=weight.device)
         return KeyValueCache(keys, values, age, slot=age.new_zeros(1))
 
@@ -264,11 +263,10 @@ class TokenWindow:
 
     def append(self, token: Tensor) -> Tensor:
         """Add a token to every row; returns the index it got, ``(rows,)``."""
-        size = self.tokens.shape[1]
-        is_full = (self.age >= size)[:, None, None]
-        tokens = torch.where(is_full, self.tokens.roll(-1, 1), self.tokens)
-        index = self.age.clamp_max(size - 1)
-        # (rows, size): where the new token goes
+        size, is_full = self.tokens.shape[1], self.age >= self.tokens.shape[1]
+        rolled = self.tokens.roll(-1, 1)
+        tokens = torch.where(is_full[:, None, None], rolled, self.tokens)
+        index = self.age.clamp_max(size - 1)  # (rows,)
         slots = torch.arange(size, device=token.device) == index[:, None]
         self.tokens = torch.where(slots[..., None], token[:, None], tokens)
         self.age = (self.age + 1).clamp_max(size)
@@ -284,14 +282,13 @@ class WindowNetwork(nn.Module):
 
     def empty_memory(self, rows: int) -> TokenWindow:
         """A window without tokens."""
-        like = next(self.network.parameters())
-        return TokenWindow(rows, self.size, self.width, like)
+        weight = next(self.network.parameters())
+        return TokenWindow(rows, self.size, self.width, weight)
 
     def step(self, token: Tensor, memory: TokenWindow) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
-        index = memory.append(token)
-        outputs = self.network(memory.tokens)
-        return outputs[torch.arange(len(token), device=token.device), index]
+        last = torch.arange(len(token), device=token.device), memory.append(token)
+        return self.network(memory.tokens)[last]
 
 
 TRANSFORMERS = {
