@@ -1,6 +1,11 @@
 """Settings of a configuration class that are out of range."""
 
+from collections.abc import Mapping
+from typing import TypeVar
+
 import torch
+
+Value = TypeVar("Value")
 
 
 class SettingError(ValueError):
@@ -16,6 +21,18 @@ def expect_at_least(least: float, **settings: float) -> None:
     for name, value in settings.items():
         if not value >= least:  # NaN is not either
             raise SettingError(f"expected {name} of at least {least}, got {value}")
+
+
+def look_up(what: str, name: str, known: Mapping[str, Value]) -> Value:
+    """The entry of that name.
+
+    Raises:
+        SettingError: there is none; it lists those that there are.
+    """
+    if name not in known:
+        names = ", ".join(known)
+        raise SettingError(f"unknown {what} '{name}', expected one of {names}")
+    return known[name]
 
 
 def expect_device(name: str) -> torch.device:

@@ -5,8 +5,8 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
+from torchrl_nerd.modules.networks import TRANSFORMERS
 from torchrl_nerd.modules.transformer import (
-    TRANSFORMERS,
     CausalTransformer,
     FullLinear,
     TransformerConfig,

@@ -15,7 +15,7 @@ from torchrl_nerd.configs import (
     UnconstrainedConfig,
 )
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.settings import SettingError
+from torchrl_nerd.settings import look_up
 
 __all__ = [
     "STEPS",
@@ -48,10 +48,7 @@ def step_config(name: str) -> StepConfig:
     Raises:
         SettingError: no such step.
     """
-    if name not in STEPS:
-        known = ", ".join(STEPS)
-        raise SettingError(f"unknown analytic step '{name}', expected one of {known}")
-    return STEPS[name]
+    return look_up("analytic step", name, STEPS)
 
 
 def default_step(scene: Scene) -> StepConfig:

@@ -14,7 +14,7 @@ from torchrl_nerd.evaluation.rollout_error import scene_of
 from torchrl_nerd.evaluation.traces import compare_traces
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.robots import load_scene, protocol_of
-from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.settings import expect_at_least, look_up
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,9 @@ class Plot(DeviceCommand):
         expect_at_least(2, trajectories=self.trajectories)
         protocol = protocol_of(scene)
         case = self.case or next(iter(protocol.cases))
-        if case not in protocol.cases:
-            known = ", ".join(protocol.cases)
-            raise ValueError(f"unknown case '{case}', expected one of {known}")
+        source = look_up("case", case, protocol.cases)
         steps = min(protocol.horizons) if self.steps is None else self.steps
         expect_at_least(1, steps=steps)
-        source = protocol.cases[case]
         place, name = scene_of(source), self.dynamics
         model = resolve_model(name, scene)
         model = model if place is scene else model.with_terrain(place)

@@ -8,18 +8,18 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled, unaffected
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
-from torchrl_nerd.envs.faults import REASONS, FaultRecorder
+from torchrl_nerd.envs.faults import FaultRecorder
+from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition, given_state
 from torchrl_nerd.geometry.manifold import normalize_pos
-from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, QPOS, QVEL, TRUST
+from torchrl_nerd.keys import ACTION, FAULT, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_at_least, expect_device
 from torchrl_nerd.tasks import Task
@@ -73,10 +73,10 @@ class SceneEnv(EnvBase):
         dump_dir: Path | str | None = None,
     ) -> None:
         expect_at_least(1, num_envs=num_envs)
-        names = [f"'{part.scene.name}'" for part in (task, dynamics)]
         if dynamics.scene.hash != task.scene.hash:
             raise ValueError(
-                "the task is for scene {}, the dynamics for {}".format(*names)
+                f"the task is for scene '{task.scene.name}', the dynamics for "
+                f"'{dynamics.scene.name}'"
             )
         super().__init__(
             device=expect_device(str(device)), batch_size=torch.Size([num_envs])
@@ -94,7 +94,11 @@ class SceneEnv(EnvBase):
             about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
             model = inner.model if isinstance(inner, NeRDDynamics) else None
             self.recorder = FaultRecorder(Path(dump_dir), about, model)
-        self._make_specs()
+        sizes, is_guarded = self._state_sizes, self.guard is not None
+        for name, spec in make_specs(
+            task, sizes, self.batch_size, self.device, is_guarded
+        ):
+            setattr(self, name, spec)
         zeros = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
         for name in ("_episode", "_age"):
             self.register_buffer(name, zeros.long())
@@ -155,35 +159,6 @@ class SceneEnv(EnvBase):
     def _state_sizes(self) -> dict[str, int]:
         model = self.scene.model
         return {QPOS: model.nq, QVEL: model.nv, **self.task.parameters}
-
-    def _make_specs(self) -> None:
-        rows, device = self.batch_size, self.device
-
-        def shape(width: int) -> torch.Size:
-            return torch.Size((*rows, width))
-
-        def column(num_values: int, dtype: torch.dtype) -> TensorSpec:
-            return Categorical(num_values, shape(1), device, dtype)
-
-        sizes = {**self._state_sizes, "joint_torque": len(self.scene.actuated)}
-        state: dict[str, TensorSpec] = {
-            key: Unbounded(shape(size), device, torch.float64)
-            for key, size in sizes.items()
-        }
-        if self.guard:
-            state[TRUST] = Bounded(0.0, 1.0, shape(1), device, torch.float32)
-        # what `reset` takes with ``set_state``: transforms hand on nothing else
-        given = {key: state[key].clone() for key in self._state_sizes}
-        self.state_spec = Composite(given, shape=rows, device=device)
-        state[FAULT] = column(len(REASONS), torch.int64)
-        observed = shape(self.task.observation_size)
-        state[OBSERVATION] = Unbounded(observed, device, torch.float32)
-        self.observation_spec = Composite(state, shape=rows, device=device)
-        actions = shape(self.task.controller.num_actions)
-        self.action_spec = Bounded(-1.0, 1.0, actions, device, torch.float32)
-        self.reward_spec = Unbounded(shape(1), device, torch.float32)
-        flags = {k: column(2, torch.bool) for k in ("done", "terminated", "truncated")}
-        self.full_done_spec = Composite(flags, shape=rows, device=device)
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         return False  # a state is set only where ``set_state=True`` says so

@@ -9,14 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.modules.transformer import (
-    TRANSFORMERS,
     FeedForward,
     FullLinear,
     TransformerConfig,
     initialize,
     make_head,
 )
-from torchrl_nerd.settings import SettingError
+from torchrl_nerd.settings import look_up
 
 
 @dataclass(frozen=True)
@@ -125,6 +124,13 @@ class GRU(nn.Module):
 
 NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 
+TRANSFORMERS = {
+    "transformer-2x64": TransformerConfig(2, 64, 4),
+    "transformer-2x96": TransformerConfig(2, 96, 4),
+    "transformer-4x128": TransformerConfig(4, 128, 4),
+    "paper": TransformerConfig(6, 192, 12),
+    "paper-large": TransformerConfig(6, 384, 12),
+}
 NETWORKS: dict[str, NetworkConfig] = {
     **TRANSFORMERS,
     "mlp-1x16": MLPConfig(depth=1, width=16),
@@ -146,7 +152,4 @@ def network_config(name: str) -> NetworkConfig:
     Raises:
         SettingError: no such network.
     """
-    if name not in NETWORKS:
-        known = ", ".join(NETWORKS)
-        raise SettingError(f"unknown network '{name}', expected one of {known}")
-    return NETWORKS[name]
+    return look_up("network", name, NETWORKS)

@@ -210,8 +210,9 @@ class CausalTransformer(nn.Module):
             if size < (2 if name == "band" else 1):
                 raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
-            sizes = f"width {config.width}, got {config.heads}"
-            raise ValueError(f"expected heads to divide {sizes}")
+            raise ValueError(
+                f"expected heads to divide width {config.width}, got {config.heads}"
+            )
         self.config = config
         self.embed = FullLinear(num_inputs, config.width)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
@@ -229,9 +230,8 @@ class CausalTransformer(nn.Module):
         """A history of nothing for ``rows`` rows."""
         c, weight = self.config, self.embed.weight
         shape = (rows, c.heads, c.band - 1, c.width // c.heads)
-        keys, values = (
-            [weight.new_zeros(shape) for _ in range(c.layers)] for _ in "kv"
-        )
+        keys = [weight.new_zeros(shape) for _ in range(c.layers)]
+        values = [torch.zeros_like(key) for key in keys]
         age = torch.zeros(rows, dtype=torch.long, device=weight.device)
         return KeyValueCache(keys, values, age, slot=age.new_zeros(1))
 
@@ -263,9 +263,9 @@ class TokenWindow:
 
     def append(self, token: Tensor) -> Tensor:
         """Add a token to every row; returns the index it got, ``(rows,)``."""
-        size, is_full = self.tokens.shape[1], self.age >= self.tokens.shape[1]
-        rolled = self.tokens.roll(-1, 1)
-        tokens = torch.where(is_full[:, None, None], rolled, self.tokens)
+        size = self.tokens.shape[1]
+        is_full = (self.age >= size)[:, None, None]
+        tokens = torch.where(is_full, self.tokens.roll(-1, 1), self.tokens)
         index = self.age.clamp_max(size - 1)  # (rows,)
         slots = torch.arange(size, device=token.device) == index[:, None]
         self.tokens = torch.where(slots[..., None], token[:, None], tokens)
@@ -287,14 +287,6 @@ class WindowNetwork(nn.Module):
 
     def step(self, token: Tensor, memory: TokenWindow) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
-        last = torch.arange(len(token), device=token.device), memory.append(token)
-        return self.network(memory.tokens)[last]
-
-
-TRANSFORMERS = {
-    "transformer-2x64": TransformerConfig(2, 64, 4),
-    "transformer-2x96": TransformerConfig(2, 96, 4),
-    "transformer-4x128": TransformerConfig(4, 128, 4),
-    "paper": TransformerConfig(6, 192, 12),
-    "paper-large": TransformerConfig(6, 384, 12),
-}
+        index = memory.append(token)  # (rows,)
+        outputs = self.network(memory.tokens)
+        return outputs[torch.arange(len(token), device=token.device), index]

@@ -10,6 +10,7 @@ from torch import Generator
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.stability.case import Case, Metrics, Trial
 from torchrl_nerd.evaluation.stability.cases import CASES
+from torchrl_nerd.settings import look_up
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,7 @@ def choose_cases(names: list[str] | None) -> list[Case]:
     Raises:
         ValueError: no such case.
     """
-    for name in names or []:
-        if name not in CASES:
-            known = ", ".join(CASES)
-            raise ValueError(f"unknown case '{name}', expected one of {known}")
-    return [CASES[name] for name in names or CASES]
+    return [look_up("case", name, CASES) for name in names or CASES]
 
 
 def run_cases(

@@ -1,0 +1,54 @@
+"""Specs of an env: what TorchRL may expect of its states, actions and flags."""
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+
+from torchrl_nerd.envs.faults import REASONS
+from torchrl_nerd.keys import FAULT, OBSERVATION, TRUST
+from torchrl_nerd.tasks import Task
+
+
+def make_specs(
+    task: Task,
+    state_sizes: Mapping[str, int],
+    rows: torch.Size,
+    device: torch.device,
+    is_guarded: bool,
+) -> Iterator[tuple[str, TensorSpec]]:
+    """Name and value of every spec.
+
+    Args:
+        task: what is observed and how wide an action is.
+        state_sizes: width of each key of the state.
+        rows: batch size of the env.
+        device: of all tensors.
+        is_guarded: whether steps have a ``trust``.
+    """
+
+    def shape(width: int) -> torch.Size:
+        return torch.Size((*rows, width))
+
+    def column(num_values: int, dtype: torch.dtype) -> TensorSpec:
+        return Categorical(num_values, shape(1), device, dtype)
+
+    sizes = {**state_sizes, "joint_torque": len(task.scene.actuated)}
+    state: dict[str, TensorSpec] = {
+        key: Unbounded(shape(size), device, torch.float64)
+        for key, size in sizes.items()
+    }
+    if is_guarded:
+        state[TRUST] = Bounded(0.0, 1.0, shape(1), device, torch.float32)
+    # what `reset` takes with ``set_state``: transforms hand on nothing else
+    given = {key: state[key].clone() for key in state_sizes}
+    yield "state_spec", Composite(given, shape=rows, device=device)
+    state[FAULT] = column(len(REASONS), torch.int64)
+    observed = shape(task.observation_size)
+    state[OBSERVATION] = Unbounded(observed, device, torch.float32)
+    yield "observation_spec", Composite(state, shape=rows, device=device)
+    actions = shape(task.controller.num_actions)
+    yield "action_spec", Bounded(-1.0, 1.0, actions, device, torch.float32)
+    yield "reward_spec", Unbounded(shape(1), device, torch.float32)
+    flags = {k: column(2, torch.bool) for k in ("done", "terminated", "truncated")}
+    yield "full_done_spec", Composite(flags, shape=rows, device=device)
