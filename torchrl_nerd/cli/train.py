@@ -24,7 +24,6 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training import ranks
 from torchrl_nerd.training.log import LoggerName
 from torchrl_nerd.training.start import begin_from, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
@@ -37,8 +36,7 @@ class Train(DeviceCommand):
     """Train a model of a scene, by default with the settings of its training preset.
 
     Robots without a preset share one. Missing data are generated first. An interrupted
-    run resumes with the same command. Several processors or GPUs share one training with
-    torchrun --nproc-per-node 2 -m torchrl_nerd.cli train SCENE
+    run resumes with the same command.
 
     Example: nerd train cartpole --out runs/cartpole --network mlp-4x64
 
@@ -126,10 +124,8 @@ class Train(DeviceCommand):
         preset, (out, folders) = preset_of(self.scene), self.folders
         initial = self.initial(scene)
         writable_folder(out)
-        ranks.join(torch.device(self.device))
-        if ranks.rank() == 0 and _is_missing(folders):
+        if _is_missing(folders):
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
-        ranks.wait()
         if self.threads:
             torch.set_num_threads(self.threads)
         protocol = protocol_of(scene)
@@ -148,12 +144,10 @@ class Train(DeviceCommand):
         )
         trainer.run()
         chosen = out / preset.exports
-        card, is_first = read_json(chosen / "card.json"), ranks.rank() == 0
-        ranks.leave()
-        if is_first:
-            if self.export is not None:
-                save_checkpoint(load_checkpoint(chosen, scene), self.export, card)
-            print(f"{preset.exports} checkpoint in {chosen}: {_errors(card)}")
+        card = read_json(chosen / "card.json")
+        if self.export is not None:
+            save_checkpoint(load_checkpoint(chosen, scene), self.export, card)
+        print(f"{preset.exports} checkpoint in {chosen}: {_errors(card)}")
         return card
 
 

@@ -9,7 +9,6 @@ from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training import ranks
 from torchrl_nerd.transforms import StateDelta, Stats
 
 PART = 1024  # trajectories turned into tokens at a time
@@ -34,12 +33,11 @@ def data_stats(
 def stats_of(
     tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
 ) -> dict[NestedKey, Stats]:
-    """Exact statistics of tokens and targets over a data set, each rank's part of it."""
-    size = min(PART, -(-len(data) // ranks.world()))
-    mine = data.split(size)[ranks.rank() :: ranks.world()]
-    pairs = [map(Stats.of, raw_tokens(tokens, state_delta, part)) for part in mine]
-    merged = map(Stats.merge_all, zip(*pairs, strict=True))
-    return dict(zip((TOKEN, TARGET), map(ranks.merge_stats, merged), strict=True))
+    """Exact statistics of tokens and targets over a data set."""
+    parts = (raw_tokens(tokens, state_delta, part) for part in data.split(PART))
+    stats = ([Stats.of(values) for values in part] for part in parts)
+    token, target = map(Stats.merge_all, zip(*stats, strict=True))
+    return {TOKEN: token, TARGET: target}
 
 
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,6 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
-from torchrl_nerd.training import ranks
 from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.log import LoggerName, TrainingLog, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
@@ -41,8 +40,6 @@ STATE = "state.json"  # card of a run that can be resumed
 
 class Trainer:
     """Trains a model on one data set; `run` continues where the folder's run stopped.
-
-    Under `torchrun` every rank computes its share of each batch, see `training.ranks`.
 
     The folder holds checkpoints ``last`` and ``best`` (averaged weights), the ``state`` of
     the run and ``log.csv``; `open_logger` says where metrics go besides.
@@ -79,9 +76,6 @@ class Trainer:
         logger: LoggerName = "tensorboard",
         init_from: NeRD | None = None,
     ) -> None:
-        ranks.expect_shares(
-            batch_size=config.batch_size, rollout_batch_size=config.rollout_batch_size
-        )
         if data.batch_size[1] < config.longest:
             raise ValueError(
                 f"expected trajectories of at least {config.longest} steps, "
@@ -90,7 +84,7 @@ class Trainer:
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.validation = Validation(source, horizons, random_actions)
-        self.quiet = quiet or ranks.rank() > 0
+        self.quiet = quiet
         self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
         self._build(data, init_from)
@@ -137,11 +131,9 @@ class Trainer:
     def run(self, until: int | None = None) -> NeRD:
         """Train to the end, or to update ``until``; returns the averaged model."""
         last = min(until or self.config.total_steps, self.config.total_steps)
-        log = None
-        if ranks.rank() == 0:
-            settings = {"scene": self.scene.name, **asdict(self.config)}
-            logger = open_logger(self.logger, self.folder, self.step, settings)
-            log = TrainingLog(self.folder, self.step, logger)
+        settings = {"scene": self.scene.name, **asdict(self.config)}
+        logger = open_logger(self.logger, self.folder, self.step, settings)
+        log = TrainingLog(self.folder, self.step, logger)
         began = time.monotonic() - self.seconds
         how = {"desc": f"train {self.scene.name}", "disable": self.quiet}
         with tqdm(total=self.config.total_steps, initial=self.step, **how) as bar:
@@ -149,17 +141,15 @@ class Trainer:
                 loss = self.update()
                 self.step += 1
                 self.errors = {}
-                if log is not None and self._is_due(self.config.validate_every):
+                if self._is_due(self.config.validate_every):
                     found = self.validate()
                     log.write({"step": self.step, "loss": float(loss), **found})
                     bar.set_postfix({k: f"{v:.2g}" for k, v in found.items()})
-                if log is not None and self._is_due(self.config.save_every):
+                if self._is_due(self.config.save_every):
                     self.seconds = time.monotonic() - began
                     self.save()
                 bar.update()
-        if log is not None:
-            log.close()
-        ranks.wait()  # for the files that rank 0 writes
+        log.close()
         return self.averaged_model()
 
     def _is_due(self, every: int) -> bool:
@@ -176,13 +166,12 @@ class Trainer:
             loss = loss_of(generator)
         loss.backward()
         parameters = list(self.model.network.parameters())
-        loss = ranks.average_gradients(parameters, loss)
         norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
         if norm.isfinite():
             for optimizer in self.optimizers.values():
                 optimizer.step()
         self._update_average()
-        return loss
+        return loss.detach()
 
     def _set_learning_rates(self) -> None:
         ratio = learning_rate_ratio(self.config, self.step)
@@ -198,8 +187,7 @@ class Trainer:
         count, length = config.batch_size, config.sequence_length
         if torch.rand((), generator=generator) < config.single_step_fraction:
             count, length = count * length, 1  # more diverse: neighbours are alike
-        batch = self.sequences.one_step(count, length, generator)
-        inputs, targets = batch[0].each(ranks.share), ranks.share(batch[1])
+        inputs, targets = self.sequences.one_step(count, length, generator)
         changes = inputs.change(self.model.network(inputs.token).float())
         return one_step_loss(changes, targets, config.loss_eps)
 
@@ -207,10 +195,8 @@ class Trainer:
         """Loss of the model's own rollouts."""
         config = self.config
         sizes = config.rollout_batch_size, config.rollout_length
-        qpos, qvel, torque, ground = self.sequences.rollout(*sizes, generator)
-        ground = None if ground is None else ranks.share(ground)
-        states = ranks.share(qpos), ranks.share(qvel), ranks.share(torque)
-        return rollout_loss(self.model, *states, ground, config.loss_eps)
+        batch = self.sequences.rollout(*sizes, generator)
+        return rollout_loss(self.model, *batch, config.loss_eps)
 
     def _autocast(self) -> AbstractContextManager:
         is_coarse = self.step < self.config.bf16_fraction * self.config.steps
