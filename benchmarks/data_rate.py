@@ -21,11 +21,17 @@ from tyro.conf import Positional
 
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import generate
-from torchrl_nerd.dynamics.mujoco import CONTROL, torque_model
+from torchrl_nerd.dynamics.mujoco import torque_model
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
+
+CONTROL = int(  # applied force, and where the ground is
+    mujoco.mjtState.mjSTATE_QFRC_APPLIED
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
 
 
 @dataclass

@@ -15,7 +15,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2] / "torchrl_nerd"
 LEAVES = {"__version__", "compat", "compiled", "files"}
-LEAVES |= {"seeds", "settings"}
+LEAVES |= {"locks", "seeds", "settings"}
 LEVELS = (
     {"keys", "configs", "geometry", "tensor_files"},
     {"scenes"},

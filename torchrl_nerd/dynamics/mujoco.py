@@ -1,13 +1,14 @@
-"""Ground truth: all envs through MuJoCo's thread-pooled rollout in one call."""
+"""Ground truth: all envs through MuJoCo's batch of simulations in one call."""
 
 import copy
+import ctypes
 import os
-from typing import Any, cast
+from weakref import WeakSet
 
 import mujoco
-import mujoco.rollout
 import numpy as np
 import torch
+from mujoco.batch import Batch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -16,11 +17,6 @@ from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import silence_mujoco
-
-STATE: Any = mujoco.mjtState
-CONTROL = int(
-    STATE.mjSTATE_QFRC_APPLIED | STATE.mjSTATE_MOCAP_POS | STATE.mjSTATE_MOCAP_QUAT
-)
 
 
 def torque_model(scene: Scene) -> mujoco.MjModel:
@@ -42,12 +38,16 @@ def feels_forces(scene: Scene) -> bool:
 
 
 def default_threads() -> int:
-    """``NERD_THREADS`` for workers that share a machine, otherwise all processors.
+    """``NERD_THREADS`` for workers that share a machine, or all processors allowed.
 
     Raises:
         ValueError: the variable holds no number of threads.
     """
-    said = os.environ.get("NERD_THREADS") or str(os.cpu_count() or 1)
+    try:
+        allowed = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        allowed = os.cpu_count() or 1
+    said = os.environ.get("NERD_THREADS") or str(allowed)
     if not said.isdecimal() or int(said) < 1:
         raise ValueError(f"expected NERD_THREADS to be a number, got {said!r}")
     return int(said)
@@ -56,13 +56,13 @@ def default_threads() -> int:
 class MujocoDynamics:
     """MuJoCo itself, substeps and threads in C, no Python loop over envs.
 
-    The solver's warm start is carried from step to step (it changes results by less than
-    the solver's tolerance) and cleared for envs that are reset.
+    The solver's warm start is carried from step to step, as ``mj_step`` does (it changes
+    results by less than the solver's tolerance), and cleared for envs that are reset.
 
     Args:
         scene: robot, ground and substeps.
-        num_threads: worker threads; by default as many as the environment variable
-            ``NERD_THREADS`` says, or all processors.
+        num_threads: that step; by default as many as the environment variable
+            ``NERD_THREADS`` says, or all processors that the process may use.
     """
 
     kind = "ground truth"
@@ -70,32 +70,35 @@ class MujocoDynamics:
     def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
         self.scene = scene
         self.num_threads = num_threads or default_threads()
-        self._start()
+        self._start(np.zeros((0, scene.model.nv)))
 
-    def _start(self) -> None:
+    def _start(self, warmstart: np.ndarray) -> None:
+        """Simulations, one for each row of the warm start ``(rows, nv)``."""
         self._model = torque_model(self.scene)
-        self._data = [mujoco.MjData(self._model) for _ in range(self.num_threads)]
-        self._pool = mujoco.rollout.Rollout(nthread=self.num_threads)
-        self._warmstart = np.zeros((0, self._model.nv))
-        self._felt = np.zeros((0, self._model.nsensordata))
+        self._batch: Batch | None = None
+        self._warmstart = warmstart
+        if len(warmstart):
+            batch = Batch(self._model, len(warmstart), self.num_threads)
+            self._batch, self._warmstart = batch, batch.bind("qacc_warmstart")
+            self._warmstart[:] = warmstart
+        _STARTED.add(self)
 
     def __getstate__(self) -> dict:
         """Threads do not travel: a copy in another process starts its own."""
-        kept = ("scene", "num_threads", "_warmstart", "_felt")
-        return {name: copy.copy(self.__dict__[name]) for name in kept}
+        kept = ("scene", "num_threads")
+        state = {name: self.__dict__[name] for name in kept}
+        return {**state, "warmstart": self._warmstart.copy()}
 
     def __setstate__(self, state: dict) -> None:
         self.scene, self.num_threads = state["scene"], state["num_threads"]
-        self._start()
-        self.__dict__.update(state)
+        self._start(state["warmstart"])
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Clear the warm start of ``rows (num_envs,)``; see `Dynamics.reset`."""
         count = state[QPOS].shape[0]
-        if rows is None or len(self._warmstart) != count:
-            self._warmstart = np.zeros((count, self._model.nv))
-        else:
-            self._warmstart[rows.cpu().numpy()] = 0.0
+        if len(self._warmstart) != count:
+            self._start(np.zeros((count, self._model.nv)))
+        self._warmstart[slice(None) if rows is None else rows.cpu().numpy()] = 0.0
 
     def history(self) -> np.ndarray:
         """See `Dynamics.history`: the warm start."""
@@ -113,10 +116,15 @@ class MujocoDynamics:
         """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
         check_step(self.scene, state, joint_torque, terrain)
         states = self.rollout(state, joint_torque[:, None], terrain)
-        last = cast(TensorDictBase, states[:, 0])
+        last = TensorDict(
+            {key: x[:, 0] for key, x in states.items()}, len(joint_torque)
+        )
         if feels_forces(self.scene):
-            last[SENSORDATA] = torch.from_numpy(self._felt).to(last.device)
-        return last
+            felt = np.zeros((0, self._model.nsensordata))
+            if self._batch is not None:
+                felt = self._batch.bind("sensordata").copy()
+            last[SENSORDATA] = torch.from_numpy(felt)
+        return last.to(state[QPOS].device)
 
     def rollout(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
@@ -132,59 +140,61 @@ class MujocoDynamics:
             ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo
             gave up on.
         """
-        qpos, qvel = (as_numpy(state[key]) for key in (QPOS, QVEL))
-        fine = self._substeps(qpos, qvel, self._control(joint_torque, terrain))
-        timestep, nq, nv = self._model.opt.timestep, self._model.nq, self._model.nv
-        velocity = slice(1 + nq, 1 + nq + nv)  # of MuJoCo's state: time, qpos, qvel
-        before = fine[:, -2, velocity] if fine.shape[1] > 1 else qvel
-        with np.errstate(invalid="ignore"):  # infinite envs are found below
-            self._warmstart = (fine[:, -1, velocity] - before) / timestep
-        states = fine[:, self.scene.substeps - 1 :: self.scene.substeps]
-        # an env that MuJoCo gave up on stopped before the end: its clock is behind
-        clock = self.scene.control_step * np.arange(1, states.shape[1] + 1)
-        is_late = abs(states[:, :, 0] - clock) > 0.5 * timestep
-        position = np.ascontiguousarray(states[:, :, 1 : velocity.start])
-        speed = np.ascontiguousarray(states[:, :, velocity])
-        if is_late.any():
-            position[is_late], speed[is_late] = np.nan, np.nan
-            self._warmstart[is_late[:, -1]] = 0.0
-        device = state[QPOS].device
-        values = {QPOS: torch.from_numpy(position), QVEL: torch.from_numpy(speed)}
-        return TensorDict(values, [*states.shape[:2]]).to(device)
-
-    def _control(self, joint_torque: Tensor, terrain: Tensor | None) -> np.ndarray:
-        """MuJoCo's control vector, ``(rows, T, size)``: applied force, ground's pose."""
-        size = mujoco.mj_stateSize(self._model, CONTROL)
-        control = np.zeros((*joint_torque.shape[:-1], size))
-        control[..., self.scene.actuated] = as_numpy(joint_torque)
-        pose, data = ground_pose(self.scene, terrain), self._data[0]
-        fixed = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
-        varied = fixed if pose is None else as_numpy(pose)[:, None]
-        control[..., self._model.nv :] = varied
-        return control
-
-    def _substeps(
-        self, qpos: np.ndarray, qvel: np.ndarray, control: np.ndarray
-    ) -> np.ndarray:
-        """The state after every substep, ``(rows, T * substeps, state)``."""
-        rows = len(qpos)
-        size = mujoco.mj_stateSize(self._model, STATE.mjSTATE_FULLPHYSICS)
-        self._felt = np.zeros((rows, self._model.nsensordata))
-        if not rows:  # MuJoCo itself would crash
-            return np.zeros((0, control.shape[1] * self.scene.substeps, size))
-        start = np.zeros((rows, size))  # time, qpos, qvel, and what is left at zero
-        known = np.concatenate((qpos, qvel), 1)
-        start[:, 1 : 1 + known.shape[1]] = known
+        rows, length = joint_torque.shape[:2]
         if len(self._warmstart) != rows:
-            self._warmstart = np.zeros((rows, self._model.nv))
+            self.reset(state)
+        qpos = np.empty((rows, length, self._model.nq))
+        qvel = np.empty((rows, length, self._model.nv))
+        batch = self._batch
+        if batch is not None and length:
+            pose = ground_pose(self.scene, terrain)
+            self._place(batch, as_numpy(state[QPOS]), as_numpy(state[QVEL]), pose)
+            torque, is_whole = as_numpy(joint_torque), np.ones(rows, bool)
+            for t in range(length):
+                self._advance(batch, torque[:, t], is_whole)
+                qpos[:, t], qvel[:, t] = batch.bind(QPOS), batch.bind(QVEL)
+        values = {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
+        return TensorDict(values, [rows, length]).to(state[QPOS].device)
+
+    def _place(
+        self, batch: Batch, qpos: np.ndarray, qvel: np.ndarray, pose: Tensor | None
+    ) -> None:
+        """Put every simulation at a state, and the ground where it belongs."""
+        batch.bind("time")[:] = 0.0
+        batch.bind(QPOS)[:], batch.bind(QVEL)[:] = qpos, qvel
+        if pose is not None:
+            place, turn = np.split(as_numpy(pose), [3 * self._model.nmocap], 1)
+            for key, value in (("mocap_pos", place), ("mocap_quat", turn)):
+                target = batch.bind(key)
+                target[:] = value.reshape(target.shape)
+
+    def _advance(self, batch: Batch, torque: np.ndarray, is_whole: np.ndarray) -> None:
+        """One control step; a simulation with a warning is NaN, and whole no longer."""
+        batch.bind("qfrc_applied")[:, self.scene.actuated] = torque
+        counts = batch.warning[..., 1]  # (rows, kinds of warning), as they stand now
+        before = counts.copy()
+        ids = None if is_whole.all() else np.flatnonzero(is_whole)
         with silence_mujoco():
-            states, felt = self._pool.rollout(
-                self._model,
-                self._data,
-                start,
-                np.repeat(control, self.scene.substeps, 1),
-                control_spec=CONTROL,
-                initial_warmstart=self._warmstart,
-            )
-        self._felt = felt[:, -1].copy()
-        return states
+            batch.step(ids, nstep=self.scene.substeps)
+        is_whole &= (counts == before).all(-1)
+        batch.bind(QPOS)[~is_whole] = np.nan
+        batch.bind(QVEL)[~is_whole] = np.nan
+        self._warmstart[~is_whole] = 0.0
+
+
+_STARTED: WeakSet[MujocoDynamics] = WeakSet()
+
+
+def _restart_all() -> None:
+    """New threads in a process that was forked, where the old ones are not.
+
+    Freeing the old ones would wait for them, so they are kept.
+    """
+    for dynamics in list(_STARTED):
+        if dynamics._batch is not None:
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(dynamics._batch))
+            dynamics._start(dynamics._warmstart.copy())
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_restart_all)

@@ -17,6 +17,7 @@ import numpy as np
 
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
+from torchrl_nerd.locks import fork_safe_lock
 
 JOINT, IN_PARENT, TENDON = (
     int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}"))
@@ -31,15 +32,27 @@ Refusal = tuple[str, Any, Callable[[int], Any] | None]
 """What, a flag of the model or one per object, and how to get an object by its index."""
 
 
+_silent: list[Any] = []  # what MuJoCo called before, once per block of `silence_mujoco`
+_LOCK = fork_safe_lock()
+
+
 @contextmanager
 def silence_mujoco() -> Iterator[None]:
-    """Neither warnings on the terminal nor a MUJOCO_LOG.TXT in the working folder."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
+    """Neither warnings on the terminal nor a MUJOCO_LOG.TXT in the working folder.
+
+    What MuJoCo calls is one for all threads: the last that leaves such a block puts back
+    what the first found.
+    """
+    with _LOCK:
+        _silent.append(_silent[0] if _silent else mujoco.get_mju_user_warning())
+        mujoco.set_mju_user_warning(lambda message: None)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(before)
+        with _LOCK:
+            before = _silent.pop()
+            if not _silent:
+                mujoco.set_mju_user_warning(before)
 
 
 def check_supported(name: str, model: mujoco.MjModel) -> None:

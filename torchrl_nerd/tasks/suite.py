@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
+from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.importer import load_suite
@@ -107,7 +108,8 @@ class SuiteReward:
     """Reset distribution, reward, observation and end of one task, env by env.
 
     The suite's `Task` reads a `Physics`. Here that `Physics` is never stepped: a state is
-    written in and only what the suite reads is brought up to date.
+    written in and only what the suite reads is brought up to date. A task may be shared by
+    threads: they take turns.
 
     | attribute | meaning |
     |---|---|
@@ -212,6 +214,9 @@ def _bytes(model: mujoco.MjModel) -> np.ndarray:
     return buffer
 
 
+_ONE_AT_A_TIME = fork_safe_lock()
+
+
 class _RowMemo:
     """A slow function of rows; a row that is the same as last time keeps its answer."""
 
@@ -221,6 +226,10 @@ class _RowMemo:
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Answers to ``rows (n, k)``; of the same n and k as last time, or all anew."""
+        with _ONE_AT_A_TIME:  # one `Physics`, written in and read
+            return self._answer(rows)
+
+    def _answer(self, rows: np.ndarray) -> np.ndarray:
         is_known = np.zeros(len(rows), bool)
         if rows.shape == self._given.shape:  # bit for bit: NaN equals NaN
             is_known = (rows.view(np.int64) == self._given.view(np.int64)).all(-1)
