@@ -24,8 +24,8 @@ from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.robots import PRESETS, SCENES, load_scene, protocol_of
 
-NOTHING_RANDOM = ("doctor", "replay", "explain")
-SOON_DONE = ("plot", "explain", "replay")
+NOTHING_RANDOM = ("doctor", "explain")
+SOON_DONE = ("plot", "explain")
 QUICK = ("cube",)  # the others take minutes in all
 TINY = [
     "--network",

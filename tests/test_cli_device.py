@@ -6,9 +6,7 @@ from helpers import EXCERPT
 
 from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.cli.command import DeviceCommand
-from torchrl_nerd.envs import make_env
 from torchrl_nerd.evaluation.policy import Policy, save_policy
-from torchrl_nerd.keys import ACTION
 
 WITH_DEVICE = [
     name for name, kind in COMMANDS.items() if issubclass(kind, DeviceCommand)
@@ -23,7 +21,6 @@ SMALL = {
     "plot": "cartpole --trajectories 2 --steps 2",
     "bench": "cartpole --batches 1 --num-trajectories 2 --rounds 1 --steps 2",
     "stability": "cartpole --cases batching",
-    "replay": "faults/fault_action.safetensors",
 }
 
 each_command = pytest.mark.parametrize("command", WITH_DEVICE)
@@ -54,9 +51,6 @@ def prepared(tmp_path, monkeypatch):
     sizes = ["--trajectories", "8", "--steps", "20", "--quiet", "--out", "set"]
     assert main(["data", "cartpole", *sizes]) == 0
     save_policy(Policy((4, 8, 1)), tmp_path / "policy")
-    env = make_env("cartpole/swingup", dump_dir=tmp_path / "faults")
-    start = env.reset()
-    env.step(start.set(ACTION, torch.full_like(env.action_spec.zero(), torch.nan)))
 
 
 def test_commands_that_run_a_model_have_a_device_and_no_others():

@@ -12,16 +12,14 @@ from dynamics_helpers import (
     inference_of,
     junk_fill,
     random_actions,
-    random_model,
     reset_rows,
     start_at,
     unequal_keys,
 )
+from safetensors import safe_open
 from tensordict import TensorDict
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
-from torchrl_nerd.cli.main import main
-from torchrl_nerd.cli.replay import read_dump, replay
 from torchrl_nerd.modules.nerd import NeRD
 
 ROWS, STEPS = 4, 3
@@ -175,7 +173,8 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     after = act(env, bad)
     assert after["fault"][:, 0].tolist() == [int(i == row) for i in range(ROWS)]
     (path,) = tmp_path.iterdir()
-    about, dump = read_dump(path)
+    with safe_open(path, framework="pt") as file:
+        about, dump = file.metadata(), {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
     assert about["reason"] == "action" and about["env"] == str(row)
     assert torch.equal(dump["qpos"][1:], good["qpos"][row])
     assert ("features" in dump.keys()) == isinstance(model, NeRD)
@@ -186,16 +185,4 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     stamp = path.stat().st_mtime_ns
     act(env, bad)
     assert path.stat().st_mtime_ns == stamp
-    steps = replay(dump, random_model(env.scene, generator))
-    assert len(steps) == 4 and all(step["speed"] < 1e4 for step in steps)
-
-
-def test_the_command_replays_a_dump(generator, tmp_path, capsys):
-    env = GroundTruthEnv("cartpole/swingup", num_envs=2, dump_dir=tmp_path)
-    env.reset()
-    act(env, torch.full(env.action_spec.shape, torch.inf))
-    assert main(["replay", str(tmp_path / "fault_action.safetensors")]) == 0
-    assert "action in env 0 of cartpole" in capsys.readouterr().out
-    (tmp_path / "other").write_text("no dump")
-    assert main(["replay", str(tmp_path / "other")]) == 2
-    assert "expected a fault's dump" in capsys.readouterr().err
+    assert all(len(value) == 4 for value in dump.values())

@@ -19,7 +19,6 @@ from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
 from torchrl_nerd.cli.play import Play
 from torchrl_nerd.cli.plot import Plot
-from torchrl_nerd.cli.replay import Replay
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
@@ -38,7 +37,6 @@ COMMANDS: dict[str, type[Command]] = {
     "explain": Explain,
     "bench": Bench,
     "stability": Stability,
-    "replay": Replay,
     "doctor": Doctor,
 }
 

@@ -48,7 +48,7 @@ class SceneEnv(EnvBase):
         seed: of the resets; where none is given one is drawn, so that workers that make
             their own env differ.
         device: where states, observations and rewards live.
-        dump_dir: where the first fault of each kind leaves a dump for `nerd replay`.
+        dump_dir: where the first fault of each kind leaves a dump of its last steps.
 
     Raises:
         ValueError: no envs, no such device, a dynamics of another scene, or a folder that

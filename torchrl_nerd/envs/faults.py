@@ -1,4 +1,4 @@
-"""What can go wrong in an env, found env by env, and written down to be replayed.
+"""What can go wrong in an env, found env by env, and written to a file.
 
 A fault ends its env as ``terminated`` at its last good state and leaves the others bitwise
 as they are. With a folder, the first fault of each kind leaves a dump there: the last
@@ -52,7 +52,7 @@ class FaultRecorder:
 
     Args:
         folder: where; made if it is not there.
-        about: names of the ``scene`` and of the ``dynamics``, for the replay.
+        about: names of the ``scene`` and of the ``dynamics``, kept in the dump.
         model: of a learned one; its ``features (T, F)`` go into the dump.
 
     Raises:
