@@ -11,11 +11,13 @@ from pathlib import Path
 
 import tyro
 from equal_error import RESULTS, reports
+from matplotlib.figure import Figure
 
 from torchrl_nerd.evaluation.bench.report import BenchReport, pareto_front
-from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
 
 FIGURES = RESULTS.parent / "docs" / "figures"
+# The colors of Okabe and Ito are told apart by every eye: https://jfly.uni-koeln.de/color/
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 MARKERS = {"simulator": "o", "analytic": "s", "hybrid": "D", "learned": "^"}
 PANELS = 3  # most quantities that are drawn: of an arm, its first and its last joint
 
@@ -39,7 +41,8 @@ def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> Non
     batch = batch or report.batch
     units = {row.quantity: row.unit for row in report.errors}
     shown = list(units) if len(units) <= PANELS else [list(units)[0], list(units)[-1]]
-    figure, panels = make_figure(len(shown), height=4.0 * len(shown), share_x=False)
+    figure = Figure(figsize=(7.0, 4.0 * len(shown)), layout="constrained")
+    panels = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     kinds = {row.name: row.kind for row in report.rates}
     for axes, quantity in zip(panels, shown, strict=True):
         points = {
@@ -73,7 +76,8 @@ def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> Non
         )
         axes.tick_params(which="minor", labelsize=7)  # larger ones cover each other
         axes.legend(frameon=False, fontsize=7)
-    save_figure(figure, path)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
 
 
 def main(options: Options) -> list[Path]:

@@ -4,7 +4,7 @@
     python examples/ppo.py --dynamics mujoco     # the same in MuJoCo: nothing else changes
     python examples/ppo.py --task ant/run        # any task; its settings: tasks/ppo.py
 
-MuJoCo only measures. Policy, numbers and pictures are written to `--out`.
+MuJoCo only measures. Policy, learning curve and returns are written to `--out`.
 """
 
 import logging
@@ -28,9 +28,9 @@ from torchrl_nerd import make_env
 from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import stack_frames
-from torchrl_nerd.evaluation.plots import plot_learning_curve
 from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
 from torchrl_nerd.evaluation.policy_transfer import mean_returns, report_transfer
+from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.tasks import Task
 
@@ -47,7 +47,7 @@ class Run(PPOConfig):
     seed: int = 0  # of weights, exploration and starts
     evaluate_every: int = 20  # updates between two points of the learning curve
     episodes: int = 2048  # of the final evaluation
-    out: Path = Path("runs/ppo")  # folder for policy, numbers, pictures
+    out: Path = Path("runs/ppo")  # folder for policy and numbers
 
 
 def parse(kind: type[Run] = Run) -> Run:
@@ -140,7 +140,7 @@ def main(cfg: Run, collect: Callable = collect) -> None:
     torch.manual_seed(cfg.seed)
     policy, curve = train(cfg, collect=collect)
     save_policy(policy, cfg.out, asdict(cfg))
-    plot_learning_curve(curve, cfg.out / "learning_curve.png")
+    write_json(cfg.out / "learning_curve.json", {"curve": curve})
     where = cfg.task, make_actor(policy), cfg.dynamics
     report_transfer(*where, cfg.episodes, cfg.seed + 2, cfg.out)
 

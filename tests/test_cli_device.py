@@ -18,7 +18,6 @@ SMALL = {
     "finetune": f"cube --from {EXCERPT} --quiet",
     "transfer": "cartpole/swingup --policy policy --episodes 2",
     "play": "cartpole/swingup --steps 2 --quiet",
-    "plot": "cartpole --trajectories 2 --steps 2",
     "bench": "cartpole --batches 1 --num-trajectories 2 --rounds 1 --steps 2",
     "stability": "cartpole --cases batching",
 }

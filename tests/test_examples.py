@@ -2,16 +2,21 @@
 
 import json
 import math
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import tyro
 from dm_control import suite as dm_suite
 from helpers import EXCERPT, slow_but
 
+from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
+from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.evaluation.policy import load_policy
-from torchrl_nerd.robots import make_task
+from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
+from torchrl_nerd.robots import load_scene, make_task, protocol_of
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -75,7 +80,8 @@ def test_ppo_learns_in_one_dynamics_and_is_measured_in_all(
     for summary in returns.values():
         assert summary["episodes"] == 4 and abs(summary["difference"]) < 0.05
     assert "dm_control  " in capsys.readouterr().out
-    assert (tmp_path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    (point,) = json.loads((tmp_path / "learning_curve.json").read_text())["curve"]
+    assert point.keys() == {"frames", "nerd", "mujoco"} and point["frames"] == 64
     card = json.loads((tmp_path / "policy.json").read_text())
     assert card.items() >= {"dynamics": dynamics, "seed": seed, "horizon": 4}.items()
     load_policy(tmp_path, make_task(cfg.task))
@@ -94,3 +100,29 @@ def test_a_log_is_learned_from_and_measured(monkeypatch, capsys):
     finetune_cube.main()
     said = capsys.readouterr().out
     assert all(name in said for name in ("no motion", "before", "after"))
+
+
+@pytest.mark.parametrize(
+    "words", ["double_pendulum --case 'terrain 1'", "cartpole --dynamics analytic"]
+)
+def test_traces_are_drawn(words, monkeypatch, tmp_path, seed, capsys):
+    """A figure, and the errors at its end as `nerd eval` finds them."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import traces
+
+    how = f"{words} --trajectories 4 --steps 5 --seed {seed} --out {tmp_path}/a.png"
+    traces.main(tyro.cli(traces.Options, args=shlex.split(how)))
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    *said, where = capsys.readouterr().out.splitlines()
+    name = words.split()[0]
+    scene = load_scene(name)
+    source = next(iter(protocol_of(scene).cases.values()))
+    model = resolve_model("analytic" if "analytic" in words else "nerd", scene)
+    dynamics = dynamics_of(model.with_terrain(scene_of(source)))
+    ground_truth = MujocoDynamics(dynamics.scene)
+    found = passive_errors(source, dynamics, ground_truth, [5], 4, seed)[5]
+    assert said == [
+        f"{joint}: {error.final:.3g} {error.unit} after 5 steps"
+        for joint, error in found.items()
+    ]
+    assert "4 trajectories" in where

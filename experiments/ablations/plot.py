@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_nerd.evaluation.plots import COLORS, make_figure, save_figure
+from matplotlib.figure import Figure
 
 from .table import Row
 
+LESS, MORE = "#0072B2", "#D55E00"  # of error than the base
 INCHES = 0.22  # per bar
 
 
@@ -19,11 +20,12 @@ def plot_ratios(rows: Sequence[Row], path: Path) -> None:
     """
     cases, variants = list(rows[0].errors), rows[1:]
     height = len(cases) * (1.0 + INCHES * len(variants))
-    figure, panels = make_figure(len(cases), height, share_x=False)
+    figure = Figure(figsize=(7.0, height), layout="constrained")
+    panels = figure.subplots(len(cases), 1, squeeze=False)[:, 0]
     names = [row.name for row in variants]
     for axes, case in zip(panels, cases, strict=True):
         ratios = [row.ratio(case) for row in variants]
-        colors = [COLORS[1] if ratio > 1.0 else COLORS[0] for ratio in ratios]
+        colors = [MORE if ratio > 1.0 else LESS for ratio in ratios]
         shifts = [ratio - 1.0 for ratio in ratios]
         axes.barh(names, shifts, left=1.0, color=colors)
         for name, ratio in zip(names, ratios, strict=True):
@@ -48,4 +50,4 @@ def plot_ratios(rows: Sequence[Row], path: Path) -> None:
         ):
             formatter("{x:g}")
         axes.tick_params(which="both", labelsize=8)
-    save_figure(figure, path)
+    figure.savefig(path, dpi=150)

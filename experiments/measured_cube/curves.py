@@ -8,7 +8,9 @@ Reads the curves that `nerd finetune` writes, and prints when each came to its b
 import argparse
 from pathlib import Path
 
-from torchrl_nerd.evaluation.plots import COLORS, STYLES, make_figure, save_figure
+from matplotlib.figure import Figure
+from toss_plot import COLORS, STYLES
+
 from torchrl_nerd.files import read_json
 from torchrl_nerd.training.finetune import Curve, converged
 
@@ -22,7 +24,8 @@ ERRORS = {"position_m": "error (m)", "orientation_rad": "error (rad)"}
 
 def plot_curves(curves: dict[str, Curve], path: Path) -> None:
     """Both errors on validation tosses over epochs."""
-    figure, panels = make_figure(len(ERRORS), height=4.5)
+    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    panels = figure.subplots(len(ERRORS), 1, sharex=True)
     for panel, (error, label) in zip(panels, ERRORS.items(), strict=True):
         for number, (name, curve) in enumerate(curves.items()):
             epochs = [point["epoch"] for point in curve]
@@ -30,9 +33,10 @@ def plot_curves(curves: dict[str, Curve], path: Path) -> None:
             style = f".{STYLES[number]}"
             panel.plot(epochs, errors, style, color=COLORS[number], label=name)
         panel.set(ylabel=label, yscale="log")
+        panel.grid(alpha=0.3)
     panels[0].legend(frameon=False)
     panels[-1].set_xlabel("epochs")
-    save_figure(figure, path)
+    figure.savefig(path, dpi=150)
 
 
 def main() -> None:

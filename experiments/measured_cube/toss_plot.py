@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchrl_nerd.evaluation.plots import COLORS, STYLES, save_figure
 from torchrl_nerd.geometry.rotations import orientation_error, rotate
 from torchrl_nerd.robots.cube.scene import HALF
 
+COLORS, STYLES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), ("-", "--", ":", "-.")
 OUTLINES = 5  # cubes drawn along the measured path
 FACE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 
@@ -25,11 +26,7 @@ def plot_toss(
         step_size: time between poses, s.
         path: of the PNG.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(3, 1, height_ratios=(2.0, 1.2, 1.2))
     side, height, angle = panels
     along = measured[-1, :2] - measured[0, :2]
@@ -64,7 +61,7 @@ def plot_toss(
     for panel in panels:
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.3)
-    save_figure(figure, path)
+    figure.savefig(path, dpi=150)
 
 
 def _outline(panel, poses: Tensor, origin: Tensor, along: Tensor, color: str) -> None:  # noqa: ANN001

@@ -5,7 +5,6 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_nerd import make_env
-from torchrl_nerd.evaluation.plots import plot_learning_curve
 from torchrl_nerd.evaluation.policy import (
     Policy,
     Standardize,
@@ -167,9 +166,3 @@ def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> Non
     task = make_task("double_pendulum/passive") if damage == "task" else None
     with pytest.raises(ValueError, match=str(tmp_path)):
         load_policy(tmp_path, task)
-
-
-def test_a_learning_curve_is_a_figure(tmp_path) -> None:
-    curve = [{"frames": 10, "nerd": 1.0}, {"frames": 20, "nerd": 2.0}]
-    plot_learning_curve(curve, tmp_path / "curve.png")
-    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")

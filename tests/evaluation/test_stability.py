@@ -15,10 +15,10 @@ from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_cases
 from torchrl_nerd.evaluation.stability.states import (
     clear_of_ground,
+    mechanics,
     sample_states,
     settled_states,
 )
-from torchrl_nerd.evaluation.traces import mechanics
 from torchrl_nerd.robots import SCENES, load_scene
 
 SCALE = 0.001

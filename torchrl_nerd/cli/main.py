@@ -18,7 +18,6 @@ from torchrl_nerd.cli.eval import Eval
 from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
 from torchrl_nerd.cli.play import Play
-from torchrl_nerd.cli.plot import Plot
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
@@ -33,7 +32,6 @@ COMMANDS: dict[str, type[Command]] = {
     "finetune": Finetune,
     "transfer": Transfer,
     "play": Play,
-    "plot": Plot,
     "explain": Explain,
     "bench": Bench,
     "stability": Stability,

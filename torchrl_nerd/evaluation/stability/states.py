@@ -1,10 +1,11 @@
-"""Where cases start: the training range, at rest, in the air, rotated."""
+"""Where cases start: the training range, at rest, in the air; mechanics of a state."""
 
 from functools import cache
 from typing import cast
 
+import mujoco
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -97,3 +98,33 @@ def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
             if given.shape[-1] == POSE_PARAMETERS:
                 given[..., 3:] = quat_multiply(quat, given[..., 3:])
     return states
+
+
+def mechanics(scene: Scene, states: TensorDictBase) -> dict[str, Tensor]:
+    """What MuJoCo computes of each state ``[n]``; NaN where a state is not finite.
+
+    Returns:
+        ``energy (n,)``, kinetic plus that of gravity and joint springs, J; ``com (n, 3)``,
+        m; ``momentum (n, 3)``, kg m/s; ``angular_momentum (n, 3)`` about the centre of
+        mass, kg m^2/s; ``penetration (n,)``, the deepest contact, m. In world axes.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mass, count = float(model.body_mass.sum()), len(states)
+    sizes = {"energy": (), "com": (3,), "momentum": (3,), "angular_momentum": (3,)}
+    found = {
+        key: torch.full((count, *size), torch.nan, dtype=torch.float64)
+        for key, size in {**sizes, "penetration": ()}.items()
+    }
+    both = torch.cat((states[QPOS], states[QVEL]), -1)  # (n, nq + nv)
+    for i in torch.nonzero(both.isfinite().all(-1))[:, 0].tolist():
+        data.qpos[:], data.qvel[:] = both[i].cpu().split((model.nq, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_energyPos(model, data)
+        mujoco.mj_energyVel(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        found["energy"][i] = float(data.energy.sum())
+        found["com"][i] = torch.from_numpy(data.subtree_com[0])
+        found["momentum"][i] = mass * torch.from_numpy(data.subtree_linvel[0])
+        found["angular_momentum"][i] = torch.from_numpy(data.subtree_angmom[0])
+        found["penetration"][i] = max((-c.dist for c in data.contact), default=0.0)
+    return found

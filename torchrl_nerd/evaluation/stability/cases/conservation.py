@@ -14,8 +14,11 @@ from torchrl_nerd.evaluation.stability.case import (
     largest,
     norm,
 )
-from torchrl_nerd.evaluation.stability.states import clear_of_ground, sample_states
-from torchrl_nerd.evaluation.traces import mechanics
+from torchrl_nerd.evaluation.stability.states import (
+    clear_of_ground,
+    mechanics,
+    sample_states,
+)
 from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
 

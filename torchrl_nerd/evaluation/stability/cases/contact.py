@@ -17,7 +17,7 @@ from torchrl_nerd.evaluation.stability.case import (
     largest,
     norm,
 )
-from torchrl_nerd.evaluation.traces import mechanics
+from torchrl_nerd.evaluation.stability.states import mechanics
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import Scene
 
