@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from dynamics_helpers import random_model
 
-from torchrl_nerd import GroundTruthEnv, NeRDEnv, from_pretrained, make_env
+from torchrl_nerd import GroundTruthEnv, NeRDEnv, from_pretrained, load_scene, make_env
 from torchrl_nerd.envs.resolve import ENGINES
-from torchrl_nerd.robots import make_task
+from torchrl_nerd.robots import TASKS, make_task
 
 TASK = "ant/run"
 
@@ -101,3 +101,19 @@ def test_an_env_of_ones_own_says_what_it_is(generator):
 def test_what_is_no_task_is_refused(task, dynamics):
     said = refusal(lambda: make_env(task, dynamics))
     assert f"unknown task {task!r}, expected one of" in said
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_scene_given_for_a_task_and_the_reverse_is_told_what_was_meant(name):
+    scene = name.partition("/")[0]
+    with pytest.raises(ValueError, match=rf"did you mean '{scene}/\w+'\?"):
+        make_env(scene, num_envs=1)
+    with pytest.raises(ValueError, match=rf"did you mean '{scene}'\?"):
+        load_scene(name)
+
+
+def test_a_misspelt_name_is_told_the_nearest():
+    with pytest.raises(ValueError, match=r"did you mean 'cartpole/swingup'\?"):
+        make_env("cartpole/swing_up")
+    with pytest.raises(ValueError, match=r"unknown scene 'xyz', expected"):
+        load_scene("xyz")

@@ -1,5 +1,7 @@
 """Robots, a folder each, registered by being there: the ``ROBOT`` of ``presets.py``."""
 
+from collections.abc import Collection
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
@@ -54,8 +56,8 @@ def load_scene(name: str) -> Scene:
     if is_import(name):
         return import_scene(name)
     raise ValueError(
-        f"unknown scene {name!r}, expected one of {', '.join(SCENES)}, "
-        "dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
+        f"unknown scene {name!r}{_meant(name, SCENES)}, expected one of "
+        f"{', '.join(SCENES)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
     )
 
 
@@ -70,9 +72,18 @@ def make_task(name: str) -> Task:
     if isinstance(name, str) and name.startswith("dm_control/"):
         return SuiteTask(name)
     raise ValueError(
-        f"unknown task {name!r}, expected one of {', '.join(TASKS)} or "
-        "dm_control/DOMAIN-TASK"
+        f"unknown task {name!r}{_meant(name, TASKS)}, expected one of "
+        f"{', '.join(TASKS)} or dm_control/DOMAIN-TASK"
     )
+
+
+def _meant(name: object, known: Collection[str]) -> str:
+    """`` (did you mean 'ant/run'?)`` for the scene of a task, or the like; or nothing."""
+    given = str(name)
+    of_scene = [other for other in known if other.startswith(f"{given}/")]
+    of_task = [other for other in known if given.startswith(f"{other}/")]
+    near = [*of_scene, *of_task, *get_close_matches(given, known, 1)]
+    return f" (did you mean '{near[0]}'?)" if near else ""
 
 
 def task_id(task: Task) -> str:
