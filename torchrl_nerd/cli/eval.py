@@ -24,7 +24,6 @@ from torchrl_nerd.evaluation.recorded_error import (
 from torchrl_nerd.evaluation.results import make_record
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import (
-    PRESETS,
     EvaluationProtocol,
     load_scene,
     protocol_of,
@@ -64,8 +63,6 @@ class Eval(MeasuringCommand):
     reference: Literal["rk4"] | None = None
     """Measure against the reference solver in place of the scene's own: MuJoCo's RK4 at
     four times its substeps."""
-    unseen_terrain: bool = False
-    """On terrain of kinds that no training data have, in place of the paper's."""
     data: Path | None = None
     """Recorded trajectories (npz or CSV) in place of MuJoCo: every window of `states`."""
     split: str = "all"
@@ -82,8 +79,7 @@ class Eval(MeasuringCommand):
         """Print the tables and return their rows.
 
         Raises:
-            ValueError: fewer than 2 trajectories, or a robot that has no such terrain or
-                model.
+            ValueError: fewer than 2 trajectories, or no such robot or model.
         """
         if self.data is not None:
             return self.run_recorded(self.data)
@@ -99,7 +95,7 @@ class Eval(MeasuringCommand):
             "Every row, coarse MuJoCo included, is measured against it."
         )
         rows = []
-        for part in self.measure(scene, self.protocol(scene)):
+        for part in self.measure(scene, protocol_of(scene)):
             rows += part
             title = f"{part[0].case}, {part[0].steps} steps"
             tqdm.write(f"\n{title}\n{error_table(part)}")
@@ -109,22 +105,6 @@ class Eval(MeasuringCommand):
             "ground_truth": solver_name,
             "errors": [asdict(row) for row in rows],
         }
-
-    def protocol(self, scene: Scene) -> EvaluationProtocol:
-        """The scene's own, or the one on unseen terrain.
-
-        Raises:
-            ValueError: unseen terrain of a robot that has none.
-        """
-        if not self.unseen_terrain:
-            return protocol_of(scene)
-        preset = PRESETS.get(self.scene)
-        if preset is None or preset.unseen_terrain is None:
-            known = ", ".join(n for n, p in PRESETS.items() if p.unseen_terrain)
-            raise ValueError(
-                f"no unseen terrain for '{self.scene}', expected one of {known}"
-            )
-        return preset.unseen_terrain
 
     def ground_truth(self, scene: Scene) -> MujocoDynamics:
         """MuJoCo with the scene's own solver or the reference solver."""

@@ -50,9 +50,6 @@ class Preset:
     task: str | None = None  # whose resets validate; None: the scene's sampling ranges
     strategy: str | None = None  # of training states, see `data.strategies`
     exports: Literal["best", "last"] = "best"  # the checkpoint that is the model
-    unseen_terrain: EvaluationProtocol | None = (
-        None  # ground that no training data have
-    )
     recorded: RecordedProtocol | None = None
 
 

@@ -3,7 +3,6 @@
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.robots.double_pendulum.scene import double_pendulum
 from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
-from torchrl_nerd.robots.double_pendulum.unseen_terrain import UNSEEN_TERRAIN
 from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
 
 # Paper, appendix C.2: 100 steps over no ground in reach (0) and grounds 1 to 6.
@@ -38,7 +37,6 @@ PRESET = Preset(
     task="double_pendulum/passive",
     strategy="level",
     exports="last",  # passive starts, which validate, say little about driven motion
-    unseen_terrain=UNSEEN_TERRAIN,
 )
 ROBOT = Robot(
     scenes={"double_pendulum": double_pendulum},

@@ -1,6 +1,5 @@
 """Double pendulum of the NeRD paper over a plane that differs from row to row."""
 
-from collections.abc import Callable
 from functools import cache
 from math import cos, pi, sin
 from pathlib import Path
@@ -11,7 +10,7 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty_law import set_penalty_contact
-from torchrl_nerd.scenes.sampling import GroundSampler, Sampling
+from torchrl_nerd.scenes.sampling import Sampling
 from torchrl_nerd.scenes.scene import Scene
 
 GAIN = 1500.0  # N m per unit of action, both joints; env_pendulum_with_contact
@@ -40,29 +39,7 @@ ASSET = Path(__file__).with_name("double_pendulum.xml")
 @cache
 def double_pendulum() -> Scene:
     """Build the scene. ``qpos`` = hinge angles; zero is both links along +x."""
-    return _scene(mujoco.MjModel.from_xml_path(str(ASSET)), ground=sample_ground)
-
-
-def double_pendulum_over(add_ground: Callable[[mujoco.MjSpec], None]) -> Scene:
-    """The same robot over a fixed ground of any shape, in place of the random plane.
-
-    Args:
-        add_ground: adds shapes to the world; whatever it adds touches the pendulum and
-            has its contact parameters, as the plane does.
-    """
-    spec = mujoco.MjSpec.from_file(str(ASSET))
-    spec.delete(spec.body("ground"))
-    add_ground(spec)
-    for geom in spec.worldbody.geoms:
-        geom.contype, geom.conaffinity = 1, 0
-    return _scene(spec.compile(), clearance=0.0)
-
-
-def _scene(
-    model: mujoco.MjModel,
-    ground: GroundSampler | None = None,
-    clearance: float | None = None,
-) -> Scene:
+    model = mujoco.MjModel.from_xml_path(str(ASSET))
     set_penalty_contact(model, **CONTACT)
     sampling = Sampling(
         qpos_low=(-pi, -pi),
@@ -70,9 +47,8 @@ def _scene(
         qvel_low=(-2 * pi, -4 * pi),
         qvel_high=(2 * pi, 4 * pi),
         torque=(GAIN, GAIN),
-        ground=ground,
-        level_ground=None if ground is None else sample_level_ground,
-        clearance=clearance,
+        ground=sample_ground,
+        level_ground=sample_level_ground,
     )
     controller = TorqueController((GAIN, GAIN))
     return Scene("double_pendulum", model, SUBSTEPS, controller, sampling)

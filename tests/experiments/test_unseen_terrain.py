@@ -3,18 +3,17 @@
 import mujoco
 import pytest
 import torch
+from unseen_terrain import UNSEEN_TERRAIN, Options, double_pendulum_over, main
 
 from torchrl_nerd.checkpoint import from_pretrained
-from torchrl_nerd.cli import main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop
-from torchrl_nerd.files import read_json
 from torchrl_nerd.keys import QPOS
-from torchrl_nerd.robots import PRESETS, load_scene
-from torchrl_nerd.robots.double_pendulum.scene import double_pendulum_over
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
 
-CASES = PRESETS["double_pendulum"].unseen_terrain.cases
+CASES = UNSEEN_TERRAIN.cases
 each_case = pytest.mark.parametrize("case", CASES)
 
 
@@ -68,12 +67,10 @@ def test_other_robots_and_other_features_are_refused():
         model.with_terrain(double_pendulum_over(floor))
 
 
-def test_the_command_measures_them(tmp_path, capsys):
+@pytest.mark.slow
+def test_the_script_measures_them(tmp_path, seed):
     out = tmp_path / "errors.json"
-    argv = ["eval", "double_pendulum", "--unseen-terrain", "--num-trajectories", "4"]
-    assert main([*argv, "--json", str(out)]) == 0
-    errors = read_json(out)["results"]["errors"]
-    assert {row["case"] for row in errors} == {*CASES, "driven"}
-    assert {"double_pendulum", "analytic"} <= {row["name"] for row in errors}
-    assert main(["eval", "cartpole", "--unseen-terrain"]) == 2
-    assert "no unseen terrain for 'cartpole'" in capsys.readouterr().err
+    main(Options(num_trajectories=4, seed=seed, json=out))
+    rows = read_results(out)["results"]
+    assert {row["case"] for row in rows} == {*CASES, "driven"}
+    assert {"double_pendulum", "analytic"} <= {row["name"] for row in rows}

@@ -1,5 +1,8 @@
-"""Grounds of kinds that the training data never had: only planes are trained on.
+"""Error of the double pendulum's models on ground of kinds that no training data have.
 
+    python experiments/unseen_terrain.py --json results/unseen_terrain.json
+
+Two planes, the edge of a box, a height field and a flat field; only planes are trained on.
 A contact point sees distance and normal of the nearest surface, whatever its shape, so the
 trained weights run unchanged. They cannot see a surface that touches a link between its
 contact points, as the edge of a box does. Nor do they know that MuJoCo gives a height
@@ -8,19 +11,64 @@ stiffer near seams: the flat field, terrain 1 of the paper, shows how much that 
 """
 
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from math import cos, pi, sin
+from pathlib import Path
 
 import mujoco
 import numpy as np
+import tyro
 from torch import Tensor
 
+from torchrl_nerd.cli.eval import Eval
+from torchrl_nerd.evaluation.bench.error_table import error_table
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.robots.double_pendulum.scene import double_pendulum_over
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots.double_pendulum.scene import (
+    ASSET,
+    CONTACT,
+    SUBSTEPS,
+    double_pendulum,
+)
 from torchrl_nerd.robots.double_pendulum.tasks import DoublePendulumPassive
 from torchrl_nerd.robots.robot import EvaluationProtocol
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 
 GEOM = mujoco.mjtGeom
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure, and where the results go."""
+
+    num_trajectories: int = 2048
+    """Trajectories per ground."""
+    seed: int = 500
+    """Of the initial states."""
+    json: Path | None = None
+    """Write the results to this file."""
+
+
+def double_pendulum_over(add_ground: Callable[[mujoco.MjSpec], None]) -> Scene:
+    """The double pendulum over a fixed ground of any shape, in place of the random plane.
+
+    Args:
+        add_ground: adds shapes to the world; whatever it adds touches the pendulum and
+            has its contact parameters, as the plane does.
+    """
+    spec, trained = mujoco.MjSpec.from_file(str(ASSET)), double_pendulum()
+    spec.delete(spec.body("ground"))
+    add_ground(spec)
+    for geom in spec.worldbody.geoms:
+        geom.contype, geom.conaffinity = 1, 0
+    model = spec.compile()
+    set_penalty_contact(model, **CONTACT)
+    fixed = {"ground": None, "level_ground": None, "clearance": 0.0}
+    sampling = replace(trained.sampling, **fixed)
+    return Scene(trained.name, model, SUBSTEPS, trained.controller, sampling)
 
 
 class DoublePendulumOver(DoublePendulumPassive):
@@ -86,3 +134,20 @@ UNSEEN_TERRAIN = EvaluationProtocol(
     (100,),
 )
 """Four grounds, 100 passive steps; the paper has none of them."""
+
+
+def main(options: Options) -> None:
+    """Print a table for each ground and write the results."""
+    measured = Eval(
+        "double_pendulum", num_trajectories=options.num_trajectories, seed=options.seed
+    )
+    rows = []
+    for part in measured.measure(load_scene("double_pendulum"), UNSEEN_TERRAIN):
+        print(f"\n{part[0].case}, {part[0].steps} steps\n{error_table(part)}")
+        rows += [asdict(row) for row in part]
+    if options.json is not None:
+        write_results(options.json, rows, options.seed)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
