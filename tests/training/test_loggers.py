@@ -1,4 +1,4 @@
-"""Results of a run in TensorBoard, Weights & Biases and MLflow themselves, offline."""
+"""Results of a run in TensorBoard and Weights & Biases themselves, offline."""
 
 import json
 import time
@@ -122,36 +122,16 @@ def test_tensorboard_forgets_what_a_killed_run_wrote_later(run, results):
     assert rows == [(10, pytest.approx(results[10]["loss"])), (20, 7.0)]
 
 
-def test_mlflow_has_every_figure(run, results, monkeypatch, seed):
-    mlflow = pytest.importorskip("mlflow")
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    write(run, "mlflow", {"scene": "cartpole", "seed": seed}, results)
-    assert mlflow.active_run() is None
-    client = mlflow.MlflowClient(f"sqlite:///{run}/mlflow.db")
-    experiment = client.get_experiment_by_name(PROJECT)
-    (made,) = client.search_runs([experiment.experiment_id])
-    assert made.info.run_name == "some run" and made.info.status == "FINISHED"
-    assert made.data.params == {"scene": "cartpole", "seed": str(seed)}
-    for key in ("loss", "hinge_100"):
-        history = client.get_metric_history(made.info.run_id, key)
-        assert {m.step: m.value for m in history} == {
-            step: row[key] for step, row in results.items()
-        }
-
-
-@pytest.mark.parametrize("name", ["wandb", "mlflow"])
-def test_where_a_library_is_missing_the_extra_is_named(
-    name, tmp_path, monkeypatch, capsys
-):
+def test_where_a_library_is_missing_the_extra_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     sizes = ["--trajectories", "4", "--steps", "20", "--out", "d", "--quiet"]
     assert main(["data", "cartpole", *sizes]) == 0
     monkeypatch.setattr("torchrl_nerd.training.log.find_spec", lambda name: None)
     argv = ["train", "cartpole", "--data", "d", "--out", "run", "--quiet"]
-    assert main([*argv, "--logger", name]) == 2
+    assert main([*argv, "--logger", "wandb"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"nerd: --logger {name} needs the package {name}")
-    assert said.endswith(f"pip install 'torchrl-nerd[{name}]'\n")
+    assert said.startswith("nerd: --logger wandb needs the package wandb")
+    assert said.endswith("pip install 'torchrl-nerd[wandb]'\n")
     assert said.count("\n") == 1
 
 

@@ -54,7 +54,7 @@ class Trainer:
         horizons: control steps of the validation rollouts.
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
-        logger: ``tensorboard``, ``wandb``, ``mlflow``, or ``csv`` for ``log.csv`` alone.
+        logger: ``tensorboard``, ``wandb``, or ``csv`` for ``log.csv`` alone.
         init_from: a model whose weights and statistics the training continues, see
             `begin_from`. The training range covers its data and these.
 
