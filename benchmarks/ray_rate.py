@@ -20,8 +20,8 @@ import tyro
 from tyro.conf import Positional
 
 from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.cluster import ray_map
 from torchrl_nerd.data.generate import CHUNK, Mapper, generate
-from torchrl_nerd.data.mappers import ray_map
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene

@@ -13,8 +13,8 @@ import torch
 from torchrl_nerd.cli import main
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data import generate as module
+from torchrl_nerd.data.cluster import ray_map
 from torchrl_nerd.data.generate import generate, load_data, simulate
-from torchrl_nerd.data.mappers import ray_map
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.robots import load_scene
@@ -113,7 +113,7 @@ def test_the_command_takes_a_cluster(cluster, tmp_path, capsys):
 
 def test_where_ray_is_missing_the_extra_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.setattr("torchrl_nerd.data.mappers.find_spec", lambda name: None)
+    monkeypatch.setattr("torchrl_nerd.data.cluster.find_spec", lambda name: None)
     argv = ["data", "cartpole", "--trajectories", "3", "--out", str(tmp_path / "d")]
     assert main([*argv, "--quiet", "--ray", "local"]) == 2
     said = capsys.readouterr().err

@@ -30,7 +30,6 @@ from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.configs import NO_PREDICTIONS, DataConfig, TrainConfig
 from torchrl_nerd.data import generate as generation
 from torchrl_nerd.data.generate import generate, load_data, simulate
-from torchrl_nerd.data.mappers import ahead
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
@@ -92,7 +91,7 @@ class Generating:
         generation.CHUNK = CHUNK
 
         def told(draw: Callable, chunks: Iterable) -> Iterator:
-            for data in ahead(draw, chunks):
+            for data in map(draw, chunks):
                 yield data
                 tell()  # whoever asks for the next one has stored this one
 

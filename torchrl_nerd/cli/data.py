@@ -18,6 +18,7 @@ from torchrl_nerd.cli.options import (
     scene_of,
 )
 from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.cluster import ray_map
 from torchrl_nerd.data.generate import (
     CARD,
     Draw,
@@ -25,7 +26,6 @@ from torchrl_nerd.data.generate import (
     generate,
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
-from torchrl_nerd.data.mappers import ahead, ray_map
 from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json
@@ -110,7 +110,7 @@ class Data(Command):
         scene = scene_of(self.scene, self.reference)
         out = self.folder
         draw = self.strategy(scene)
-        mapper = partial(ray_map, address=self.ray) if self.ray else ahead
+        mapper = partial(ray_map, address=self.ray) if self.ray else map
         generate(scene, self.config, out, self.quiet, draw, mapper)
         card = read_json(out / CARD)
         print(

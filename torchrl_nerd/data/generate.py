@@ -19,7 +19,6 @@ from tqdm import tqdm
 
 from torchrl_nerd import __version__
 from torchrl_nerd.configs import DataConfig
-from torchrl_nerd.data.mappers import ahead
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.data.store import (
     chunk_path,
@@ -59,7 +58,7 @@ def generate(
     folder: Path,
     quiet: bool = False,
     strategy: tuple[str, Draw] | None = None,
-    mapper: Mapper = ahead,
+    mapper: Mapper = map,
 ) -> Path:
     """Write a data set, or finish one that was interrupted.
 
@@ -69,8 +68,7 @@ def generate(
         folder: of the data set; a finished one of the same card is left as it is.
         quiet: no progress bar.
         strategy: name and function of another way to draw trajectories than `simulate`.
-        mapper: draws the chunks: here, one ahead of the chunk that is written, or on other
-            machines as `ray_map`.
+        mapper: draws the chunks: here, or on other machines as `ray_map`.
 
     Raises:
         ValueError: the folder cannot be written or holds data of another card.

@@ -1,28 +1,9 @@
 """Recorded logs of any robot: read from npz or CSV, checked, kept as a data set.
 
-| npz array; CSV columns | shape | unit, frame |
-|---|---|---|
-| ``qpos``; qpos_0, qpos_1, ... | (N, nq) | MuJoCo's, as everywhere |
-| ``qvel``; qvel_0, ... | (N, nv) | the same; may be left out |
-| ``joint_torque``; joint_torque_0, ... | (N, motors) | N m or N until the next state; 0 |
-| ``terrain``; terrain_0, ... | (N, terrain.size) | where the ground varies; see `Terrain` |
-| ``trajectory_offsets``; - | (T + 1,) | trajectory i is rows ``o[i]:o[i + 1]`` |
-| ``trajectory``; trajectory, toss | (N,) | in place of offsets: a number per trajectory |
-| ``time``; time | (N,) | s; frames of the scene's control step where left out |
-
-A single free body may have, in place of ``qpos`` and ``qvel``:
-
-| npz array; CSV columns | shape | unit, frame |
-|---|---|---|
-| ``position``; x, y, z | (N, 3) | m, world, z up, of the body's frame |
-| ``quaternion_wxyz``; qw, qx, qy, qz | (N, 4) | from body to world |
-| ``linear_velocity``; vx, vy, vz | (N, 3) | m/s, world; may be left out |
-| ``angular_velocity``; wx, wy, wz | (N, 3) | rad/s, body; may be left out |
-
-`data.physics_checks` checks units and frames, which no file states.
+docs/howto/logs.md names the arrays and columns, with shapes, units and frames, which
+`data.physics_checks` checks: no file states them.
 """
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,10 +23,7 @@ from torchrl_nerd.data.recorded import (
     is_free_body,
     split_trajectories,
 )
-from torchrl_nerd.data.store import (
-    chunk_path,
-    write_chunk,
-)
+from torchrl_nerd.data.store import chunk_path, write_chunk
 from torchrl_nerd.files import writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
@@ -79,33 +57,32 @@ def read_log(path: Path, scene: Scene) -> Recording:
                 f"of shape {array.shape}"
             )
     is_pose = is_free_body(scene) and QPOS not in arrays
-    terrain = scene.terrain if scene.terrain and scene.terrain.is_per_row else None
-    needed = ("position", "quaternion_wxyz") if is_pose else (QPOS,)
-    for name in (*needed, *((TERRAIN,) if terrain else ())):
+    needed = ["position", "quaternion_wxyz"] if is_pose else [QPOS]
+    motors, nv = len(scene.actuated), scene.model.nv
+    sizes = {QPOS: scene.model.nq, QVEL: nv, TORQUE: motors}
+    sizes |= {name: len(columns) for name, columns in FREE_BODY.items()}
+    if scene.terrain is not None and scene.terrain.is_per_row:
+        needed.append(TERRAIN)
+        sizes[TERRAIN] = scene.terrain.size
+    for name in needed:
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"
             raise ValueError(f"expected '{name}' in {path}, found {found}")
-    count, nv = len(arrays[needed[0]]), scene.model.nv
-    sizes = {QPOS: scene.model.nq, QVEL: nv, TORQUE: len(scene.actuated)}
-    sizes |= {name: len(columns) for name, columns in FREE_BODY.items()}
-    if terrain:
-        sizes[TERRAIN] = terrain.size
-    shapes: dict[str, tuple[int, ...]] = {k: (count, v) for k, v in sizes.items()}
-    shapes |= {"time": (count,), "trajectory": (count,)}
+    count = len(arrays[needed[0]])
+    shapes = {"time": (count,), "trajectory": (count,)}
+    shapes |= {name: (count, size) for name, size in sizes.items()}
     tensors = {}
-    for name, shape in shapes.items():
-        array = arrays.get(name)
-        if array is None:
-            continue
-        if array.shape != shape:
+    for name in (name for name in shapes if name in arrays):
+        if arrays[name].shape != shapes[name]:
             raise ValueError(
-                f"expected '{name}' of shape {shape} in {path}, got {array.shape}"
+                f"expected '{name}' of shape {shapes[name]} in {path}, "
+                f"got {arrays[name].shape}"
             )
-        if not np.isfinite(array).all():
+        tensors[name] = torch.as_tensor(arrays[name], dtype=torch.float64)
+        if not tensors[name].isfinite().all():
             raise ValueError(
                 f"expected finite numbers in '{name}' of {path}, got others"
             )
-        tensors[name] = torch.as_tensor(array, dtype=torch.float64)
     none = torch.full((count, nv), torch.nan, dtype=torch.float64)
     if is_pose:
         parts = [tensors.get(name, none[:, :3]) for name in FREE_BODY]
@@ -113,7 +90,7 @@ def read_log(path: Path, scene: Scene) -> Recording:
     log = Recording(
         tensors[QPOS],
         tensors.get(QVEL, none),
-        tensors.get(TORQUE, none.new_zeros(count, len(scene.actuated))),
+        tensors.get(TORQUE, none.new_zeros(count, motors)),
         _offsets(arrays, count, path),
         scene.control_step,
         tensors.get("time"),
@@ -163,20 +140,19 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
     except (ValueError, IndexError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"expected a CSV table in {path}: {said}") from None
-    names = table.dtype.names or ()
+    names = set(table.dtype.names or ())
     columns = dict(FREE_BODY)
     for array in (QPOS, QVEL, TORQUE, TERRAIN):
-        numbers = [re.fullmatch(rf"{array}_(\d+)", name) for name in names]
-        found = sorted(int(number[1]) for number in numbers if number)
-        if found:
-            columns[array] = tuple(f"{array}_{number}" for number in found)
+        count = sum(name.startswith(f"{array}_") for name in names)
+        if count:
+            columns[array] = tuple(f"{array}_{number}" for number in range(count))
     arrays = {
         array: np.stack([table[column] for column in its], -1)
         for array, its in columns.items()
-        if set(its) <= set(names)
+        if names.issuperset(its)
     }
-    aliases = {"time": "time", "toss": "trajectory", "trajectory": "trajectory"}
-    return arrays | {aliases[name]: table[name] for name in names if name in aliases}
+    others = {"time": "time", "toss": "trajectory", "trajectory": "trajectory"}
+    return arrays | {others[name]: table[name] for name in others if name in names}
 
 
 def load_recording(path: Path, scene: Scene) -> tuple[Recording, dict[str, Tensor]]:

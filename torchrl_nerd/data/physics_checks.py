@@ -5,7 +5,7 @@ check's name, its value and, where another reading would fit, that reading. Of r
 are not a single free body, time stamps, quaternions and velocities are checked.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -70,22 +70,18 @@ def check_log(log: Recording, scene: Scene) -> list[Check]:
 def _checks(log: Recording, scene: Scene) -> Iterator[Check]:
     quats = [log.qpos[:, q : q + 4] for q, _ in scene.layout.rotations]
     if quats:
-        lengths = _length(torch.stack(quats))  # (rotations, N)
-        worst = float((lengths - 1.0).abs().max())
+        worst = float((_length(torch.stack(quats)) - 1.0).abs().max())
         name, advice = "length of quaternions less 1", "expected unit quaternions"
         yield Check(name, worst, 0.0, UNIT_ERROR, "", advice)
     if log.time is not None:
         steps = log.time.diff()[log.inside[1:]] / log.frame
-        least, most = float(steps.min()), float(steps.max())
-        name, limits = "time between frames", (0.5, 1.5, "frames")
-        advice = "time must rise evenly within a trajectory"
-        yield Check(name, least, *limits, advice)
-        advice = "there is a gap in time: split the trajectory there"
-        yield Check(name, most, *limits, advice)
-        name, ratio = (
-            "frame over the scene's control step",
-            log.frame / scene.control_step,
-        )
+        uneven = "time must rise evenly within a trajectory"
+        gap = "there is a gap in time: split the trajectory there"
+        for step, advice in ((steps.min(), uneven), (steps.max(), gap)):
+            limits = 0.5, 1.5, "frames"
+            yield Check("time between frames", float(step), *limits, advice)
+        ratio = log.frame / scene.control_step
+        name = "frame over the scene's control step"
         advice = "resample the log to the scene's control step"
         yield Check(name, ratio, 0.95, 1.05, "", advice)
     if is_free_body(scene):
@@ -99,26 +95,38 @@ def _checks(log: Recording, scene: Scene) -> Iterator[Check]:
 
 def _free_body_checks(log: Recording, scene: Scene) -> Iterator[Check]:
     yield _gravity(free_fall(log), scene)
-    yield _depth(log, scene)
-    mean = backward_differences(log, scene)
+    # the log if its quaternions are xyzw
+    swapped = replace(log, qpos=log.qpos[:, [0, 1, 2, *WXYZ]])
+    yield _depth(log, swapped, scene)
     linear, angular = log.qvel.split(3, -1)  # (N, 3) each
+    moved, turned = backward_differences(log, scene).split(3, -1)  # the same, measured
+    quat = quat_normalize(log.qpos[:, 3:])
     has_linear = not linear.isnan().any()
     if has_linear:
         name = "linear velocity against differences of positions"
-        advice = _linear_advice(log, mean[:, :3])
-        yield _velocity(name, linear, mean[:, :3], log, advice)
+        speeds = (float(_length(x).median()) for x in (moved, linear))
+        advice = "positions move at {:.3g} m/s (median), velocities say {:.3g} m/s"
+        advice, other = advice.format(*speeds), (rotate(quat, linear), moved)
+        readings = {"they are read in body axes: give them in world axes": other}
+        yield _velocity(name, linear, moved, log, advice, readings)
     if not angular.isnan().any():
         name = "angular velocity in body axes against differences of quaternions"
-        advice = _angular_advice(log, mean[:, 3:], scene)
-        yield _velocity(name, angular, mean[:, 3:], log, advice)
+        advice = "quaternions or angular velocities are in other frames or units"
+        own, axes = "angular velocities are", "world axes: give them in body axes"
+        order = "quaternions are xyzw: give them as wxyz"
+        readings = {
+            f"{own} in {axes}": (angular, rotate(quat, turned)),
+            order: (angular, backward_differences(swapped, scene)[:, 3:]),
+            f"{own} in degrees: give them in rad/s": (torch.deg2rad(angular), turned),
+        }
+        yield _velocity(name, angular, turned, log, advice, readings)
     if has_linear:
-        jump = _length(mean[:, :3] - linear) / (_length(linear) + SLOW)
-        jump = torch.where(log.inside, jump, 0.0)
+        jump = _length(moved - linear) / (_length(linear) + SLOW)
         name = "displacement within a frame that no velocity explains"
-        yield _gap(name, jump, LARGEST_JUMP)
+        yield _gap(name, torch.where(log.inside, jump, 0.0), LARGEST_JUMP)
     # The velocity over a frame with an impact is a mean of those around it, so no impact
     # makes it larger than both; lost frames do.
-    speed = _length(mean[:, :3])
+    speed = _length(moved)
     around = torch.maximum(speed.roll(1), speed.roll(-1))
     excess = (speed - around).clamp_min(0.0) / (around + SLOW)
     excess = torch.where(log.inside & log.inside.roll(-1), excess, 0.0)
@@ -143,26 +151,45 @@ def _gravity(fall: Tensor, scene: Scene) -> Check:
     return Check("free fall along z", value, *limits, "m/s^2", advice)
 
 
-def _depth(log: Recording, scene: Scene) -> Check:
+def _depth(log: Recording, swapped: Recording, scene: Scene) -> Check:
     """How deep the lowest contact point ever lies in the ground."""
+    found, if_swapped = (
+        float(
+            -scene.clearances(torch.cat((x[:, :3], quat_normalize(x[:, 3:])), 1)).min()
+        )
+        for x in (log.qpos, swapped.qpos)
+    )
     limit = DEEPEST * float(abs(scene.contacts.positions).max())
-
-    def deepest(qpos: Tensor) -> float:
-        unit = torch.cat((qpos[:, :3], quat_normalize(qpos[:, 3:])), 1)
-        return float(-scene.clearances(unit).min())
-
     advice = "sizes, or the ground's height, differ from the scene's"
-    if deepest(_swapped(log).qpos) < limit:
+    if if_swapped < limit:
         advice = "it fits if quaternions are read as xyzw: give them as wxyz"
-    name, found = "deepest corner under the ground", deepest(log.qpos)
+    name = "deepest corner under the ground"
     return Check(name, found, -float("inf"), limit, "m", advice)
 
 
 def _velocity(
-    name: str, stored: Tensor, measured: Tensor, log: Recording, advice: str
+    name: str,
+    stored: Tensor,
+    measured: Tensor,
+    log: Recording,
+    advice: str,
+    readings: Mapping[str, tuple[Tensor, Tensor]] | None = None,
 ) -> Check:
-    error = _relative_error(stored, measured, log)
-    return Check(name, error, 0.0, VELOCITY_ERROR, "of the speed", advice)
+    """Median difference over the median speed, of frames within a trajectory.
+
+    ``readings``: other pairs of velocities, which are advised if they agree.
+    """
+
+    def error(stored: Tensor, measured: Tensor) -> float:
+        apart, speed = (_length(x)[log.inside] for x in (stored - measured, measured))
+        return float(apart.median() / speed.median().clamp_min(1e-9))
+
+    for reading, pair in (readings or {}).items():
+        if error(*pair) < VELOCITY_ERROR:
+            advice = f"it fits if {reading}"
+            break
+    found = error(stored, measured)
+    return Check(name, found, 0.0, VELOCITY_ERROR, "of the speed", advice)
 
 
 def _gap(name: str, values: Tensor, limit: float) -> Check:
@@ -174,41 +201,3 @@ def _gap(name: str, values: Tensor, limit: float) -> Check:
 
 def _length(x: Tensor) -> Tensor:
     return torch.linalg.vector_norm(x, dim=-1)
-
-
-def _swapped(log: Recording) -> Recording:
-    """The log if its quaternions are xyzw."""
-    return replace(log, qpos=log.qpos[:, [0, 1, 2, *WXYZ]])
-
-
-def _relative_error(stored: Tensor, measured: Tensor, log: Recording) -> float:
-    """Median difference over the median speed, of frames within a trajectory."""
-    apart, speed = (_length(x)[log.inside] for x in (stored - measured, measured))
-    return float(apart.median() / speed.median().clamp_min(1e-9))
-
-
-def _linear_advice(log: Recording, measured: Tensor) -> str:
-    stored = log.qvel[:, :3]
-    turned = rotate(quat_normalize(log.qpos[:, 3:]), stored)
-    if _relative_error(turned, measured, log) < VELOCITY_ERROR:
-        return "it fits if they are read in body axes: give them in world axes"
-    moved, own = (float(_length(x).median()) for x in (measured, stored))
-    return f"positions move at {moved:.3g} m/s (median), velocities say {own:.3g} m/s"
-
-
-def _angular_advice(log: Recording, measured: Tensor, scene: Scene) -> str:
-    stored, quat = log.qvel[:, 3:], quat_normalize(log.qpos[:, 3:])
-    swapped = backward_differences(_swapped(log), scene)[:, 3:]
-    turned, in_rad = rotate(quat, measured), torch.deg2rad(stored)
-    axes = "angular velocities are in world axes: give them in body axes"
-    order = "quaternions are xyzw: give them as wxyz"
-    unit = "angular velocities are in degrees: give them in rad/s"
-    readings = (
-        (axes, stored, turned),
-        (order, stored, swapped),
-        (unit, in_rad, measured),
-    )
-    for reading, a, b in readings:
-        if _relative_error(a, b, log) < VELOCITY_ERROR:
-            return f"it fits if {reading}"
-    return "quaternions or angular velocities are in other frames or units"

@@ -48,9 +48,9 @@ class Recording:
 
     def select(self, numbers: Tensor) -> "Recording":
         """Some of the trajectories by their ``numbers (n,)``, in that order."""
-        bounds = [self.offsets[i : i + 2].tolist() for i in numbers]
-        rows = torch.cat([torch.arange(first, end) for first, end in bounds])
-        ends = torch.tensor([0, *(end - first for first, end in bounds)]).cumsum(0)
+        rows = self.starts(1, numbers)
+        counts = self.offsets.diff()[numbers]
+        ends = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
         kept = {name: column[rows] for name, column in self.columns.items()}
         return replace(self, **kept, offsets=ends, time=None)
 
@@ -59,9 +59,9 @@ class Recording:
 
         Of the trajectories with these ``numbers (n,)``, or of all.
         """
-        found = [torch.zeros(0, dtype=torch.long)]
+        found, bounds = [torch.zeros(0, dtype=torch.long)], self.trajectories
         for i in range(len(self)) if numbers is None else numbers.tolist():
-            first, end = self.offsets[i : i + 2].tolist()
+            first, end = bounds[i].start, bounds[i].stop
             found.append(torch.arange(first, max(first, end - states + 1)))
         return torch.cat(found)
 

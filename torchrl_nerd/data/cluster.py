@@ -1,10 +1,9 @@
-"""``map`` that computes ahead in a thread, or on the workers of a Ray cluster."""
+"""``map`` on the workers of a Ray cluster."""
 
 import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -12,28 +11,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 RETRIES = 10  # of one call, each on another worker
-
-
-def ahead(
-    function: Callable[[Item], Result], items: Iterable[Item]
-) -> Iterator[Result]:
-    """Results of ``map`` in its order; a thread computes the next one meanwhile.
-
-    Memory holds two results at most. What a call raises is raised where its result is
-    taken.
-
-    Examples:
-        >>> list(ahead(abs, [-1, 2, -3]))
-        [1, 2, 3]
-    """
-    with ThreadPoolExecutor(1, "ahead") as thread:
-        coming: Future[Result] | None = None
-        for item in items:
-            taken, coming = coming, thread.submit(function, item)
-            if taken is not None:
-                yield taken.result()
-        if coming is not None:
-            yield coming.result()
 
 
 def ray_map(
@@ -62,36 +39,34 @@ def ray_map(
         )
     import ray
 
+    def call(function: Callable[[Item], Result], item: Item) -> Result:
+        os.environ.setdefault("NERD_THREADS", "1")  # other processors run other calls
+        return function(item)
+
+    def take(reference: Any) -> Result:
+        try:
+            return ray.get(reference)
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+        except ray.exceptions.RayError as error:
+            raise RuntimeError(
+                f"Ray lost all {RETRIES + 1} workers that tried a chunk "
+                f"({type(error).__name__}); earlier chunks are kept"
+            ) from None
+
     is_new = not ray.is_initialized()
     if is_new:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     try:
-        call = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+        remote = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
         sent = ray.put(function)
         pending: deque[Any] = deque()
         for item in items:
-            pending.append(call.remote(sent, item))
+            pending.append(remote.remote(sent, item))
             if len(pending) > ray.cluster_resources().get("CPU", 1):
-                yield _take(ray, pending.popleft())
+                yield take(pending.popleft())
         while pending:
-            yield _take(ray, pending.popleft())
+            yield take(pending.popleft())
     finally:
         if is_new:
             ray.shutdown()
-
-
-def _call(function: Callable[[Item], Result], item: Item) -> Result:
-    os.environ.setdefault("NERD_THREADS", "1")  # other processors run other calls
-    return function(item)
-
-
-def _take(ray: Any, reference: Any) -> Any:
-    try:
-        return ray.get(reference)
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from None
-    except ray.exceptions.RayError as error:
-        raise RuntimeError(
-            f"Ray lost all {RETRIES + 1} workers that tried a chunk "
-            f"({type(error).__name__}); earlier chunks are kept"
-        ) from None
