@@ -21,7 +21,8 @@ from dynamics_helpers import (
     unequal_keys,
 )
 from torch import Generator, Tensor
-from torchrl.envs import SerialEnv
+from torchrl.collectors import MultiSyncCollector
+from torchrl.envs import ParallelEnv, SerialEnv
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
@@ -73,6 +74,21 @@ def test_a_seed_is_drawn_where_none_is_given_and_workers_differ(generator):
     makers = [make_env, NeRDEnv, GroundTruthEnv]
     assert len({make(TASK).seed for make in makers + makers}) == 6
     assert all(make(TASK, seed=3).seed == 3 for make in makers)
+
+
+@pytest.mark.slow
+def test_workers_in_processes_begin_at_starts_of_their_own():
+    make = functools.partial(GroundTruthEnv, TASK, num_envs=ROWS)
+    parallel = ParallelEnv(3, make)
+    collector = MultiSyncCollector([make] * 3, frames_per_batch=6 * ROWS)
+    try:
+        starts = parallel.reset()["qpos"].flatten(0, 1)
+        assert len(starts.unique(dim=0)) == 3 * ROWS
+        first = next(iter(collector))["qpos"].flatten(0, 1)[:, 0]
+        assert len(first.unique(dim=0)) == 3 * ROWS
+    finally:
+        parallel.close()
+        collector.shutdown()
 
 
 def test_any_seed_that_torchrl_hands_on_is_taken(seed):
