@@ -1,12 +1,17 @@
-"""What compiling brings to a whole env: steps with their resets, eager and compiled.
+"""A whole env in learned dynamics, eager and compiled, beside the same in MuJoCo.
 
     python benchmarks/compiled_env.py --tasks ant/run franka/reach --rows 512
 
-Both take turns on one thread; processor time of an action of one row, TorchRL's
-bookkeeping included, and of the first compiled step, which compiles. Actions are random
-and held, from the starts of episodes on, so robots that fall spend some steps in the air.
+They take turns on one thread; processor time of an action of one row, TorchRL's
+bookkeeping and resets included. Actions are random and held, from the starts of episodes on, so robots
+that fall spend some steps in the air. Seconds of the first compiled step are those of new
+processes: a cold one, and a warm one that finds the compiled code in torch's cache.
 """
 
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +20,23 @@ import torch
 import tyro
 from scaling import two_in_turn
 
-from torchrl_nerd import NeRDEnv
+from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.resolve import model_name
 from torchrl_nerd.evaluation.bench.rates import Runner
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import TASKS, make_task
+
+FIRST_STEP = """
+import sys, time
+from torchrl_nerd import make_env
+env = make_env(sys.argv[1], num_envs=int(sys.argv[2]), seed=0, compile=True)
+env.rollout(1)
+began = time.perf_counter()
+env.rollout(2)
+print(time.perf_counter() - began)
+"""
 
 
 @dataclass
@@ -58,37 +74,63 @@ class Stepper:
 
 
 def compare(task: str, rows: int, rounds: int, seed: int) -> dict[str, float]:
-    """Microseconds of an action of one row, their ratio, and seconds to compile."""
-    eager = Stepper(NeRDEnv(task, num_envs=rows, seed=seed), seed)
-    compiled = Stepper(NeRDEnv(task, num_envs=rows, seed=seed).compile(), seed)
-    began = time.perf_counter()
+    """Microseconds of an action of one row in each, and what compiling brings."""
+    envs = (make_env(task, x, rows, seed) for x in ("nerd", "nerd", "mujoco"))
+    eager, compiled, mujoco = (Stepper(env, seed) for env in envs)
+    compiled.env.compile()
     compiled(2)
-    seconds = time.perf_counter() - began
-    one, other = (Runner(x, time.process_time) for x in (compiled, eager))
+    one, other, third = (
+        Runner(x, time.process_time) for x in (compiled, eager, mujoco)
+    )
     fast, slow, ratio = two_in_turn(one, other, rounds)
+    true, _, _ = two_in_turn(third, other, rounds)
+    eager_us, compiled_us, mujoco_us = (1e6 / (rows * x) for x in (slow, fast, true))
     return {
-        "eager_us": 1e6 / (rows * slow),
-        "compiled_us": 1e6 / (rows * fast),
+        "eager_us": eager_us,
+        "compiled_us": compiled_us,
+        "mujoco_us": mujoco_us,
         "ratio": ratio,
-        "compile_s": seconds,
     }
+
+
+def first_steps(task: str, rows: int) -> dict[str, float]:
+    """Seconds of the first compiled step: of all envs, without a cache and with one."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("cold_s", "warm_s"):
+            done = subprocess.run(
+                [sys.executable, "-c", FIRST_STEP, task, str(rows)],
+                env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": folder},
+                stdout=subprocess.PIPE,
+                check=True,
+            )
+            found[name] = float(done.stdout)
+    return found
 
 
 def main(options: Options) -> None:
     """Print a row for every task."""
     torch.set_num_threads(1)
+    os.environ["NERD_THREADS"] = "1"
     shipped = shipped_models()
-    tasks = options.tasks or [t for t in TASKS if make_task(t).scene.name in shipped]
+    learned = {x: model_name("nerd", make_task(x).scene) for x in TASKS}
+    tasks = options.tasks or [x for x in TASKS if learned[x] in shipped]
     print(f"{options.rows} rows, one thread, us of an action of one row")
-    print(f"{'task':<30}{'eager':>8}{'compiled':>10}{'ratio':>7}{'compiling, s':>14}")
+    print(
+        f"{'task':<30}{'eager':>8}{'compiled':>10}{'MuJoCo':>8}{'ratio':>7}{'cold':>8}{'warm, s':>9}"
+    )
     results = {}
     for task in tasks:
-        row = compare(task, options.rows, options.rounds, options.seed)
+        row = first_steps(task, options.rows)
+        row |= compare(task, options.rows, options.rounds, options.seed)
         results[task] = row
         rates = (
-            f"{row['eager_us']:>8.1f}{row['compiled_us']:>10.1f}{row['ratio']:>7.2f}"
+            f"{row['eager_us']:>8.1f}{row['compiled_us']:>10.1f}"
+            f"{row['mujoco_us']:>8.1f}{row['ratio']:>7.2f}"
         )
-        print(f"{task:<30}{rates}{row['compile_s']:>14.1f}", flush=True)
+        print(
+            f"{task:<30}{rates}{row['cold_s']:>8.1f}{row['warm_s']:>9.1f}", flush=True
+        )
     if options.json is not None:
         write_results(
             options.json, {"rows": options.rows, "tasks": results}, options.seed

@@ -1,11 +1,13 @@
 """A function through `torch.compile`, in parts on threads; eager without a compiler."""
 
 import os
+import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache, wraps
-from threading import Barrier
+from threading import Barrier, Timer
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import torch
@@ -16,6 +18,11 @@ from torchrl_nerd.compat import COMPILER_ERRORS, compile_options
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 Function = TypeVar("Function", bound=Callable[..., Any])
+PATIENCE = 5.0  # s of silence
+WAIT = (
+    "compiling a step: up to two minutes for a walking robot on two cores, seconds once "
+    "torch has it in its cache"
+)
 WARM = 2  # calls of one part after the other: an eager one, and one that compiles
 
 
@@ -45,6 +52,18 @@ def unaffected(method: Function) -> Function:
     return cast(Function, run)
 
 
+@contextmanager
+def announced() -> Iterator[None]:
+    """Say on the terminal's error stream that it compiles, where that takes a while."""
+    timer = Timer(PATIENCE, print, [WAIT], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 class Compiled(Generic[Given, Result]):
     """Compiled after a first call; eager for good, with one warning, where that fails.
 
@@ -72,10 +91,17 @@ class Compiled(Generic[Given, Result]):
         if self._calls_to_go > 0:
             self._calls_to_go -= 1
             return self.function(*args, **kwargs)
-        if self._run is None:
-            self._run = torch.compile(self.function, **compile_options(self.options))
+        if self._run is not None:
+            return self._attempt(self._run, *args, **kwargs)
+        self._run = torch.compile(self.function, **compile_options(self.options))
+        with announced():
+            return self._attempt(self._run, *args, **kwargs)
+
+    def _attempt(
+        self, run: Callable[Given, Result], *args: Given.args, **kwargs: Given.kwargs
+    ) -> Result:
         try:
-            return self._run(*args, **kwargs)
+            return run(*args, **kwargs)
         except COMPILER_ERRORS as error:
             reason = " ".join(str(error).strip().splitlines()[:2])
             warnings.warn(f"cannot compile, running eagerly: {reason}", stacklevel=3)
