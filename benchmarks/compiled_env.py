@@ -3,9 +3,9 @@
     python benchmarks/compiled_env.py --tasks ant/run franka/reach --rows 512
 
 They take turns on one thread; processor time of an action of one row, TorchRL's
-bookkeeping and resets included. Actions are random and held, from the starts of episodes on, so robots
-that fall spend some steps in the air. Seconds of the first compiled step are those of new
-processes: a cold one, and a warm one that finds the compiled code in torch's cache.
+bookkeeping and resets included. Actions are random and held, from the starts of episodes
+on, so robots that fall spend some steps in the air. Seconds of the first compiled step are
+those of new processes: a cold one, and a warm one that finds its code in torch's cache.
 """
 
 import os
@@ -116,9 +116,8 @@ def main(options: Options) -> None:
     learned = {x: model_name("nerd", make_task(x).scene) for x in TASKS}
     tasks = options.tasks or [x for x in TASKS if learned[x] in shipped]
     print(f"{options.rows} rows, one thread, us of an action of one row")
-    print(
-        f"{'task':<30}{'eager':>8}{'compiled':>10}{'MuJoCo':>8}{'ratio':>7}{'cold':>8}{'warm, s':>9}"
-    )
+    columns = f"{'task':<30}{'eager':>8}{'compiled':>10}{'MuJoCo':>8}{'ratio':>7}"
+    print(f"{columns}{'cold':>8}{'warm, s':>9}")
     results = {}
     for task in tasks:
         row = first_steps(task, options.rows)
