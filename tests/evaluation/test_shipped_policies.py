@@ -23,10 +23,12 @@ PAPER = {
     "anymal/sideways": 1360.0,
 }
 """Returns in ground truth, tables 1 and 2 of the paper."""
+OURS = {"franka/reach_osc"}
+"""Tasks with a goal that the paper does not have."""
 
 
 def test_they_are_of_tasks_that_have_a_goal() -> None:
-    assert shipped_policies().keys() <= PPO_CONFIGS.keys() == PAPER.keys()
+    assert shipped_policies().keys() <= PPO_CONFIGS.keys() == PAPER.keys() | OURS
 
 
 LOST = {"cartpole/swingup": 0.01, "ant/run": 0.2, "franka/reach": 0.4}

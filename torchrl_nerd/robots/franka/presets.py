@@ -7,6 +7,7 @@ from torchrl_nerd.robots.franka.scene import franka, franka_gravity
 from torchrl_nerd.robots.franka.tasks import (
     FrankaGravityReachTorque,
     FrankaReach,
+    FrankaReachOSC,
     FrankaReachTorque,
 )
 from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
@@ -48,6 +49,7 @@ ROBOT = Robot(
     tasks={
         "franka/reach": FrankaReach,
         "franka/reach_torque": FrankaReachTorque,
+        "franka/reach_osc": FrankaReachOSC,
         "franka_gravity/reach_torque": FrankaGravityReachTorque,
     },
     presets={
@@ -66,5 +68,14 @@ ROBOT = Robot(
         "franka/reach": PPO,
         # std: of the torque that it can give; to brake by torque takes a wider policy
         "franka/reach_torque": replace(PPO, std=0.3, widths=(128, 128)),
+        # the controller brakes: one observation is enough, and a tenth of the actions
+        "franka/reach_osc": replace(
+            PPO,
+            total_frames=2_000_000,
+            num_envs=512,
+            minibatch=2048,
+            std=0.2,
+            frame_stack=1,
+        ),
     },
 )

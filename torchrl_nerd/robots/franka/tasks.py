@@ -8,8 +8,16 @@ from torch import Tensor
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
-from torchrl_nerd.robots.franka.scene import GAIN, HOME, franka, franka_gravity
+from torchrl_nerd.robots.franka.scene import (
+    GAIN,
+    HIGH,
+    HOME,
+    LOW,
+    franka,
+    franka_gravity,
+)
 from torchrl_nerd.scenes.controllers import PDController
+from torchrl_nerd.scenes.operational_space import OperationalSpaceController
 from torchrl_nerd.tasks.floating import between, symmetric
 from torchrl_nerd.tasks.task import State, Task
 
@@ -19,6 +27,10 @@ EPSILON = 1e-4
 KP = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)  # N m/rad; reference code
 KD = (5.0, 5.0, 5.0, 5.0, 3.0, 2.5, 1.5)  # N m s/rad
 ACTION_SCALE = 0.03125  # rad per unit of action from the present position
+HAND = "end_effector"  # the site between the fingertips
+HAND_KP, HAND_KD = 400.0, 40.0  # 1/s^2 and 1/s: critically damped, 0.05 s
+HAND_SCALE = 0.1  # m per unit of action, which leads to 1 m/s
+GOAL_SPREAD = 0.5  # rad about HOME: joint positions whose hand is a goal
 
 
 class FrankaReachTorque(Task):
@@ -53,7 +65,7 @@ class FrankaReachTorque(Task):
     @cached_property
     def _kinematics(self) -> PointKinematics:
         model = self.scene.model
-        site = model.site("end_effector")
+        site = model.site(HAND)
         body = int(model.site_bodyid[site.id])
         return PointKinematics(model, self.scene.base, [body], site.pos[None])
 
@@ -84,6 +96,46 @@ class FrankaReach(FrankaReachTorque):
         joints, scale = tuple(range(7)), (ACTION_SCALE,) * 7
         return PDController(
             joints, joints, KP, KD, scale, relative_to="current", limit=GAIN
+        )
+
+
+class FrankaReachOSC(FrankaReachTorque):
+    """The same reward by moves of the hand: the action is a displacement of 0.1 m a.
+
+    An `OperationalSpaceController` turns it into torque, within the effort limits. Each
+    action holds for two control steps. Not in the paper.
+
+    A goal is where the hand is at joint positions uniform within 0.5 rad of home and
+    within the joint limits. So the arm reaches every goal, 0.15 m or more over the table.
+    Observation: joint angles in [-pi, pi), the point, the way from it to the goal.
+    """
+
+    frame_skip = 2
+    num_uniforms = 14
+
+    def initial_state(self, u: Tensor) -> dict[str, Tensor]:
+        """At rest near home; the goal is the hand of another pose near home."""
+        start = super().initial_state(u[..., :10])
+        pose = u.new_tensor(HOME) + symmetric(u[..., 7:], GOAL_SPREAD)
+        low, high = u.new_tensor(LOW), u.new_tensor(HIGH)
+        pose = torch.minimum(torch.maximum(pose, low), high)
+        return start | {GOAL: self.controller.site(pose).position}
+
+    def observation(self, state: State) -> Tensor:
+        """Joint angles, the point, the way to the goal."""
+        angles, point, goal = super().observation(state).split((7, 3, 3), -1)
+        return torch.cat((angles, point, goal - point), -1)
+
+    @property
+    def controller(self) -> OperationalSpaceController:
+        """From displacements of the hand to torques within the effort limits."""
+        return self._controller
+
+    @cached_property
+    def _controller(self) -> OperationalSpaceController:
+        kp, kd, scale = (HAND_KP,) * 3, (HAND_KD,) * 3, (HAND_SCALE,) * 3
+        return OperationalSpaceController(
+            self.scene.model, HAND, kp, kd, scale, HOME, limit=GAIN
         )
 
 

@@ -1,0 +1,185 @@
+"""A site at the end of a chain of joints: its pose, Jacobian and bias acceleration.
+
+The chain is pytorch-kinematics' `SerialChain`, built from a compiled MuJoCo model.
+Source: https://github.com/UM-ARM-Lab/pytorch_kinematics
+"""
+
+import copy
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.geometry.rotations import quat_matrix
+
+if TYPE_CHECKING:  # importing it takes a second: only who builds a chain waits for it
+    from pytorch_kinematics import SerialChain
+
+END = "end"
+
+
+class EndEffector(NamedTuple):
+    """Where a site is, and how the n joints of its chain move it; all in the world."""
+
+    position: Tensor  # (*batch, 3), m
+    rotation: Tensor  # (*batch, 3, 3)
+    jacobian: Tensor  # (*batch, 6, n): velocity, then angular velocity, per joint rate
+
+
+class SiteKinematics:
+    """Forward kinematics and Jacobian of a site on a robot whose base is fixed.
+
+    | attribute | meaning |
+    |---|---|
+    | ``qpos_addresses``, ``dof_addresses`` | of the chain's n joints, from the base on |
+    | ``limits`` | lower and upper joint positions ``(n, 2)``; infinite where unlimited |
+
+    Args:
+        model: compiled model.
+        site: name of the site.
+
+    Raises:
+        ValueError: no such site, or a joint on the way to it that is no hinge or slide.
+    """
+
+    def __init__(self, model: mujoco.MjModel, site: str) -> None:
+        self.joints = _joints_to(model, site)
+        self.qpos_addresses = model.jnt_qposadr[self.joints].tolist()
+        self.dof_addresses = model.jnt_dofadr[self.joints].tolist()
+        is_limited = model.jnt_limited[self.joints, None] != 0
+        unlimited = np.array((-np.inf, np.inf))
+        self.limits = np.where(is_limited, model.jnt_range[self.joints], unlimited)
+        self._chains = {torch.device("cpu"): serial_chain(model, site)}
+
+    def __call__(self, qpos: Tensor) -> EndEffector:
+        """Pose and Jacobian at ``qpos (*batch, nq)``, in the dtype of ``qpos``."""
+        batch, chain = qpos.shape[:-1], self.chain(qpos.device)
+        joints = qpos.reshape(batch.numel(), qpos.shape[-1])[:, self.qpos_addresses]
+        jacobian, pose = chain.jacobian_tensor(joints.double(), ret_eef_pose=True)
+        parts = pose[:, :3, 3], pose[:, :3, :3], jacobian
+        return EndEffector(
+            *(x.to(qpos.dtype).reshape(*batch, *x.shape[1:]) for x in parts)
+        )
+
+    def chain(self, device: torch.device) -> "SerialChain":
+        """The chain on a device: float64, the joints in the order of the attributes."""
+        if device not in self._chains:
+            with torch.inference_mode(False):
+                first = copy.deepcopy(self._chains[torch.device("cpu")])
+                self._chains[device] = first.to(device=device)
+        return self._chains[device]
+
+
+def bias_acceleration(jacobian: Tensor, rates: Tensor) -> Tensor:
+    """Acceleration of a site at constant joint rates, ``(*batch, 6)``.
+
+    The time derivative of the Jacobian times the rates: linear, then angular. It follows
+    from the Jacobian, since its columns are the joints' twists about the site. With
+    omega_j and v_j the sums of the columns up to joint j times their rates:
+
+        angular = sum_j omega_j x (J_w,j q_j')
+        linear = sum_j (omega_j x (J_v,j q_j') + v_j x (J_w,j q_j')) + omega_n x v_n
+
+    Args:
+        jacobian: ``(*batch, 6, n)``, as `EndEffector` has it.
+        rates: of the joints, from the base on, ``(*batch, n)``.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms, section 2.11.
+    """
+    twists = (jacobian * rates[..., None, :]).mT  # (*batch, n, 6)
+    moved, turned = twists.split(3, -1)
+    velocity, omega = twists.cumsum(-2).split(3, -1)
+    cross = torch.linalg.cross
+    angular = cross(omega, turned).sum(-2)
+    linear = (cross(omega, moved) + cross(velocity, turned)).sum(-2)
+    linear = linear + cross(omega[..., -1, :], velocity[..., -1, :])
+    return torch.cat((linear, angular), -1)
+
+
+@torch.inference_mode(False)
+def serial_chain(model: mujoco.MjModel, site: str) -> "SerialChain":
+    """pytorch-kinematics' chain from the world to a site, float64; its joints take qpos.
+
+    A frame per joint, at the joint's anchor. MuJoCo's ``ref`` and the fixed parts of the
+    way are in the frames' offsets.
+
+    Raises:
+        ValueError: as for `SiteKinematics`.
+    """
+    from pytorch_kinematics import Chain, SerialChain
+    from pytorch_kinematics.frame import Frame, Joint, Link
+    from pytorch_kinematics.transforms import Transform3d
+
+    float64: dict[str, Any] = {"dtype": torch.float64}
+
+    def frame(name: str, offset: np.ndarray, **joint: Any) -> Frame:
+        matrix = torch.from_numpy(offset[None])
+        link = Link(name, Transform3d(matrix=matrix, **float64))
+        return Frame(name, link, Joint(name, **float64, **joint))
+
+    joints, is_limited = _joints_to(model, site), model.jnt_limited
+    root = last = frame("world", np.eye(4))
+    offset = np.eye(4)
+    for body in _bodies_to(model, site):
+        offset = offset @ _matrix(model.body_pos[body], model.body_quat[body])
+        for joint in (joint for joint in joints if model.jnt_bodyid[joint] == body):
+            axis, anchor = model.jnt_axis[joint], model.jnt_pos[joint]
+            is_hinge, ref = model.jnt_type[joint] == HINGE, np.eye(4)
+            start = -model.qpos0[model.jnt_qposadr[joint]]
+            if is_hinge:
+                quat = np.empty(4)
+                mujoco.mju_axisAngle2Quat(quat, axis, start)
+                ref = _matrix(np.zeros(3), quat)
+            else:
+                ref[:3, 3] = start * axis
+            kind = "revolute" if is_hinge else "prismatic"
+            next_frame = frame(
+                f"joint {joint}",
+                offset @ _matrix(anchor) @ ref,
+                joint_type=kind,
+                axis=torch.from_numpy(axis.copy()),
+                limits=tuple(model.jnt_range[joint]) if is_limited[joint] else None,
+            )
+            last.children = [next_frame]
+            last, offset = next_frame, _matrix(-anchor)
+    place = model.site(site)
+    last.children = [frame(END, offset @ _matrix(place.pos, place.quat))]
+    return SerialChain(Chain(root, **float64), END, **float64)
+
+
+def _matrix(position: np.ndarray, quat: np.ndarray | None = None) -> np.ndarray:
+    """A homogeneous transform ``(4, 4)``."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    if quat is not None:
+        matrix[:3, :3] = quat_matrix(quat)
+    return matrix
+
+
+def _bodies_to(model: mujoco.MjModel, site: str) -> list[int]:
+    """Bodies from the world, which is not among them, to the site's."""
+    names = [model.site(index).name for index in range(model.nsite)]
+    if site not in names:
+        known = ", ".join(filter(None, names)) or "none"
+        raise ValueError(f"expected the name of a site ({known}), got {site!r}")
+    bodies, body = [], int(model.site(site).bodyid[0])
+    while body:
+        bodies.insert(0, body)
+        body = int(model.body_parentid[body])
+    return bodies
+
+
+def _joints_to(model: mujoco.MjModel, site: str) -> list[int]:
+    """Joints from the base to the site."""
+    starts = ((int(model.body_jntadr[b]), b) for b in _bodies_to(model, site))
+    joints = [j for at, b in starts for j in range(at, at + int(model.body_jntnum[b]))]
+    others = [j for j in joints if model.jnt_type[j] not in (HINGE, SLIDE)]
+    if others or not joints:
+        found = f"joint '{model.joint(others[0]).name}'" if others else "no joint"
+        raise ValueError(
+            f"expected hinges and slides on the way to site '{site}', got {found}"
+        )
+    return joints
