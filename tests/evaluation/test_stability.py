@@ -10,9 +10,8 @@ from helpers import slow_but
 from torchrl_nerd.cli.main import INTERRUPTED, main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.results import read_results
-from torchrl_nerd.evaluation.stability.case import Case
+from torchrl_nerd.evaluation.stability.case import Case, Metric, as_table, run_cases
 from torchrl_nerd.evaluation.stability.cases import CASES
-from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_cases
 from torchrl_nerd.evaluation.stability.states import (
     clear_of_ground,
     mechanics,
@@ -31,7 +30,7 @@ INDEPENDENT = ("invalid_inputs", "quaternion_sign", "altitude")
 def results_of(scene, names, generator):
     tested = NeRDDynamics(random_model(scene, generator))
     seed = int(torch.randint(1000, (), generator=generator))
-    return list(run_cases(tested, choose_cases(names), seed, SCALE))
+    return list(run_cases(tested, [CASES[name] for name in names], seed, SCALE))
 
 
 def failures(results):
@@ -61,9 +60,14 @@ def test_what_does_not_depend_on_weights_holds_for_any(scene, generator):
         assert result.passes, (result.case, result.tested)
 
 
+def test_joint_limits_are_tried_where_there_are_some(scene):
+    has_limits = bool(scene.model.jnt_limited.any() and len(scene.actuated))
+    assert CASES["joint_limits"].applies(scene) == has_limits
+
+
 def test_every_seed_has_starts_of_its_own(generator):
     scene, drawn = load_scene("cartpole"), []
-    case = Case("made up", "", lambda trial: drawn.append(trial.starts(2)) or {})
+    case = Case(lambda trial: drawn.append(trial.starts(2)) or iter(()))
     for seed in (0, 1, 1, 2**20):
         list(run_cases(MujocoDynamics(scene), [case], seed))
     first, other, again, far = (x["qpos"] for x in drawn[::2])
@@ -71,12 +75,18 @@ def test_every_seed_has_starts_of_its_own(generator):
     assert not torch.equal(first, other) and not torch.equal(first, far)
 
 
-def test_a_metric_that_is_nan_fails():
-    case = Case("made up", "", lambda _: {}, tolerances={"x": 1.0})
-    assert case.passes({"x": 1.0}, is_ground_truth=False)
-    assert not case.passes({"x": 1.1}, is_ground_truth=False)
-    assert not case.passes({"x": float("nan")}, is_ground_truth=False)
-    assert case.passes({"x": float("nan")}, is_ground_truth=True)  # without a tolerance
+@pytest.mark.parametrize("value", [1.0, 1.1, float("nan"), float("inf")])
+@pytest.mark.parametrize("limit", [1.0, float("inf")])
+@pytest.mark.parametrize("mujoco_limit", [None, 1.05, float("inf")])
+def test_a_metric_beyond_its_limit_fails(value, limit, mujoco_limit):
+    """NaN is beyond every limit; an infinite limit is none."""
+    case = Case(lambda _: iter([Metric("x", value, limit, mujoco_limit)]))
+    (result,) = run_cases(MujocoDynamics(load_scene("cartpole")), [case])
+    assert result.passes == (value == 1.0 or limit > 1.0)
+    exact = limit if mujoco_limit is None else mujoco_limit
+    assert result.ground_truth_passes == (value == 1.0 or exact > 1.1)
+    assert result.tolerances == ({"x": 1.0} if limit == 1.0 else {})
+    assert set(result.tested) == {"x"} == set(result.ground_truth)
 
 
 def test_momentum_and_energy_are_those_of_a_falling_cube(generator):
@@ -114,9 +124,10 @@ def test_results_outlive_an_interruption(tmp_path, monkeypatch):
 
     def interrupted(*arguments):
         assert "hinge_turns" in read_results(out)["results"]
-        assert run(*arguments)
+        assert list(run(*arguments))
         raise KeyboardInterrupt
 
+    interrupted.__name__ = "batching"
     broken = replace(CASES["batching"], run=interrupted)
     monkeypatch.setitem(CASES, "batching", broken)
     arguments = ["cartpole", "--cases", "hinge_turns", "batching", "--scale", "0.01"]

@@ -9,9 +9,10 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
 from torchrl_nerd.dynamics import dynamics_of
-from torchrl_nerd.evaluation.stability.run import as_table, choose_cases, run_cases
+from torchrl_nerd.evaluation.stability.case import as_table, run_cases
+from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.settings import SettingError
+from torchrl_nerd.settings import SettingError, look_up
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Stability(MeasuringCommand):
         """
         if not 0.0 < self.scale <= 1.0:
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
-        cases = choose_cases(list(self.cases) or None)
+        cases = [look_up("case", name, CASES) for name in self.cases or CASES]
         scene = load_scene(self.scene)
         model = from_pretrained(self.model or self.scene, scene).to(self.device)
         tested = dynamics_of(model, compile=self.compile)

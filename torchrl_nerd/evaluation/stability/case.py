@@ -1,8 +1,11 @@
-"""A hard case: physics with a known outcome, and tolerances for what is measured."""
+"""A hard case: a function that measures physics of known outcome against its limits."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from math import inf
 from typing import Any
+from zlib import crc32
 
 import torch
 from tensordict import TensorDict
@@ -16,8 +19,34 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torque
 
-Metrics = dict[str, float]
-"""What a case measured, by name with its unit."""
+
+@dataclass(frozen=True)
+class Metric:
+    """One number that a case measured.
+
+    | field | meaning |
+    |---|---|
+    | ``name`` | with its unit |
+    | ``value`` | in the dynamics that the case ran in |
+    | ``limit`` | largest allowed value; infinite: the number is for information |
+    | ``mujoco_limit`` | the same for MuJoCo, it validates the case; None: ``limit`` |
+    """
+
+    name: str
+    value: float
+    limit: float = inf
+    mujoco_limit: float | None = None
+
+    @property
+    def passes(self) -> bool:
+        """Whether it is within the limit, as NaN is not, or has none."""
+        return self.limit == inf or self.value <= self.limit
+
+    @property
+    def passes_in_mujoco(self) -> bool:
+        """The same of MuJoCo's limit."""
+        limit = self.limit if self.mujoco_limit is None else self.mujoco_limit
+        return replace(self, limit=limit).passes
 
 
 @dataclass(frozen=True)
@@ -86,35 +115,22 @@ class Trial:
         return torch.stack(list(errors.values())).amax(0)  # over quantities
 
 
+Run = Callable[[Trial], Iterator[Metric]]
+"""Measures one trial; its docstring says what should happen, and why."""
+
+
 @dataclass(frozen=True)
 class Case:
-    """One hard case.
+    """One hard case: its `Run`, the robots it applies to, whether it needs a network."""
 
-    | field | meaning |
-    |---|---|
-    | ``name`` | of the case |
-    | ``physics`` | what should happen, and why, in a sentence |
-    | ``run`` | measures one trial |
-    | ``applies`` | whether it makes sense for a robot |
-    | ``tolerances`` | largest allowed metrics of the tested dynamics |
-    | ``ground_truth_tolerances`` | of MuJoCo: they validate the case itself |
-    | ``needs_model`` | whether it asks for a model with a network |
-
-    A metric without a tolerance is for information.
-    """
-
-    name: str
-    physics: str
-    run: Callable[[Trial], Metrics]
+    run: Run
     applies: Callable[[Scene], bool] = lambda scene: True
-    tolerances: Metrics = field(default_factory=dict)
-    ground_truth_tolerances: Metrics = field(default_factory=dict)
     needs_model: bool = False
 
-    def passes(self, metrics: Metrics, is_ground_truth: bool) -> bool:
-        """Whether every metric with a tolerance is within it; NaN is not."""
-        limits = self.ground_truth_tolerances if is_ground_truth else self.tolerances
-        return all(metrics[name] <= limit for name, limit in limits.items())
+    @property
+    def name(self) -> str:
+        """Of the function."""
+        return self.run.__name__
 
     def supports(self, dynamics: Dynamics) -> bool:
         """Whether the case can run on it."""
@@ -127,29 +143,95 @@ CASES: dict[str, Case] = {}
 
 
 def hard_case(
-    tolerances: Metrics,
-    ground_truth: Metrics | None = None,
-    applies: Callable[[Scene], bool] = lambda scene: True,
-    needs_model: bool = False,
-) -> Callable[[Callable[[Trial], Metrics]], Callable[[Trial], Metrics]]:
-    """Register a function as the case of its name; its docstring says the physics.
+    applies: Callable[[Scene], bool] = lambda scene: True, needs_model: bool = False
+) -> Callable[[Run], Run]:
+    """Register a function as the case of its name; see `Case` for the arguments."""
 
-    Args:
-        tolerances: largest allowed metrics.
-        ground_truth: the same for MuJoCo; by default those of the tested dynamics.
-        applies: whether the case makes sense for a robot.
-        needs_model: whether it asks for a model with a network; MuJoCo is left out then.
-    """
-    limits = tolerances if ground_truth is None else ground_truth
-    limits = {} if needs_model else limits
-
-    def register(run: Callable[[Trial], Metrics]) -> Callable[[Trial], Metrics]:
-        physics = " ".join((run.__doc__ or "").split())
-        about = (run.__name__, physics, run, applies, tolerances, limits, needs_model)
-        CASES[run.__name__] = Case(*about)
+    def register(run: Run) -> Run:
+        CASES[run.__name__] = Case(run, applies, needs_model)
         return run
 
     return register
+
+
+@dataclass(frozen=True)
+class Result:
+    """One case in both dynamics.
+
+    | field | meaning |
+    |---|---|
+    | ``case``, ``physics`` | what was tried, and what should happen |
+    | ``ground_truth``, ``tested`` | metrics; none of MuJoCo where a model is needed |
+    | ``ground_truth_passes``, ``passes`` | whether all are within their limits |
+    | ``tolerances`` | limits of the dynamics under test |
+    | ``seconds`` | for both |
+    """
+
+    case: str
+    physics: str
+    ground_truth: dict[str, float]
+    tested: dict[str, float]
+    ground_truth_passes: bool
+    passes: bool
+    tolerances: dict[str, float]
+    seconds: float
+
+
+def run_cases(
+    tested: Dynamics,
+    cases: list[Case],
+    seed: int = 0,
+    scale: float = 1.0,
+    ground_truth: Dynamics | None = None,
+) -> Iterator[Result]:
+    """Every case that applies, one after the other.
+
+    Args:
+        tested: any dynamics; cases of models are left out for others.
+        cases: which.
+        seed: of starts and torques; each case has a stream of its own, the same in both.
+        scale: fraction of long rollouts and large batches, in (0, 1].
+        ground_truth: what stands beside it; by default MuJoCo.
+    """
+    for case in cases:
+        if not case.supports(tested):
+            continue
+        began, found = time.monotonic(), []
+        for dynamics in (ground_truth or MujocoDynamics(tested.scene), tested):
+            stream = Generator().manual_seed(crc32(case.name.encode(), seed))
+            trial = Trial(dynamics, stream, scale)
+            found.append(list(case.run(trial)) if case.supports(dynamics) else [])
+        exact, mine = found
+        yield Result(
+            case=case.name,
+            physics=" ".join((case.run.__doc__ or "").split()),
+            ground_truth={m.name: m.value for m in exact},
+            tested={m.name: m.value for m in mine},
+            ground_truth_passes=all(m.passes_in_mujoco for m in exact),
+            passes=all(m.passes for m in mine),
+            tolerances={m.name: m.limit for m in mine if m.limit < inf},
+            seconds=round(time.monotonic() - began, 1),
+        )
+
+
+def as_table(results: list[Result], kind: str = "tested") -> str:
+    """Markdown: one line per metric; ``kind`` heads the tested dynamics' column."""
+    lines = [
+        f"| case | metric | MuJoCo | {kind} | tolerance | |",
+        "|---|---|---|---|---|---|",
+    ]
+    for result in results:
+        name = result.case
+        for metric in result.tested | result.ground_truth:
+            limit, value = result.tolerances.get(metric), result.tested.get(metric)
+            verdict = ""
+            if limit is not None and value is not None:
+                verdict = "pass" if value <= limit else "**fail**"
+            shown = (result.ground_truth.get(metric), value, limit)
+            cells = " | ".join("" if x is None else f"{x:.2g}" for x in shown)
+            lines.append(f"| {name} | {metric} | {cells} | {verdict} |")
+            name = ""
+    return "\n".join(lines) + "\n"
 
 
 def has_floating_base(scene: Scene) -> bool:
@@ -157,23 +239,12 @@ def has_floating_base(scene: Scene) -> bool:
     return scene.base.is_floating
 
 
-def has_motors(scene: Scene) -> bool:
-    """Whether there is a torque to drive with."""
-    return bool(len(scene.actuated))
-
-
 def largest(value: Tensor) -> float:
     """The largest entry; infinity if any is not finite, or there is none."""
     is_valid = value.numel() and value.isfinite().all()
-    return float(value.max()) if is_valid else float("inf")
+    return float(value.max()) if is_valid else inf
 
 
 def norm(x: Tensor) -> Tensor:
     """Length of vectors ``(*batch, D)``."""
     return torch.linalg.vector_norm(x, dim=-1)
-
-
-def relative_difference(x: Tensor, other: Tensor) -> float:
-    """Largest ``|x - other| / (1 + max |x|)`` of trajectories ``(n, steps, D)``."""
-    size = 1.0 + x.abs().amax((1, 2), keepdim=True)  # (n, 1, 1)
-    return largest(((other - x) / size).abs())
