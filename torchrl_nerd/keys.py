@@ -15,9 +15,8 @@ QVEL = "qvel"
 
 TERRAIN = "terrain"
 """Ground parameters of each row ``(*batch, scene.terrain.size)``, world frame, float64.
-A plane is (unit normal, offset) with ``normal . x = offset``; other movable ground is its
-body's position (m) and quaternion, see `Terrain`. Only where the ground varies from row
-to row."""
+Planes (unit normal, offset) with ``normal . x = offset``, see `Terrain`. Only where the
+ground varies from row to row."""
 
 GOAL = "goal"
 """Where the hand should go ``(*batch, 3)``, m, world frame, float64; a task's row

@@ -27,16 +27,15 @@ GROUNDS = {
         <geom type="box" size="1 2 0.3" pos="1 0 0" quat="0.95 0.1 0 0.2"/>""",
     "trench": """<geom type="plane" size="0 0 1" quat="0.9 0.3 0 0" pos="0 0.1 -1"/>
         <geom type="plane" size="0 0 1" quat="0.9 -0.3 0 0" pos="0 0.1 -1"/>""",
-    "moving step": """<geom type="plane" size="0 0 1" pos="0 0 -1"/>
-        <body mocap="true" pos="1 0 0"><geom type="box" size="0.5 1 0.3"/></body>""",
-    "all moving": """<body mocap="true"><geom type="plane" size="0 0 1"/></body>
+    "step and slope": """<geom type="plane" size="0 0 1" pos="0 0 -1"/>
+        <body mocap="true"><geom type="plane" size="0 0 1"/></body>
+        <geom type="box" size="0.5 1 0.3" pos="1 0 0"/>""",
+    "two slopes": """<body mocap="true"><geom type="plane" size="0 0 1"/></body>
         <body mocap="true" pos="9 9 9"/>
-        <body mocap="true"><geom type="sphere" size="0.4" pos="0.1 0 0"/>
-          <body pos="0 0.3 0"><geom type="plane" size="0 0 1" pos="0 0 -0.5"/></body>
-        </body>
-        <body mocap="true"><geom type="capsule" size="0.2 0.3" pos="0 0.3 0"/></body>""",
+        <body mocap="true"><body pos="0 0.3 0">
+          <geom type="plane" size="0 0 1" pos="0 0 -0.5"/></body></body>""",
 }
-WIDTHS = {"slope": 4, "set-in slope": 4, "moving step": 7, "all moving": 4 + 7 + 7}
+WIDTHS = {"slope": 4, "set-in slope": 4, "step and slope": 4, "two slopes": 8}
 each_ground = pytest.mark.parametrize("ground", GROUNDS)
 
 
@@ -53,12 +52,11 @@ def random_places(rows, generator, spread=0.7):
 
 def random_terrain(scene, rows, generator):
     parts = [torch.zeros(rows, 0).double()]
-    for part in scene.terrain.parameters.values():
+    for _ in scene.terrain.planes:
         pose = random_places(rows, generator)
-        if part.stop - part.start == 4:
-            normal = rotate(pose[:, 3:], torch.tensor([0.0, 0.0, 1.0]).double())
-            pose = torch.cat((normal, (normal * pose[:, :3]).sum(-1, keepdim=True)), 1)
-        parts.append(pose)
+        normal = rotate(pose[:, 3:], torch.tensor([0.0, 0.0, 1.0]).double())
+        offset = (normal * pose[:, :3]).sum(-1, keepdim=True)
+        parts.append(torch.cat((normal, offset), 1))
     return torch.cat(parts, -1)
 
 
@@ -140,14 +138,10 @@ def test_features_move_with_robot_and_ground(ground, generator):
         return torch.cat((position, quat_multiply(turn, pose[..., 3:])), -1)
 
     parts = [torch.zeros(ROWS, 0).double()]
-    for part in scene.terrain.parameters.values():
-        numbers = terrain[:, part]
-        if numbers.shape[1] == 4:
-            normal = rotate(turn, numbers[:, :3])
-            offset = numbers[:, 3] + (normal * shift).sum(-1)
-            parts.append(torch.cat((normal, offset[:, None]), -1))
-        else:
-            parts.append(moved(numbers))
+    for plane in scene.terrain.split(terrain):
+        normal = rotate(turn, plane[:, :3])
+        offset = plane[:, 3] + (normal * shift).sum(-1)
+        parts.append(torch.cat((normal, offset[:, None]), -1))
     speed = torch.cat((rotate(turn, qvel[:, :3]), qvel[:, 3:]), -1)
     want = ContactFeatures(scene).contact_features(states, qvel, terrain)
     got = ContactFeatures(elsewhere).contact_features(
@@ -184,7 +178,7 @@ def test_without_parameters_the_ground_is_the_files(ground, generator):
     np.testing.assert_allclose(*others, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("ground", ["moving step", "all moving"])
+@pytest.mark.parametrize("ground", ["step and slope", "two slopes"])
 def test_both_mujoco_dynamics_put_the_ground_in_place(ground, generator):
     scene = scene_over(ground)
     terrain = random_terrain(scene, 6, generator)
@@ -205,12 +199,12 @@ def test_both_mujoco_dynamics_put_the_ground_in_place(ground, generator):
 
 @pytest.mark.parametrize("dynamics", [MujocoDynamics, DMControlDynamics])
 def test_bad_terrain_is_refused_in_one_sentence(dynamics, generator):
-    scene = scene_over("moving step")
+    scene = scene_over("two slopes")
     state = {QPOS: random_places(3, generator), QVEL: torch.zeros(3, 6).double()}
     state, torque = TensorDict(state, [3]), torch.zeros(3, 0).double()
     physics, terrain = dynamics(scene), random_terrain(scene, 3, generator)
     for wrong in (terrain[:, :4], terrain[:2], terrain[0]):
-        with pytest.raises(ValueError, match=r"terrain of shape \(3, 7\), got \("):
+        with pytest.raises(ValueError, match=r"terrain of shape \(3, 8\), got \("):
             physics.step(state, torque, wrong)
     terrain[1, 5] = torch.nan
     with pytest.raises(
@@ -221,13 +215,27 @@ def test_bad_terrain_is_refused_in_one_sentence(dynamics, generator):
         scene.terrain.mocap_pose(terrain)
 
 
-@pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])
+@pytest.mark.parametrize("kind", ["cylinder", "sphere"])
 def test_ground_of_another_shape_is_refused_by_name(kind):
     geom = f'<geom name="stump" type="{kind}" size="0.1 0.2 0.3"/>'
     xml = f"<mujoco><worldbody>{geom}{ROBOT}</worldbody></mujoco>"
     with pytest.raises(
         ValueError, match=f"'stump' of the ground is a {kind}; expected"
     ):
+        _ = make_scene(xml).terrain
+
+
+@pytest.mark.parametrize(
+    ("geoms", "why"),
+    [
+        ('<geom name="a" type="box" size="1 1 1"/>', "'a' of a mocap body .* is a box"),
+        (2 * '<geom type="plane" size="0 0 1"/>', "one plane on a mocap body"),
+    ],
+)
+def test_mocap_bodies_with_other_ground_than_a_plane_are_refused(geoms, why):
+    body = f'<body mocap="true">{geoms}</body>'
+    xml = f"<mujoco><worldbody>{body}{ROBOT}</worldbody></mujoco>"
+    with pytest.raises(ValueError, match=why):
         _ = make_scene(xml).terrain
 
 
@@ -240,7 +248,7 @@ def test_the_hash_sees_the_ground_and_the_robots_does_not():
         + f"{ROBOT}</worldbody></mujoco>"
     )
     scenes += [make_scene(field.format(height)) for height in (0.2, 0.3)]
-    fixed = GROUNDS["moving step"].replace('mocap="true" ', "")
+    fixed = GROUNDS["two slopes"].replace('mocap="true" ', "")
     xml = f"<mujoco><worldbody>{fixed}{ROBOT}</worldbody></mujoco>"
     scenes.append(make_scene(xml))
     assert len({scene.hash for scene in scenes}) == len(scenes)

@@ -3,9 +3,8 @@
 Every function takes points ``(*batch, P, 3)`` and returns the signed distance
 ``(*batch, P)`` (m, negative inside) and the outward unit normal ``(*batch, P, 3)``, both
 at the closest point of the surface, which is ``point - distance * normal``. A plane is
-given by its equation in the points' frame. The other shapes stand in a frame of their own
-as MuJoCo's geoms do, with MuJoCo's sizes ``(3,)`` or ``(*batch, 3)``; `into_frame` takes
-points there.
+given by its equation in the points' frame. Boxes and height fields stand in a frame of
+their own as MuJoCo's geoms do, with MuJoCo's sizes; `into_frame` takes points there.
 
 A height field is a grid of heights over x and y whose cells are each cut in two along the
 diagonal from (row r, column c) to (r + 1, c + 1); see ``mjc_ConvexHField`` in MuJoCo's
@@ -14,9 +13,6 @@ edge or a vertex. A face holds it only if the foot of the perpendicular lies abo
 face's right triangle in the x-y plane.
 """
 
-from collections.abc import Callable
-
-import mujoco
 import torch
 from torch import Tensor
 
@@ -46,29 +42,12 @@ def plane_in_frame(plane: Tensor, position: Tensor, rotation: Tensor) -> Tensor:
     return torch.cat((normal_b, offset_b), -1)
 
 
-def sphere_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """To a sphere about the origin; ``size (*batch, 3)`` begins with its radius, m."""
-    distance, normal = _length_and_direction(points, _z_axis(points))
-    return distance - size[..., None, 0], normal
-
-
-def capsule_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """To a capsule along z; ``size (*batch, 3)``: radius, half the cylinder's length, m."""
-    half = size[..., None, 1]
-    along = points[..., 2]
-    axis = along.clamp(-half, half)  # the closest point of the capsule's axis
-    offset = torch.cat((points[..., :2], (along - axis)[..., None]), -1)
-    x_axis = _z_axis(points).roll(1, -1)
-    distance, normal = _length_and_direction(offset, x_axis)
-    return distance - size[..., None, 0], normal
-
-
 def box_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """To a box about the origin; ``size (*batch, 3)`` is half its lengths, m.
+    """To a box about the origin; ``size (3,)`` is half its lengths, m.
 
     Inside, the closest point lies on the nearest face.
     """
-    beyond = points.abs() - size[..., None, :]  # per axis: how far outside
+    beyond = points.abs() - size  # per axis: how far outside
     deepest = beyond.argmax(-1, keepdim=True)
     sign = torch.where(points < 0.0, -1.0, 1.0).to(points)
     face = torch.zeros_like(points).scatter(-1, deepest, sign.gather(-1, deepest))
@@ -76,14 +55,6 @@ def box_distance(points: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     distance, normal = _length_and_direction(outside, face)
     depth = beyond.gather(-1, deepest)[..., 0]  # (*batch, P)
     return torch.where(depth > 0.0, distance, depth), normal
-
-
-SHAPES: dict[int, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): sphere_distance,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): capsule_distance,
-    int(mujoco.mjtGeom.mjGEOM_BOX): box_distance,
-}
-"""Shapes that MuJoCo's three size numbers determine, by MuJoCo's geom type."""
 
 
 def into_frame(
@@ -232,9 +203,3 @@ def _length_and_direction(vector: Tensor, fallback: Tensor) -> tuple[Tensor, Ten
     length = torch.where(is_zero, torch.ones_like(squared), squared).sqrt()
     direction = torch.where(is_zero, fallback, vector / length)
     return torch.where(is_zero, squared, length)[..., 0], direction
-
-
-def _z_axis(like: Tensor) -> Tensor:
-    axis = torch.zeros_like(like)
-    axis[..., 2] = 1.0
-    return axis

@@ -1,9 +1,7 @@
-"""The ground: planes, boxes, spheres, capsules and height fields, fixed or per row.
+"""The ground: planes, boxes and height fields, and planes that differ from row to row.
 
-Surfaces on mocap bodies stand where each row's parameters say. Those are, mocap body by
-mocap body in MuJoCo's order, the body's pose (position in m, quaternion ``wxyz``), or,
-where a body is nothing but one plane, the plane's equation: unit normal and offset (m).
-All in the world frame.
+A plane on a mocap body stands where each row's parameters say: unit normal and offset (m)
+in the world, plane by plane in MuJoCo's order.
 """
 
 import math
@@ -17,16 +15,14 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.rotations import (
-    matrix_from_quat,
     quat_conjugate,
     quat_matrix,
     quat_multiply,
-    quat_normalize,
     rotate,
 )
 from torchrl_nerd.geometry.surfaces import (
     PLANE_PARAMETERS,
-    SHAPES,
+    box_distance,
     height_field_distance,
     into_frame,
     plane_distance,
@@ -35,13 +31,13 @@ from torchrl_nerd.geometry.surfaces import (
 from torchrl_nerd.scenes.contact_points import geom_label
 
 PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 HEIGHT_FIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
-POSE_PARAMETERS = 7
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One shape of the ground, in its mocap body's frame, or in the world if fixed."""
+    """One shape of the ground, in the world, or a plane in its mocap body's frame."""
 
     kind: int  # MuJoCo's geom type
     size: np.ndarray  # (3,), m, MuJoCo's; of a height field half x, half y and height
@@ -74,43 +70,42 @@ class Terrain:
         """The ground that these geoms make.
 
         Raises:
-            ValueError: a geom is of a shape that no distance is known for.
+            ValueError: a geom is of a shape that no distance is known for, or a mocap body
+                carries more or other ground than one plane.
         """
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         surfaces = tuple(_read_surface(model, data, geom) for geom in geoms)
+        mocaps = [surface.mocap for surface in surfaces if surface.mocap >= 0]
+        if len({*mocaps}) < len(mocaps):
+            raise ValueError(
+                "expected one plane on a mocap body of the ground, got more"
+            )
         return cls(surfaces, np.hstack((data.mocap_pos, data.mocap_quat)))
 
     @cached_property
-    def parameters(self) -> dict[int, slice]:
-        """Where each mocap body's numbers are in a row's parameters."""
-        slices, start = {}, 0
-        for mocap in sorted({s.mocap for s in self.surfaces if s.mocap >= 0}):
-            width = PLANE_PARAMETERS if self.plane_of(mocap) else POSE_PARAMETERS
-            slices[mocap] = slice(start, start + width)
-            start += width
-        return slices
+    def planes(self) -> list[Surface]:
+        """Those on mocap bodies: a row has `PLANE_PARAMETERS` numbers of each."""
+        return [surface for surface in self.surfaces if surface.mocap >= 0]
 
     @property
     def size(self) -> int:
         """How many numbers a row has."""
-        return sum(part.stop - part.start for part in self.parameters.values())
+        return PLANE_PARAMETERS * len(self.planes)
 
     @property
     def is_per_row(self) -> bool:
         """True where every row may have its own ground."""
-        return bool(self.parameters)
+        return bool(self.planes)
 
     @property
     def default(self) -> np.ndarray:
         """A row's parameters ``(size,)`` as the file has them."""
         parts = [np.zeros(0)]
-        for mocap in self.parameters:
-            plane, pose = self.plane_of(mocap), self.mocap_default[mocap]
-            if plane is not None:
-                normal = quat_matrix(pose[3:]) @ plane.plane[:3]
-                pose = np.append(normal, plane.plane[3] + normal @ pose[:3])
-            parts.append(pose)
+        for surface in self.planes:
+            pose, plane = self.mocap_default[surface.mocap], surface.plane
+            normal = quat_matrix(pose[3:]) @ plane[:3]
+            parts.append(np.append(normal, plane[3] + normal @ pose[:3]))
         return np.concatenate(parts)
 
     @property
@@ -119,11 +114,6 @@ class Terrain:
         first = self.surfaces[0]
         is_lone = len(self.surfaces) == 1 and first.mocap < 0 and first.kind == PLANE
         return first.plane if is_lone else None
-
-    def plane_of(self, mocap: int) -> Surface | None:
-        """The plane that is all of a mocap body's ground, or None."""
-        on_body = [s for s in self.surfaces if s.mocap == mocap]
-        return on_body[0] if len(on_body) == 1 and on_body[0].kind == PLANE else None
 
     def mocap_pose(self, terrain: Tensor) -> Tensor:
         """Mocap poses ``(*batch, 7 * mocap bodies)`` that put the ground there.
@@ -136,11 +126,14 @@ class Terrain:
         self.check(terrain, (*terrain.shape[:-1], self.size))
         default = torch.as_tensor(self.mocap_default).to(terrain)
         poses = list(default.expand(*terrain.shape[:-1], -1, -1).unbind(-2))
-        for mocap, part in self.parameters.items():
-            plane, given = self.plane_of(mocap), terrain[..., part]
-            poses[mocap] = given if plane is None else _plane_pose(given, plane)
+        for surface, plane in zip(self.planes, self.split(terrain), strict=True):
+            poses[surface.mocap] = _plane_pose(plane, surface)
         parts = [pose[..., k] for k in (slice(3), slice(3, 7)) for pose in poses]
         return torch.cat((terrain[..., :0], *parts), -1)
+
+    def split(self, terrain: Tensor) -> tuple[Tensor, ...]:
+        """The planes ``(*batch, 4)`` of ``terrain (*batch, size)``."""
+        return terrain.split(PLANE_PARAMETERS, -1) if self.planes else ()
 
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
         """Raise ValueError where a row's parameters are of another shape or not finite.
@@ -194,8 +187,9 @@ class TerrainDistance(nn.Module):
         """
         if terrain is None:
             terrain = self.default.expand(*points.shape[:-2], -1)
+        planes = list(self.terrain.split(terrain))
         (distance, normal), *others = (
-            self._to_surface(index, points, terrain, position, rotation)
+            self._to_surface(index, points, planes, position, rotation)
             for index in range(len(self.terrain.surfaces))
         )
         for other_distance, other_normal in others:
@@ -208,45 +202,39 @@ class TerrainDistance(nn.Module):
         self,
         index: int,
         points: Tensor,
-        terrain: Tensor,
+        planes: list[Tensor],
         position: Tensor,
         rotation: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Distance and normal to one surface."""
+        """Distance and normal to one surface; takes the row's ``planes`` in their order."""
         surface = self.terrain.surfaces[index]
-        origin = getattr(self, f"position_{index}")
-        axes = getattr(self, f"rotation_{index}")
-        if surface.mocap >= 0:
-            row = terrain[..., self.terrain.parameters[surface.mocap]]
-            if self.terrain.plane_of(surface.mocap) is surface:
-                return plane_distance(points, plane_in_frame(row, position, rotation))
-            body = matrix_from_quat(quat_normalize(row[..., 3:]))
-            origin, axes = row[..., :3] + body @ origin, body @ axes
-        elif surface.kind == PLANE:
-            plane = getattr(self, f"plane_{index}").expand(*points.shape[:-2], -1)
-            return plane_distance(points, plane_in_frame(plane, position, rotation))
-        local, turn = into_frame(points, position, rotation, origin, axes)
         if surface.kind == PLANE:
-            distance, normal = local[..., 2], torch.zeros_like(local)
-            normal[..., 2] = 1.0
-        elif surface.kind == HEIGHT_FIELD:
+            plane = (
+                planes.pop(0) if surface.mocap >= 0 else getattr(self, f"plane_{index}")
+            )
+            plane = plane.expand(*points.shape[:-2], -1)
+            return plane_distance(points, plane_in_frame(plane, position, rotation))
+        axes = getattr(self, f"rotation_{index}")
+        origin = getattr(self, f"position_{index}")
+        local, turn = into_frame(points, position, rotation, origin, axes)
+        if surface.kind == HEIGHT_FIELD:
             half_x, half_y = (float(half) for half in surface.size[:2])
             field = getattr(self, f"heights_{index}"), half_x, half_y, self.reach
             distance, normal = height_field_distance(local, *field)
         else:
-            size = getattr(self, f"size_{index}")
-            distance, normal = SHAPES[surface.kind](local, size)
+            distance, normal = box_distance(local, getattr(self, f"size_{index}"))
         return distance, normal @ turn
 
 
 def _read_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surface:
     kind, size = int(model.geom_type[geom]), model.geom_size[geom].copy()
-    if kind not in (PLANE, HEIGHT_FIELD, *SHAPES):
+    body = int(model.body_weldid[model.geom_bodyid[geom]])
+    mocap = int(model.body_mocapid[body])
+    if kind not in ((PLANE, BOX, HEIGHT_FIELD) if mocap < 0 else (PLANE,)):
         name, what = geom_label(model, geom)
-        raise ValueError(
-            f"{name} of the ground is a {what}; expected a plane, box, sphere, capsule "
-            "or height field"
-        )
+        expected = "a plane, box or height field" if mocap < 0 else "a plane"
+        where = "the ground" if mocap < 0 else "a mocap body of the ground"
+        raise ValueError(f"{name} of {where} is a {what}; expected {expected}")
     heights = None
     if kind == HEIGHT_FIELD:
         field = int(model.geom_dataid[geom])
@@ -256,8 +244,6 @@ def _read_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surf
         heights = size[2] * levels.reshape(shape)
     position = data.geom_xpos[geom].copy()
     rotation = data.geom_xmat[geom].reshape(3, 3).copy()
-    body = int(model.body_weldid[model.geom_bodyid[geom]])
-    mocap = int(model.body_mocapid[body])
     if mocap >= 0:  # as the body sees it
         turn = data.xmat[body].reshape(3, 3)
         position = turn.T @ (position - data.xpos[body])

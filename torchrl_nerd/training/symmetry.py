@@ -169,7 +169,7 @@ def _keeps_place(scene: Scene, world: np.ndarray) -> bool:
     if ground is None or np.array_equal(world, np.eye(3)):
         return True
     if ground.is_per_row:
-        return all(s.mocap >= 0 and ground.plane_of(s.mocap) for s in ground.surfaces)
+        return len(ground.planes) == len(ground.surfaces)
     plane = ground.fixed_plane
     return plane is not None and np.allclose(world @ plane[:3], plane[:3])
 

@@ -12,7 +12,6 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.terrain import POSE_PARAMETERS
 
 SETTLE, AT_REST = 5.0, 1e-3  # s; m/s and rad/s
 TRIES = 8
@@ -91,12 +90,8 @@ def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
     qpos[..., q + 3 : q + 7] = quat_multiply(quat, qpos[..., q + 3 : q + 7])
     qvel[..., v : v + 3] = rotate(quat, qvel[..., v : v + 3])
     if scene.terrain is not None and TERRAIN in states.keys():
-        ground = states[TERRAIN]
-        for part in scene.terrain.parameters.values():  # normals, or poses
-            given = ground[..., part]
-            given[..., :3] = rotate(quat, given[..., :3])
-            if given.shape[-1] == POSE_PARAMETERS:
-                given[..., 3:] = quat_multiply(quat, given[..., 3:])
+        for plane in scene.terrain.split(states[TERRAIN]):
+            plane[..., :3] = rotate(quat, plane[..., :3])  # normals
     return states
 
 
