@@ -37,9 +37,7 @@ STEPS: dict[str, StepConfig] = {
     "penalty-contact-1-stage-merged": PenaltyContactConfig(
         num_stages=1, merged_substeps=2
     ),
-    "penalty-contact-3-stages": PenaltyContactConfig(num_stages=3),
 }
-"""Three stages approximate the reference solver, the others the scene's own."""
 
 
 def step_config(name: str) -> StepConfig:

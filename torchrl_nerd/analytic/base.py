@@ -49,12 +49,11 @@ class AnalyticStep(nn.Module, ABC):
         """Where it computes."""
         return next((x.device for x in self.buffers()), torch.device("cpu"))
 
-    @abstractmethod
     def forward(
         self,
         qpos: Tensor,
         qvel: Tensor,
-        joint_torque: Tensor,
+        joint_torque: Tensor | None = None,
         terrain: Tensor | None = None,
     ) -> StepResult:
         """The state after one control step.
@@ -62,9 +61,24 @@ class AnalyticStep(nn.Module, ABC):
         Args:
             qpos: ``(*batch, nq)``, float64.
             qvel: ``(*batch, nv)``.
-            joint_torque: ``(*batch, num_actuated)``, N m and N, held over the step.
+            joint_torque: ``(*batch, num_actuated)``, N m and N, held over the step; None
+                for none.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
         """
+        batch = qpos.shape[:-1]
+        given = (qpos, qvel, joint_torque, terrain)
+        found = self._step(*(x if x is None else _rows(x, batch) for x in given))
+        return StepResult(*(x.reshape(*batch, x.shape[-1]) for x in found))
+
+    @abstractmethod
+    def _step(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, terrain: Any
+    ) -> StepResult:
+        """`forward` of ``N`` robots, ``qpos (N, nq)``."""
+
+
+def _rows(x: Tensor, batch: torch.Size) -> Tensor:
+    return x.reshape(batch.numel(), x.shape[-1])  # of no numbers, too
 
 
 def check_supported(scene: Scene) -> None:

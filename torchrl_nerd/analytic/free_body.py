@@ -126,24 +126,12 @@ class FreeBodyPenaltyStep(AnalyticStep):
         self.raw[:count] = (wanted[:count] / self.nominal).log() / self.share
         self.raw[count:] = wanted[count:] / self.shift
 
-    def forward(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor | None = None,
-        terrain: Tensor | None = None,
-    ) -> StepResult:
-        """See `AnalyticStep.forward`; a free body has no torque and no other ground.
+    def _step(self, qpos: Tensor, qvel: Tensor, *_: Tensor | None) -> StepResult:
+        """See `AnalyticStep`; a free body has no torque and no other ground.
 
         The backward Euler spring adds ``h k`` to the damping, which is small only beside
         ``mass / substep``: 90 N s/m at a corner of the measured cube.
         """
-        batch = qpos.shape[:-1]
-        found = self._step(qpos.reshape(-1, 7), qvel.reshape(-1, 6))
-        return StepResult(*(x.reshape(*batch, x.shape[-1]) for x in found))
-
-    def _step(self, qpos: Tensor, qvel: Tensor) -> StepResult:
-        """One control step of ``N`` bodies, ``qpos (N, 7)``, ``qvel (N, 6)``."""
         scaled = self.scaled()
         gravity, size, heavier, mu, ke, kd, kf, ground, *_, fading = scaled.unbind()
         centre, inertia = scaled[-4:-1], heavier * self.inertia

@@ -29,8 +29,8 @@ class FrozenDynamics(NamedTuple):
 class DynamicsEvaluation(nn.Module):
     """Evaluates the `FrozenDynamics` of a robot over its ground.
 
-    Joint damping is implicit over ``damping_period`` s; 0: explicit. A scene without ground
-    raises ValueError.
+    Joint damping is implicit over ``damping_period`` s. A scene without ground raises
+    ValueError.
     """
 
     joints: Tensor  # (P C',): joints that move each point, flat
@@ -78,7 +78,7 @@ class DynamicsEvaluation(nn.Module):
         self,
         qpos: Tensor,
         qvel: Tensor,
-        joint_torque: Tensor,
+        joint_torque: Tensor | None,
         terrain: Tensor | None,
         dtype: torch.dtype,
     ) -> FrozenDynamics:

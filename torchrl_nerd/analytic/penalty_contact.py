@@ -6,17 +6,13 @@ contacts and limits do not, but their law is a cheap function of depth and veloc
 dynamics are evaluated at ``num_stages`` times only, and MuJoCo's substeps are made with the
 force law anew and all else interpolated, see `substeps`.
 
-| stages | evaluated at | substeps |
-|---|---|---|
-| 1 | the mean time of the substeps, extrapolated at the start's velocity | Euler |
-| 2 | the start, and the mean time, which the substeps so far lead to | Euler |
-| 3 | the start, a third, two thirds (Heun's third-order rule) | leapfrog |
-
-Source: E. Hairer, S. P. Norsett, G. Wanner, "Solving ordinary differential equations I",
-table II.1.1.
+| stages | evaluated at |
+|---|---|
+| 1 | the mean time of the substeps, extrapolated at the start's velocity |
+| 2 | the start, and the mean time, which the substeps so far lead to |
 """
 
-from itertools import pairwise
+from typing import Any
 
 import mujoco
 import torch
@@ -43,8 +39,7 @@ class PenaltyContactStep(AnalyticStep):
     Args:
         scene: a robot of hinges and slides, on a floating or a fixed base, over a ground,
             whose contacts and limits follow the penalty law, see `scenes.penalty_law`.
-        num_stages: dynamics evaluations per outer step: 1, 2, or 3, which approximates the
-            reference solver (`Scene.reference`) in place of the scene's own.
+        num_stages: dynamics evaluations per outer step: 1 or 2.
         num_outer_steps: equal parts of the control step, one after the other.
         merged_substeps: how many of MuJoCo's substeps are made as one.
         precision: of the forces and substeps; poses are float64.
@@ -62,91 +57,73 @@ class PenaltyContactStep(AnalyticStep):
         merged_substeps: int = 1,
         precision: Precision = "float32",
     ) -> None:
-        if num_stages not in (1, 2, 3):
-            raise ValueError(f"expected 1, 2 or 3 stages, got {num_stages}")
+        if num_stages not in (1, 2):
+            raise ValueError(f"expected 1 or 2 stages, got {num_stages}")
         check_supported(scene)
         config = PenaltyContactConfig(
             num_stages, num_outer_steps, merged_substeps, precision
         )
         super().__init__(scene, config, num_outer_steps * scene.layout.nv)
-        is_reference = num_stages == 3
-        if not is_reference and scene.model.opt.integrator != EULER:
+        if scene.model.opt.integrator != EULER:
             found = mujoco.mjtIntegrator(scene.model.opt.integrator).name
             raise ValueError(
-                f"expected substeps of mjINT_EULER, got {found} in scene '{scene.name}' "
-                "(three stages approximate the reference solver)"
+                f"expected substeps of mjINT_EULER, got {found} in scene '{scene.name}'"
             )
-        own = (scene.reference if is_reference else scene).substeps
-        substeps = max(1, own // merged_substeps)
+        substeps = max(1, scene.substeps // merged_substeps)
         if num_outer_steps < 1 or substeps % num_outer_steps:
             raise ValueError(
                 f"expected outer steps that divide {substeps} substeps, got "
                 f"{num_outer_steps}"
             )
-        self.num_outer_steps = num_outer_steps
+        self.num_stages, self.num_outer_steps = num_stages, num_outer_steps
         self.num_substeps = substeps // num_outer_steps  # of each outer step
         self.step_size = scene.control_step / substeps
-        offset = 0.5 if is_reference else 0.0
-        mean, third = 0.5 * (self.num_substeps - 1) + offset, self.num_substeps / 3
-        stages = {1: (mean,), 2: (0.0, mean), 3: (0.0, third, 2.0 * third)}
-        self.stage_times = stages[num_stages]  # in substeps
+        self.mean_time = 0.5 * (self.num_substeps - 1)  # in substeps
         axes = JointAxes.of(scene.model, scene.base)
-        damping_period = 0.0 if is_reference else 2.0 * self.step_size
-        self.evaluation = DynamicsEvaluation(scene, axes, damping_period)
+        self.evaluation = DynamicsEvaluation(scene, axes, 2.0 * self.step_size)
         self.layout, self.dtype = scene.layout, getattr(torch, precision)
         self.integrator = SubstepIntegrator(
-            scene, axes, self.evaluation, self.step_size, offset
+            scene, axes, self.evaluation, self.step_size
         )
 
-    def forward(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+    def _step(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, terrain: Any
     ) -> StepResult:
-        """See `AnalyticStep.forward`."""
-        batch = qpos.shape[:-1]
-        qpos, qvel, joint_torque = (
-            x.flatten(0, -2) for x in (qpos, qvel, joint_torque)
-        )
-        ground = None if terrain is None else terrain.flatten(0, -2)
+        """See `AnalyticStep`."""
         defects = []
         for _ in range(self.num_outer_steps):
-            qpos, qvel, defect = self._outer_step(qpos, qvel, joint_torque, ground)
+            qpos, qvel, defect = self._outer_step(qpos, qvel, joint_torque, terrain)
             defects.append(defect)
-        found = qpos, qvel, torch.cat(defects, -1)
-        return StepResult(*(x.unflatten(0, batch) for x in found))
+        return StepResult(qpos, qvel, torch.cat(defects, -1))
 
     def _outer_step(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, ground: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, ground: Any
     ) -> StepResult:
         """One outer step of ``N`` robots, ``qpos (N, nq)``."""
         drive = joint_torque, ground, self.dtype
-        first, last = self.stage_times[0], self.stage_times[-1]
-        position, velocity, ahead = qpos, qvel, first * self.step_size
-        if first:
+        integrator, mean, velocity = self.integrator, self.mean_time, qvel
+        if self.num_stages == 1:
+            ahead = mean * self.step_size
             position = integrate_pos(self.layout, qpos, ahead * qvel)
-        dynamics = self.evaluation(position, velocity, *drive)
-        if first:  # depths at the start, from which the substeps go on
-            speed = self.integrator.to_base_frame(qvel.mT, dynamics.rotation.mT)
+            dynamics, between = self.evaluation(position, qvel, *drive), 0.0
+            # depths at the start, from which the substeps go on
+            speed = integrator.to_base_frame(qvel.mT, dynamics.rotation.mT)
             speed = speed.to(self.dtype)
             moving = self.evaluation.point_velocity(dynamics.jacobian, speed)
             rising = (moving * dynamics.normal).sum(0)
             dynamics = dynamics._replace(depth=dynamics.depth + ahead * rising)
-        start = dynamics
-        for earlier, later in pairwise(self.stage_times):
-            states = self.integrator.integrate_substeps(
-                start, dynamics, earlier, qpos, qvel, later
-            )
-            state = state_at(states, later)
-            position, velocity = self._moved(qpos, state, dynamics.rotation)
-            dynamics = self.evaluation(position, velocity, *drive)
-        states = self.integrator.integrate_substeps(
-            start, dynamics, last - first, qpos, qvel, self.num_substeps
+            start = dynamics
+        else:
+            start = self.evaluation(qpos, qvel, *drive)
+            states = integrator.integrate_substeps(start, start, 0.0, qpos, qvel, mean)
+            state = state_at(states, mean)
+            position, velocity = self._moved(qpos, state, start.rotation)
+            dynamics, between = self.evaluation(position, velocity, *drive), mean
+        states = integrator.integrate_substeps(
+            start, dynamics, between, qpos, qvel, self.num_substeps
         )
-        used = self.integrator.to_base_frame(velocity.mT, dynamics.rotation.mT)
-        defect = (state_at(states, last).qvel - used).mT
+        used = integrator.to_base_frame(velocity.mT, dynamics.rotation.mT)
+        defect = (state_at(states, mean).qvel - used).mT
         return StepResult(*self._moved(qpos, states[-1], dynamics.rotation), defect)
 
     def _moved(

@@ -43,9 +43,8 @@ class SubstepState(NamedTuple):
 class SubstepIntegrator(nn.Module):
     """Integrates a robot under penalty contact and limit forces.
 
-    Contacts and limits of ``scene`` must follow the penalty law, with elliptic cones; else
-    ValueError. Forces act at ``stage_offset`` of a substep of ``step_size`` s: 0 for
-    semi-implicit Euler, 0.5 for leapfrog.
+    By semi-implicit Euler substeps of ``step_size`` s. Contacts and limits of ``scene``
+    must follow the penalty law, with elliptic cones; else ValueError.
     """
 
     limited_dofs: Tensor  # (L,)
@@ -60,11 +59,9 @@ class SubstepIntegrator(nn.Module):
         axes: JointAxes,
         evaluation: DynamicsEvaluation,
         step_size: float,
-        stage_offset: float,
     ) -> None:
         super().__init__()
-        self.step_size, self.stage_offset = step_size, stage_offset
-        self.evaluation = evaluation
+        self.step_size, self.evaluation = step_size, evaluation
         self.num_base_dofs = evaluation.num_base_dofs
         model, points = scene.model, scene.contacts
         if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
@@ -128,24 +125,16 @@ class SubstepIntegrator(nn.Module):
             jacobian_rate = rate * (last.jacobian - jacobian)
             qacc_rate = rate * (last.qacc_smooth - qacc_smooth)
         jacobian_0, moved = jacobian, torch.zeros_like(speed)
-        change = moved
         states, scatter = [SubstepState(speed, moved)], self.scatter.to(speed)
         for number in range(ceil(num_substeps)):
-            time = number + self.stage_offset
             if jacobian_rate is not None:
-                jacobian = torch.add(jacobian_0, jacobian_rate, alpha=time)
+                jacobian = torch.add(jacobian_0, jacobian_rate, alpha=number)
             velocity = self.evaluation.point_velocity(jacobian, speed)
             rising = (velocity * normal).sum(0)  # (P, N)
-            if time:
-                depth = depth - min(1.0, time) * step * rising
-            damped = speed
-            if self.stage_offset:
-                moved = self._composed(moved, self.stage_offset * step * speed)
-                damped = speed + self.stage_offset * change  # extrapolated to the stage
-                velocity = self.evaluation.point_velocity(jacobian, damped)
-                rising = (velocity * normal).sum(0)
+            if number:
+                depth = depth - step * rising
             force = self._contact_force(depth, rising, velocity, normal)
-            angles, rates = moved[self.limited_dofs], damped[self.limited_dofs]
+            angles, rates = moved[self.limited_dofs], speed[self.limited_dofs]
             limit = self._limit_force(joints + angles, rates)
             columns = (jacobian * force[:, :, None]).sum(0).flatten(0, 1)  # (P C, N)
             qfrc = matvec(scatter, torch.cat((columns, limit)))
@@ -153,10 +142,9 @@ class SubstepIntegrator(nn.Module):
                 qfrc = torch.cat((force.sum(1), qfrc[self.num_base_dofs :]))
             qacc = qacc_smooth
             if qacc_rate is not None:
-                qacc = torch.add(qacc_smooth, qacc_rate, alpha=time)
-            change = step * (qacc + (inverse * qfrc).sum(1))
-            speed = speed + change
-            moved = self._composed(moved, (1.0 - self.stage_offset) * step * speed)
+                qacc = torch.add(qacc_smooth, qacc_rate, alpha=number)
+            speed = speed + step * (qacc + (inverse * qfrc).sum(1))
+            moved = self._composed(moved, step * speed)
             states.append(SubstepState(speed, moved))
         return states
 

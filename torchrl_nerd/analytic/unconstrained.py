@@ -7,6 +7,8 @@ at that time, and there. This midpoint rule shares the error of the substeps ins
 adding its own. Joint limits change faster and are solved anew several times per step.
 """
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from torch import Tensor
@@ -17,7 +19,7 @@ from torchrl_nerd.configs import UnconstrainedConfig
 from torchrl_nerd.geometry.base import BasePose, JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
-from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.geometry.spd import spd_inverse
 from torchrl_nerd.scenes.scene import Scene
 
@@ -59,14 +61,10 @@ class UnconstrainedStep(AnalyticStep):
             self.limits = JointLimits(model, axes, substep)
             self.num_solves = self.limits.num_solves(self.step_size)
 
-    def forward(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+    def _step(
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, terrain: Any
     ) -> StepResult:
-        """See `AnalyticStep.forward`."""
+        """See `AnalyticStep`."""
         ahead = 0.5 * (self.step_size - self.lag)
         state, solves = (qpos, qvel), self.num_solves
         start = self._dynamics(*state, joint_torque, 2.0 * ahead)
@@ -76,9 +74,9 @@ class UnconstrainedStep(AnalyticStep):
         return StepResult(*after, self.step_size * (dynamics[0] - start[0]))
 
     def _dynamics(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, period: float
+        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, period: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Unconstrained acceleration ``(*batch, nv)``, inverse mass matrix ``(nv, nv, N)``.
+        """Unconstrained acceleration ``(N, nv)``, inverse mass matrix ``(nv, nv, N)``.
 
         The inverse is None where no limit needs it.
         """
@@ -90,7 +88,7 @@ class UnconstrainedStep(AnalyticStep):
         if self.limits is None:
             return self.rigid_body(*where), None
         inverse, qacc = spd_inverse(*self.rigid_body.mass_matrix_and_force(*where))
-        return qacc.movedim(0, -1).reshape(qvel.shape), inverse
+        return qacc.mT, inverse
 
     def _integrate(
         self,
@@ -105,7 +103,6 @@ class UnconstrainedStep(AnalyticStep):
         if self.limits is None or inverse is None:
             moved = period * (qvel + 0.5 * (period + self.lag) * qacc)
             return integrate_pos(self.layout, qpos, moved), qvel + period * qacc
-        rows = [rows_last(x, 1) for x in (qpos, qvel, qacc)]
-        state = self.limits(*rows, inverse, period, num_solves, self.lag)
-        next_qpos, next_qvel = (x.movedim(0, -1).reshape(qpos.shape) for x in state)
-        return next_qpos, next_qvel
+        held = inverse, period, num_solves, self.lag
+        next_qpos, next_qvel = self.limits(qpos.mT, qvel.mT, qacc.mT, *held)
+        return next_qpos.mT, next_qvel.mT
