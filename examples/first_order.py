@@ -23,9 +23,9 @@ from torch.optim.lr_scheduler import LinearLR
 from tqdm import trange
 
 from torchrl_nerd import NeRDEnv, make_env
+from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.frame_stack import append_frame, stack_frames
-from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import (
     ReturnSummary,
@@ -77,7 +77,9 @@ def measure(cfg: Config, policy: Policy) -> ReturnSummary:
 
 def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]]:
     """The policy with the largest return, and the mean reward of every window."""
-    model = resolve_model(cfg.dynamics, make_task(cfg.task).scene).requires_grad_(False)
+    model = from_pretrained(cfg.dynamics, make_task(cfg.task).scene).requires_grad_(
+        False
+    )
     env = NeRDEnv(cfg.task, model, cfg.num_envs, cfg.seed, differentiable=True)
     policy = make_policy(cfg, env)
     if cfg.compile:

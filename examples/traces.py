@@ -17,8 +17,8 @@ import tyro
 from matplotlib.figure import Figure
 from tensordict import TensorDict
 
+from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
-from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
@@ -53,7 +53,7 @@ def main(options: Options) -> None:
     source = look_up("case", case, protocol.cases)
     count, steps = options.trajectories, options.steps or min(protocol.horizons)
 
-    scene, model = scene_of(source), resolve_model(options.dynamics, own)
+    scene, model = scene_of(source), from_pretrained(options.dynamics, own)
     model = model if scene is own else model.with_terrain(scene)
     start = initial_states(source, count, options.seed)
     is_random = case in protocol.random_actions

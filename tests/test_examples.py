@@ -12,8 +12,8 @@ import tyro
 from dm_control import suite as dm_suite
 from helpers import EXCERPT, slow_but
 
+from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
-from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.evaluation.policy import load_policy
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
 from torchrl_nerd.robots import load_scene, make_task, protocol_of
@@ -117,7 +117,7 @@ def test_traces_are_drawn(words, monkeypatch, tmp_path, seed, capsys):
     name = words.split()[0]
     scene = load_scene(name)
     source = next(iter(protocol_of(scene).cases.values()))
-    model = resolve_model("analytic" if "analytic" in words else "nerd", scene)
+    model = from_pretrained("analytic" if "analytic" in words else "nerd", scene)
     dynamics = dynamics_of(model.with_terrain(scene_of(source)))
     ground_truth = MujocoDynamics(dynamics.scene)
     found = passive_errors(source, dynamics, ground_truth, [5], 4, seed)[5]

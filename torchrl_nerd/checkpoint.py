@@ -13,9 +13,9 @@ from typing import Any
 import mujoco
 import torch
 
-from torchrl_nerd.analytic import make_step
+from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.card import FORMAT, config_of, make_card
-from torchrl_nerd.dynamics import Model
+from torchrl_nerd.dynamics import ENGINES, Model
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
@@ -33,6 +33,8 @@ from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
 PRETRAINED = Path(__file__).parent / "pretrained"
+KINDS = ("nerd", "hybrid", "analytic")
+"""Names of the models of a scene, beside those of engines and of shipped models."""
 
 
 def save_checkpoint(model: Model, folder: Path, card: dict[str, Any]) -> Path:
@@ -93,31 +95,65 @@ def read_checkpoint(
 
 @torch.inference_mode(False)
 def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> Model:
-    """A shipped model by its name, or one of your own by its folder.
+    """The model of that name, which `make_env` and every command take.
 
-    The name of a scene stands for its learned model, ``cube`` for ``cube-mlp``, where no
-    folder has that name.
+    Args:
+        name_or_folder: a shipped model, a scene (``"cube"`` stands for its learned model
+            ``"cube-mlp"``) or a checkpoint folder. For a given scene also ``"nerd"`` (its
+            learned model), ``"hybrid"``, ``"analytic"``, or an analytic step in `STEPS`.
+        scene: the robot; by default that of the model.
 
     Raises:
-        ValueError: neither a shipped model nor a folder with a checkpoint.
+        ValueError: in one sentence, no such model, or a scene that it cannot step.
     """
-    asked = str(name_or_folder)
-    name = folder_name(asked) if is_import(asked) else asked
-    shipped = shipped_models()
-    if name in shipped:
-        return load_checkpoint(PRETRAINED / name, scene)
-    if os.path.isdir(asked):  # False, too, for what no path can be
-        return load_checkpoint(Path(name_or_folder), scene)
-    if f"{name}-mlp" in shipped:
-        return load_checkpoint(PRETRAINED / f"{name}-mlp", scene)
-    if is_import(asked):
+    if not isinstance(name_or_folder, str | Path):
+        raise ValueError(f"expected dynamics of {_known()}, got {name_or_folder!r}")
+    found = model_name(name_or_folder, scene)
+    if scene is not None and (found == "analytic" or found in STEPS):
+        return make_step(scene, STEPS.get(found))
+    if found in shipped_models():
+        return load_checkpoint(PRETRAINED / found, scene)
+    if os.path.isdir(found):  # False, too, for what no path can be
+        return load_checkpoint(Path(found), scene)
+    if found in ENGINES:
+        raise ValueError(f"expected a model, got the engine '{found}'")
+    asked = scene.name if scene is not None and found in KINDS else found
+    if asked != found or is_import(found):
+        kind = "hybrid" if found == "hybrid" else "learned"
+        step = " --step STEP" if found == "hybrid" else ""
         raise ValueError(
-            f"no model of '{asked}' is shipped: make one with `nerd data {asked}` and "
-            f"`nerd train {asked}`, then give its folder, runs/{name}/best"
+            f"no {kind} model of '{asked}' is shipped: make one with `nerd data {asked}` "
+            f"and `nerd train {asked} --kind {kind}{step}`, and give its folder, such as "
+            f"runs/{folder_name(asked)}/best; `nerd explain {asked}` names the analytic "
+            "steps that suit it"
         )
-    raise ValueError(
-        f"expected a shipped model ({', '.join(shipped)}) or a checkpoint folder, got "
-        f"{asked!r}"
+    raise ValueError(f"unknown dynamics {str(found)!r}, expected {_known()}")
+
+
+def model_name(name: str | Path, scene: Scene | None = None) -> str:
+    """The model that a name stands for: ``"cube-mlp"`` for ``"nerd"`` or ``"cube"``.
+
+    What stands for nothing else, or for nothing at all, is returned as it is.
+    """
+    asked = given = str(name)
+    shipped = shipped_models()
+    if scene is not None:
+        # a folder called "ant" is what "ant" names, but never what "nerd" stands for
+        asked = {"nerd": scene.name, "hybrid": f"{scene.name}-hybrid"}.get(given, given)
+    if asked in shipped:
+        return asked
+    is_folder = asked == given and os.path.isdir(given)
+    is_learned = f"{asked}-mlp" in shipped and not is_folder
+    return f"{asked}-mlp" if is_learned else given
+
+
+def _known() -> str:
+    """All that ``dynamics=`` takes."""
+    names, steps = ", ".join((*KINDS, *ENGINES)), ", ".join(STEPS)
+    shipped = ", ".join(shipped_models())
+    return (
+        f"{names}, an analytic step ({steps}), a shipped model ({shipped}) or a "
+        "checkpoint folder"
     )
 
 
@@ -230,6 +266,7 @@ __all__ = [
     "from_pretrained",
     "load_checkpoint",
     "make_card",
+    "model_name",
     "read_checkpoint",
     "save_checkpoint",
     "shipped_card",

@@ -1,6 +1,7 @@
 """Settings of a configuration class that are out of range."""
 
 from collections.abc import Mapping
+from numbers import Integral
 from typing import TypeVar
 
 import torch
@@ -21,6 +22,19 @@ def expect_at_least(least: float, **settings: float) -> None:
     for name, value in settings.items():
         if not value >= least:  # NaN is not either
             raise SettingError(f"expected {name} of at least {least}, got {value}")
+
+
+def expect_count(least: int, **settings: object) -> None:
+    """Refuse settings that are no whole numbers of at least ``least``.
+
+    Raises:
+        SettingError: naming the first such setting.
+    """
+    for name, value in settings.items():
+        if not isinstance(value, Integral) or int(value) < least:
+            raise SettingError(
+                f"expected {name}, a whole number of at least {least}, got {value!r}"
+            )
 
 
 def look_up(what: str, name: str, known: Mapping[str, Value]) -> Value:

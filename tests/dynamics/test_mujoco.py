@@ -102,3 +102,13 @@ def test_no_rows_at_all_stay_none(scene, generator):
     path = MujocoDynamics(scene).rollout(start, torque, terrain)
     assert path.batch_size == (0, 3) and path["qpos"].shape == (0, 3, scene.layout.nq)
     assert len(MujocoDynamics(scene).step(start, torque[:, 0], terrain)) == 0
+
+
+def test_no_steps_lead_nowhere(scene, generator):
+    start, torques, terrain = random_drive(scene, ROWS, 1, generator)
+    dynamics = MujocoDynamics(scene, 1)
+    path = dynamics.rollout(start, torques.transpose(0, 1)[:, :0], terrain)
+    assert path.batch_size == (ROWS, 0) and path["qvel"].shape[2:] == (scene.model.nv,)
+    fresh = MujocoDynamics(scene, 1)
+    after, expected = (d.step(start, torques[0], terrain) for d in (dynamics, fresh))
+    assert not unequal_keys(after, expected)

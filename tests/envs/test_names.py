@@ -6,7 +6,7 @@ import pytest
 from dynamics_helpers import random_model
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, from_pretrained, load_scene, make_env
-from torchrl_nerd.envs.resolve import ENGINES
+from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.robots import TASKS, make_task
 
 TASK = "ant/run"
@@ -117,3 +117,30 @@ def test_a_misspelt_name_is_told_the_nearest():
         make_env("cartpole/swing_up")
     with pytest.raises(ValueError, match=r"unknown scene 'xyz', expected"):
         load_scene("xyz")
+
+
+@pytest.mark.parametrize("dynamics", ["analytic", "mujoco"])
+@pytest.mark.parametrize("num_envs", [1.5, "2", None, 0, -1])
+def test_the_number_of_envs_is_a_number(dynamics, num_envs):
+    said = refusal(lambda: make_env("cartpole/swingup", dynamics, num_envs))
+    assert said == f"expected num_envs, a whole number of at least 1, got {num_envs!r}"
+
+
+@pytest.mark.parametrize("seed", ["a", 1.5, -1, 2**63])
+def test_so_is_a_seed(seed):
+    said = refusal(lambda: make_env("cartpole/swingup", "analytic", seed=seed))
+    assert said == f"expected a seed from 0 to {2**63 - 1}, got {seed!r}"
+
+
+@pytest.mark.parametrize("what", ["reward", "terminated"])
+def test_a_task_says_one_thing_of_each_env(what):
+    kind = type(make_task("cartpole/swingup"))
+    once = getattr(kind, what)
+
+    def twice(self, *args):
+        return once(self, *args)[:, None]
+
+    task = type("Mine", (kind,), {what: twice})()
+    env = make_env(task, "analytic", num_envs=3)
+    said = refusal(lambda: env.rollout(1))
+    assert said == f"expected {what} of shape (3,) from Mine, got (3, 1)"

@@ -449,3 +449,31 @@ def test_a_ground_per_row_needs_somebody_to_draw_it(tmp_path):
         return torch.tensor([0.0, 0.0, 1.0, 0.0]).double().expand(len(qpos), 4)
 
     assert Scene.from_mjcf(path, ground=level).terrain.is_per_row
+
+
+@pytest.mark.parametrize("control_step", [float("nan"), float("inf"), 0, -0.02, "a"])
+def test_a_control_step_is_a_length_of_time(control_step, tmp_path):
+    with pytest.raises(ValueError) as error:
+        Scene.from_mjcf(write(tmp_path, BODY), control_step=control_step)
+    assert f"whole timesteps of 0.002 s, got {control_step!r}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "why"),
+    [
+        ({"grond": None}, "expected ranges among qpos_low, .*, got 'grond'"),
+        ({"zero_torque_fraction": 1.1}, "zero_torque_fraction from 0 to 1, got 1.1"),
+        ({"low_torque_fraction": -0.1}, "low_torque_fraction from 0 to 1, got -0.1"),
+        ({"low_torque_fraction": float("nan")}, "from 0 to 1, got nan"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(ranges, why, tmp_path):
+    with pytest.raises(ValueError, match=why) as error:
+        Scene.from_mjcf(write(tmp_path, BODY), **ranges)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", [None, 5, ["ant"], ("ant",)])
+def test_what_is_no_name_is_no_scene(name):
+    with pytest.raises(ValueError, match="unknown scene .*, expected one of"):
+        load_scene(name)

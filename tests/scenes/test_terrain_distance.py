@@ -27,7 +27,7 @@ GROUNDS = {
         <geom type="box" size="1 2 0.3" pos="1 0 0" quat="0.95 0.1 0 0.2"/>""",
     "trench": """<geom type="plane" size="0 0 1" quat="0.9 0.3 0 0" pos="0 0.1 -1"/>
         <geom type="plane" size="0 0 1" quat="0.9 -0.3 0 0" pos="0 0.1 -1"/>""",
-    "step and slope": """<geom type="plane" size="0 0 1" pos="0 0 -1"/>
+    "slope and step": """<geom type="plane" size="0 0 1" pos="0 0 -1"/>
         <body mocap="true"><geom type="plane" size="0 0 1"/></body>
         <geom type="box" size="0.5 1 0.3" pos="1 0 0"/>""",
     "two slopes": """<body mocap="true"><geom type="plane" size="0 0 1"/></body>
@@ -35,7 +35,7 @@ GROUNDS = {
         <body mocap="true"><body pos="0 0.3 0">
           <geom type="plane" size="0 0 1" pos="0 0 -0.5"/></body></body>""",
 }
-WIDTHS = {"slope": 4, "set-in slope": 4, "step and slope": 4, "two slopes": 8}
+WIDTHS = {"slope": 4, "set-in slope": 4, "slope and step": 4, "two slopes": 8}
 each_ground = pytest.mark.parametrize("ground", GROUNDS)
 
 
@@ -178,7 +178,7 @@ def test_without_parameters_the_ground_is_the_files(ground, generator):
     np.testing.assert_allclose(*others, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("ground", ["step and slope", "two slopes"])
+@pytest.mark.parametrize("ground", ["slope and step", "two slopes"])
 def test_both_mujoco_dynamics_put_the_ground_in_place(ground, generator):
     scene = scene_over(ground)
     terrain = random_terrain(scene, 6, generator)

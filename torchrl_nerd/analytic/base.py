@@ -66,19 +66,19 @@ class AnalyticStep(nn.Module, ABC):
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
         """
         batch = qpos.shape[:-1]
-        given = (qpos, qvel, joint_torque, terrain)
-        found = self._step(*(x if x is None else _rows(x, batch) for x in given))
+        qpos, qvel = (x.reshape(batch.numel(), x.shape[-1]) for x in (qpos, qvel))
+        drive = (
+            None if x is None else x.reshape(len(qpos), x.shape[-1])
+            for x in (joint_torque, terrain)
+        )
+        found = self._step(qpos, qvel, *drive)
         return StepResult(*(x.reshape(*batch, x.shape[-1]) for x in found))
 
     @abstractmethod
     def _step(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, terrain: Any
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None
     ) -> StepResult:
         """`forward` of ``N`` robots, ``qpos (N, nq)``."""
-
-
-def _rows(x: Tensor, batch: torch.Size) -> Tensor:
-    return x.reshape(batch.numel(), x.shape[-1])  # of no numbers, too
 
 
 def check_supported(scene: Scene) -> None:

@@ -126,14 +126,16 @@ class FreeBodyPenaltyStep(AnalyticStep):
         self.raw[:count] = (wanted[:count] / self.nominal).log() / self.share
         self.raw[count:] = wanted[count:] / self.shift
 
-    def _step(self, qpos: Tensor, qvel: Tensor, *_: Tensor | None) -> StepResult:
+    def _step(
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None
+    ) -> StepResult:
         """See `AnalyticStep`; a free body has no torque and no other ground.
 
         The backward Euler spring adds ``h k`` to the damping, which is small only beside
         ``mass / substep``: 90 N s/m at a corner of the measured cube.
         """
         scaled = self.scaled()
-        gravity, size, heavier, mu, ke, kd, kf, ground, *_, fading = scaled.unbind()
+        gravity, size, heavier, mu, ke, kd, kf, floor, *_, fading = scaled.unbind()
         centre, inertia = scaled[-4:-1], heavier * self.inertia
         h, points = self.step_size, size * self.points - centre
         soften = 1.0 + h * (kd + h * ke) / self.lightest  # backward Euler at a point
@@ -156,7 +158,7 @@ class FreeBodyPenaltyStep(AnalyticStep):
             linear = linear - fall
             up = rotation[:, 2]  # (N, 3), of the world, in body axes
             in_body = (linear[:, None] @ rotation)[:, 0]
-            depth = ground - position[:, 2:] - up @ points.mT  # (N, P)
+            depth = floor - position[:, 2:] - up @ points.mT  # (N, P)
             moving = (angular @ cross.mT).unflatten(1, (-1, 3)) + in_body[:, None]
             rising = (moving @ up[:, :, None])[..., 0]
             sliding = moving - rising[..., None] * up[:, None]  # (N, P, 3)

@@ -12,8 +12,6 @@ force law anew and all else interpolated, see `substeps`.
 | 2 | the start, and the mean time, which the substeps so far lead to |
 """
 
-from typing import Any
-
 import mujoco
 import torch
 from torch import Tensor
@@ -87,20 +85,20 @@ class PenaltyContactStep(AnalyticStep):
         )
 
     def _step(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, terrain: Any
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None
     ) -> StepResult:
         """See `AnalyticStep`."""
         defects = []
         for _ in range(self.num_outer_steps):
-            qpos, qvel, defect = self._outer_step(qpos, qvel, joint_torque, terrain)
+            qpos, qvel, defect = self._outer_step(qpos, qvel, torque, ground)
             defects.append(defect)
         return StepResult(qpos, qvel, torch.cat(defects, -1))
 
     def _outer_step(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, ground: Any
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None
     ) -> StepResult:
         """One outer step of ``N`` robots, ``qpos (N, nq)``."""
-        drive = joint_torque, ground, self.dtype
+        drive = torque, ground, self.dtype
         integrator, mean, velocity = self.integrator, self.mean_time, qvel
         if self.num_stages == 1:
             ahead = mean * self.step_size

@@ -7,8 +7,6 @@ at that time, and there. This midpoint rule shares the error of the substeps ins
 adding its own. Joint limits change faster and are solved anew several times per step.
 """
 
-from typing import Any
-
 import mujoco
 import numpy as np
 from torch import Tensor
@@ -62,14 +60,14 @@ class UnconstrainedStep(AnalyticStep):
             self.num_solves = self.limits.num_solves(self.step_size)
 
     def _step(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor | None, terrain: Any
+        self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None
     ) -> StepResult:
         """See `AnalyticStep`."""
         ahead = 0.5 * (self.step_size - self.lag)
         state, solves = (qpos, qvel), self.num_solves
-        start = self._dynamics(*state, joint_torque, 2.0 * ahead)
+        start = self._dynamics(*state, torque, 2.0 * ahead)
         middle = self._integrate(*state, start, ahead, solves // 2)
-        dynamics = self._dynamics(*middle, joint_torque, 2.0 * self.lag)
+        dynamics = self._dynamics(*middle, torque, 2.0 * self.lag)
         after = self._integrate(*state, dynamics, self.step_size, solves)
         return StepResult(*after, self.step_size * (dynamics[0] - start[0]))
 

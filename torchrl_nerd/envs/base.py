@@ -2,6 +2,7 @@
 
 import secrets
 from collections.abc import Mapping
+from numbers import Integral
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +22,7 @@ from torchrl_nerd.envs.transition import Transition, given_state
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import ACTION, FAULT, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
-from torchrl_nerd.settings import expect_at_least, expect_device
+from torchrl_nerd.settings import expect_count, expect_device
 from torchrl_nerd.tasks import Task
 
 MAX_SEED = 2**63
@@ -72,7 +73,7 @@ class SceneEnv(EnvBase):
         device: torch.device | str = "cpu",
         dump_dir: Path | str | None = None,
     ) -> None:
-        expect_at_least(1, num_envs=num_envs)
+        expect_count(1, num_envs=num_envs)
         if dynamics.scene.hash != task.scene.hash:
             raise ValueError(
                 f"the task is for scene '{task.scene.name}', the dynamics for "
@@ -171,8 +172,8 @@ class SceneEnv(EnvBase):
     @unaffected
     def _set_seed(self, seed: int | None) -> None:
         """Begin each env's stream anew."""
-        if seed is None or not 0 <= seed < MAX_SEED:
-            raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed}")
+        if not isinstance(seed, Integral) or not 0 <= seed < MAX_SEED:
+            raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed!r}")
         self._seed = torch.full_like(self._seed, seed)
         self._keys = row_keys(seed, len(self._episode), self.device)
         self._episode = torch.zeros_like(self._episode)

@@ -1,15 +1,20 @@
 """One argument switches between ground truth, learned, hybrid and analytic dynamics."""
 
 from pathlib import Path
-from typing import cast
 
 import torch
 
-from torchrl_nerd.dynamics import GuardedDynamics, Model, NeRDDynamics, dynamics_of
+from torchrl_nerd.checkpoint import from_pretrained, model_name
+from torchrl_nerd.dynamics import (
+    ENGINES,
+    GuardedDynamics,
+    Model,
+    NeRDDynamics,
+    dynamics_of,
+)
 from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.resolve import ENGINES, Engine, model_name, resolve_model
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
@@ -37,7 +42,7 @@ class GroundTruthEnv(SceneEnv):
     def __init__(
         self,
         task: str | Task,
-        engine: Engine = "mujoco",
+        engine: str = "mujoco",
         num_envs: int = 1,
         seed: int | None = None,
         device: torch.device | str = "cpu",
@@ -59,7 +64,7 @@ class NeRDEnv(SceneEnv):
 
     Args:
         task: id of a registered task, or a task.
-        model: a model, or the name of one, see `resolve_model`.
+        model: a model, or the name of one, see `from_pretrained`.
         num_envs, seed, dump_dir: see `SceneEnv`.
         device: where the model and all tensors live.
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
@@ -92,7 +97,7 @@ class NeRDEnv(SceneEnv):
         task = task if isinstance(task, Task) else make_task(task)
         name = type(model).__name__
         if not isinstance(model, Model):
-            given, model = model, resolve_model(model, task.scene)
+            given, model = model, from_pretrained(model, task.scene)
             name = model_name(given, task.scene)
         model = model.to(expect_device(str(device)))
         how = {"differentiable": differentiable, "inference": inference}
@@ -120,7 +125,8 @@ def make_env(
     """A batched env of a task in the dynamics of your choice.
 
     Args:
-        task: id of a registered task, or a task.
+        task: id of a registered task, ``dm_control/DOMAIN-TASK``, a task, or a robot alone
+            (an MJCF file, ``gymnasium/ID``), which becomes a `SceneTask`.
         dynamics: ``"nerd"`` (learned), ``"hybrid"``, ``"analytic"``, ``"mujoco"``,
             ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
             analytic step's name, or a checkpoint folder.
@@ -146,7 +152,7 @@ def make_env(
                 f"'{dynamics}'"
             )
         _refuse_network_options(dynamics, guard)
-        return GroundTruthEnv(task, cast(Engine, dynamics), *shared, dump_dir)
+        return GroundTruthEnv(task, dynamics, *shared, dump_dir)
     how = {"guard": guard, "dump_dir": dump_dir, "differentiable": differentiable}
     env = NeRDEnv(task, dynamics, *shared, **how)
     return env.compile() if compile else env

@@ -81,12 +81,14 @@ class Transition:
         shown = after | {ACTION: given}
         if SENSORDATA in moved:
             shown[SENSORDATA] = torch.where(is_good, moved[SENSORDATA], 0.0)
-        terminated = self.task.terminated(shown)[:, None] | ~is_good  # (num_envs, 1)
+        ends = self._per_env("terminated", self.task.terminated(shown), action)
+        terminated = ends | ~is_good
         truncated = (age + 1 >= self.task.horizon)[:, None]
         if trust is not None:
             truncated = truncated | (trust < self.least_trust)
             after[TRUST] = trust
-        reward = self.task.reward(state, given, shown)[:, None]
+        earned = self.task.reward(state, given, shown)
+        reward = self._per_env("reward", earned, action)
         return after | {
             "joint_torque": torque,
             FAULT: fault,
@@ -96,6 +98,15 @@ class Transition:
             "terminated": terminated,
             "truncated": truncated,
         }
+
+    def _per_env(self, name: str, value: Tensor, action: Tensor) -> Tensor:
+        """What a task says of each env, ``(num_envs,)``, as ``(num_envs, 1)``."""
+        if value.shape != action.shape[:1]:
+            raise ValueError(
+                f"expected {name} of shape {tuple(action.shape[:1])} from "
+                f"{type(self.task).__name__}, got {tuple(value.shape)}"
+            )
+        return value[:, None]
 
     def _control_step(
         self, moving: Tensors, action: Tensor, terrain: Tensor | None

@@ -14,12 +14,11 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.checkpoint import model_name, shipped_models
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
-from torchrl_nerd.envs.resolve import model_name
 from torchrl_nerd.evaluation.bench.error_table import text_table
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import make_task

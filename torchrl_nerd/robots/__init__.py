@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from difflib import get_close_matches
-from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
@@ -15,7 +14,7 @@ from torchrl_nerd.robots.robot import (
     Source,
 )
 from torchrl_nerd.scenes import Scene, import_scene, is_import
-from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks import SceneTask, Task
 from torchrl_nerd.tasks.suite import SuiteTask
 
 ROBOTS: dict[str, Robot] = {
@@ -40,7 +39,6 @@ THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
 )
 
 
-@cache
 def load_scene(name: str) -> Scene:
     """The scene of that name; the same object at every call.
 
@@ -51,7 +49,7 @@ def load_scene(name: str) -> Scene:
     Raises:
         ValueError: no such scene, or a robot with something not supported (named).
     """
-    if name in SCENES:
+    if isinstance(name, str) and name in SCENES:
         return SCENES[name]()
     if is_import(name):
         return import_scene(name)
@@ -64,16 +62,19 @@ def load_scene(name: str) -> Scene:
 def make_task(name: str) -> Task:
     """The task of that id: a registered one or ``dm_control/DOMAIN-TASK``.
 
+    An MJCF file and ``gymnasium/ID`` name a robot alone, which becomes a `SceneTask`.
+
     Raises:
         ValueError: no such task, or one whose robot has something not supported (named).
     """
-    if name in TASKS:
+    if isinstance(name, str) and name in TASKS:
         return TASKS[name]()
-    if isinstance(name, str) and name.startswith("dm_control/"):
-        return SuiteTask(name)
+    if is_import(name):
+        is_suite = name.startswith("dm_control/")
+        return SuiteTask(name) if is_suite else SceneTask(import_scene(name))
     raise ValueError(
         f"unknown task {name!r}{_meant(name, TASKS)}, expected one of "
-        f"{', '.join(TASKS)} or dm_control/DOMAIN-TASK"
+        f"{', '.join(TASKS)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
     )
 
 
@@ -88,7 +89,7 @@ def _meant(name: object, known: Collection[str]) -> str:
 
 def task_id(task: Task) -> str:
     """The id of a task, or the name of its class."""
-    if isinstance(task, SuiteTask):
+    if isinstance(task, SuiteTask | SceneTask):
         return task.name
     ids = (name for name, kind in TASKS.items() if kind is type(task))
     return next(ids, type(task).__name__)

@@ -7,7 +7,8 @@ from torchrl_nerd.scenes.scene import Scene
 
 def is_import(name: str) -> bool:
     """Whether a name has the form of a third-party robot's; see `import_scene`."""
-    return name.startswith(("dm_control/", "gymnasium/")) or name.endswith(".xml")
+    origins = ("dm_control/", "gymnasium/")
+    return isinstance(name, str) and (name.startswith(origins) or name.endswith(".xml"))
 
 
 @cache

@@ -11,9 +11,10 @@ starts anywhere above the ground up to twice the robot's reach, turned any way.
 import ast
 import os
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.util import find_spec
-from math import cos, pi, sin, sqrt
+from math import cos, isfinite, pi, sin, sqrt
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,11 +55,12 @@ def read_mjcf(path: Path, control_step: float | None) -> tuple[mujoco.MjModel, i
     timestep = model.opt.timestep
     if control_step is None:
         return model, max(1, round(CONTROL_STEP / timestep))
-    substeps = round(control_step / timestep)
+    is_number = isinstance(control_step, Real) and isfinite(control_step)
+    substeps = round(control_step / timestep) if is_number else 0
     if substeps < 1 or abs(substeps * timestep - control_step) > 1e-9:
         raise ValueError(
             f"expected a control step of whole timesteps of {timestep} s, "
-            f"got {control_step} s"
+            f"got {control_step!r} s"
         )
     return model, substeps
 
@@ -138,8 +140,14 @@ def default_sampling(
 ) -> Sampling:
     """Sampling ranges from limits and strengths of a compiled model.
 
-    ``ranges``: fields of `Sampling` to use in place of the default ones.
+    ``ranges``: fields of `Sampling` to use in place of the default ones; ValueError where
+    one is none.
     """
+    known = [field.name for field in fields(Sampling)]
+    if unknown := [name for name in ranges if name not in known]:
+        raise ValueError(
+            f"expected ranges among {', '.join(known)}, got '{unknown[0]}'"
+        )
     base = Base.from_model(model)
     skipped_q, skipped_v = (7, 6) if base.is_floating else (0, 0)
     low, high = (tuple(x.tolist()) for x in _positions(model))

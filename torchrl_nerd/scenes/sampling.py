@@ -81,8 +81,8 @@ class Sampling:
     Without a ``correlation_time`` torques are drawn anew at every step.
 
     Raises:
-        ValueError: a scale or times that are not positive and in order, or a correlation
-            beside a ``drive``, whose torques follow the state.
+        ValueError: a fraction outside [0, 1], a scale or times that are not positive and
+            in order, or a correlation beside a ``drive``, whose torques follow the state.
     """
 
     qpos_low: Row
@@ -103,6 +103,9 @@ class Sampling:
 
     def __post_init__(self) -> None:
         least, times = self.min_torque_scale, self.correlation_time
+        for name in ("zero_torque_fraction", "low_torque_fraction"):
+            if not 0.0 <= (value := getattr(self, name)) <= 1.0:
+                raise ValueError(f"expected {name} from 0 to 1, got {value}")
         if least is not None and not 0.0 < least <= 1.0:
             raise ValueError(
                 f"expected a min_torque_scale above 0 and up to 1, got {least}"

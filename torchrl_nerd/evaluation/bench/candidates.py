@@ -11,9 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.analytic import make_step
-from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
-from torchrl_nerd.envs.resolve import resolve_model
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.transformer import CausalTransformer
@@ -118,7 +117,7 @@ def models(
         variants: which of `VARIANTS` to add to each.
 
     Raises:
-        ValueError: an unknown variant; see `resolve_model`.
+        ValueError: an unknown variant; see `from_pretrained`.
     """
     unknown = [variant for variant in variants if variant not in VARIANTS]
     if unknown:
@@ -127,7 +126,7 @@ def models(
     found: list[Candidate] = []
     own = ["analytic"] if has_step(scene) else []
     for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
-        model = resolve_model(name, scene).to(device)
+        model = from_pretrained(name, scene).to(device)
         found.append(_candidate(name, model))
         found += _variants(name, model, variants)
     return sorted(found, key=lambda c: KINDS.index(c.kind))

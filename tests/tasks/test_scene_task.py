@@ -1,0 +1,63 @@
+"""An env of a robot alone: its state, no reward, starts as in training."""
+
+import pytest
+import torch
+from dynamics_helpers import random_model
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_nerd import load_scene, make_env
+from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.robots import SCENES, task_id
+from torchrl_nerd.tasks import SceneTask
+
+ROBOT = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
+  <body pos="0 0 1"><joint name="a" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.05"/></body></worldbody>
+  <actuator><motor joint="a" gear="2"/></actuator></mujoco>"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    (tmp_path / "robot.xml").write_text(ROBOT)
+    return str(tmp_path / "robot.xml")
+
+
+def test_a_robots_file_is_an_env_in_every_dynamics(path, tmp_path, generator):
+    model = random_model(load_scene(path), generator)
+    folder = save_checkpoint(model, tmp_path / "model", make_card(model))
+    for dynamics in ("mujoco", "dm_control", str(folder), folder):
+        env = make_env(path, dynamics, num_envs=3, seed=1)
+        check_env_specs(env)
+        assert env.scene is load_scene(path) and task_id(env.task) == path
+        found = env.rollout(4, break_when_any_done=False)["next"]
+        state = torch.cat((found["qpos"], found["qvel"]), -1)
+        assert torch.equal(found["observation"], state.float())
+        assert not found["reward"].any() and not found["terminated"].any()
+
+
+def test_an_episode_ends_by_its_horizon(path):
+    env = make_env(path, "mujoco")
+    env.task.horizon = 5
+    flags = env.rollout(9)["next"]
+    assert flags["truncated"].flatten().tolist() == [False] * 4 + [True]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_starts_are_those_of_the_training_data(name):
+    scene, u = load_scene(name), torch.tensor([[0.25], [0.75], [0.25]]).double()
+    task = SceneTask(scene)
+    starts = task.initial_state(u)
+    seeded = torch.Generator().manual_seed(2**30)
+    expected, _ = scene.sample_initial(1, seeded)
+    assert starts.keys() == expected.keys()
+    for key, value in starts.items():
+        assert torch.equal(value[0], expected[key][0]), key
+        assert torch.equal(value[0], value[2]) and not torch.equal(value[0], value[1])
+
+
+def test_a_suite_task_stays_the_suites():
+    assert task_id(make_env("dm_control/pendulum-swingup", "mujoco").task) == (
+        "dm_control/pendulum-swingup"
+    )
+    with pytest.raises(ValueError, match="found none at nowhere.xml"):
+        make_env("nowhere.xml", "mujoco")
