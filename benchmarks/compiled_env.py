@@ -21,9 +21,8 @@ import tyro
 from scaling import two_in_turn
 
 from torchrl_nerd import make_env
-from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.checkpoint import model_name, shipped_models
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.resolve import model_name
 from torchrl_nerd.evaluation.bench.rates import Runner
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import TASKS, make_task
