@@ -30,6 +30,9 @@ SENSORDATA = "sensordata"
 """What MuJoCo's sensors read during the last substep ``(*batch, nsensordata)``, float64.
 Only from the ground truth of a model that senses forces; the task alone sees it."""
 
+PIXELS = "pixels"
+"""Images ``(*batch, height, width, 3)``, uint8. Only where `make_env` is asked for them."""
+
 ACTION = "action"
 """What the policy chose ``(*batch, num_actions)``, float32, in [-1, 1]."""
 

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
 from torchrl_nerd.cli.command import Command
-from torchrl_nerd.evaluation.render.renderer import find_gl
+from torchrl_nerd.envs.rendering import find_gl
 from torchrl_nerd.evaluation.results import versions
 
 PACKAGES = (

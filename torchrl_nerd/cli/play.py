@@ -6,10 +6,14 @@ from typing import Any
 
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.envs.rendering import require_gl
 from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policies
-from torchrl_nerd.evaluation.render.renderer import require_gl
-from torchrl_nerd.evaluation.render.side_by_side import FixedActions, roll_out_both
-from torchrl_nerd.evaluation.render.video import check_video, write_video
+from torchrl_nerd.evaluation.side_by_side import (
+    FixedActions,
+    SideBySide,
+    check_video,
+    write_video,
+)
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_at_least
@@ -42,7 +46,7 @@ class Play(DeviceCommand):
     steps: int | None = None
     """Of the env; 5 s or the task's horizon by default."""
     out: Path | None = None
-    """Video, .gif or .mp4, or .png for a figure of six frames; runs/TASK.gif by default."""
+    """Video, .gif or .mp4; runs/TASK.gif by default."""
     width: int = 720
     """Of the video, pixels."""
     slowdown: float = 1.0
@@ -66,8 +70,7 @@ class Play(DeviceCommand):
         if not 0.0 < self.slowdown < float("inf"):
             raise ValueError(f"expected slowdown above 0, got {self.slowdown}")
         expect_at_least(64, width=self.width)
-        step_size = task.scene.control_step * task.frame_skip
-        steps = min(task.horizon, round(SECONDS / step_size))
+        steps = min(task.horizon, round(SECONDS / task.step_size))
         if self.steps is not None:
             expect_at_least(1, steps=self.steps)
             steps = self.steps
@@ -78,22 +81,18 @@ class Play(DeviceCommand):
             actor = make_actor(load_policy(folder, task).to(self.device))
         require_gl()
         both, closed_loop = (self.dynamics, "mujoco"), not self.open_loop
-        how = (steps, self.seed, closed_loop, self.device)
-        pair = roll_out_both(self.task, both, actor, *how)
-        frames = write_video(pair, out, self.width, self.slowdown, self.quiet)
+        pair = SideBySide(self.task, both, actor, self.seed, closed_loop, self.device)
+        frames = write_video(pair, out, steps, self.width, self.slowdown, self.quiet)
         print(f"{out}: {pair.seconds:.2f} s, {frames} frames")
         rollouts = []
-        for i in range(2):
-            one = {"dynamics": pair.names[i], "kind": pair.kinds[i]}
-            rollouts.append({**one, "return": float(pair.returns[i][-1])})
-            print(
-                f"{pair.names[i]:<20}{pair.kinds[i]:<14}{pair.returns[i][-1]:.1f} return"
-            )
+        for name, kind, total in zip(pair.names, pair.kinds, pair.returns, strict=True):
+            rollouts.append({"dynamics": name, "kind": kind, "return": total})
+            print(f"{name:<20}{kind:<14}{total:.1f} return")
         return {
             "task": self.task,
             "video": out,
-            "steps": len(pair.paths[0]) - 1,
+            "steps": pair.steps,
             "seconds": pair.seconds,
-            "ending": pair.ending,
+            "ending": pair.ending or "steps",
             "rollouts": rollouts,
         }

@@ -9,13 +9,14 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled, unaffected
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import FaultRecorder
+from torchrl_nerd.envs.pixels import RenderedEnv
+from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition, given_state
@@ -29,7 +30,7 @@ MAX_SEED = 2**63
 SEED_BITS = 32  # of a seed that is drawn
 
 
-class SceneEnv(EnvBase):
+class SceneEnv(RenderedEnv):
     """A task in any dynamics: everything around the solver, written once.
 
     Per env: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
@@ -84,6 +85,7 @@ class SceneEnv(EnvBase):
         )
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
         self.model_name: str | None = None
+        self._renderer = Renderer(task)
         self.guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
         self._transition = Transition(task, dynamics)
         self._transit = self._transition.step
@@ -224,7 +226,7 @@ class SceneEnv(EnvBase):
         episode, age = self._episode + rows, self._age.masked_fill(rows, 0)
         result = self._hand_out(found, {"_episode": episode, "_age": age})
         self.dynamics.reset(result, rows)
-        return result
+        return self._seen(result)
 
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -246,7 +248,7 @@ class SceneEnv(EnvBase):
             age = torch.where(held, self._age, age)
         if self.recorder is not None:
             self.recorder.record(state, action, found["joint_torque"], found[FAULT])
-        return self._hand_out(found, {"_age": age})
+        return self._seen(self._hand_out(found, {"_age": age}))
 
     def _hold(
         self, found: dict[str, Tensor], rows: Tensor, tensordict: TensorDictBase

@@ -15,6 +15,7 @@ from torchrl_nerd.dynamics import (
 from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.pixels import image_size
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
@@ -121,6 +122,10 @@ def make_env(
     dump_dir: Path | str | None = None,
     compile: bool = False,
     differentiable: bool = False,
+    from_pixels: bool = False,
+    pixels_only: bool = False,
+    render_size: int | tuple[int, int] = (240, 320),
+    camera_id: int | str | None = None,
 ) -> SceneEnv:
     """A batched env of a task in the dynamics of your choice.
 
@@ -138,6 +143,10 @@ def make_env(
         compile: make one compiled piece of controller, model, reward and observation, see
             `SceneEnv.compile`; engines stay as they are.
         differentiable: record gradients through every step; not of engines.
+        from_pixels: show ``pixels (num_envs, height, width, 3)``, uint8, of every state.
+        pixels_only: instead of all else that an agent could see.
+        render_size: height and width of an image, or one number for both, pixels.
+        camera_id: of an image; see `envs.rendering.Renderer`.
 
     Raises:
         ValueError: unknown task or dynamics, or an option that the dynamics does not have,
@@ -152,10 +161,15 @@ def make_env(
                 f"'{dynamics}'"
             )
         _refuse_network_options(dynamics, guard)
-        return GroundTruthEnv(task, dynamics, *shared, dump_dir)
-    how = {"guard": guard, "dump_dir": dump_dir, "differentiable": differentiable}
-    env = NeRDEnv(task, dynamics, *shared, **how)
-    return env.compile() if compile else env
+        env: SceneEnv = GroundTruthEnv(task, dynamics, *shared, dump_dir)
+    else:
+        how = {"guard": guard, "dump_dir": dump_dir, "differentiable": differentiable}
+        env = NeRDEnv(task, dynamics, *shared, **how)
+        env = env.compile() if compile else env
+    env.render_size, env.camera_id = image_size(render_size), camera_id
+    if pixels_only and not from_pixels:
+        raise ValueError("expected from_pixels=True with pixels_only=True, got False")
+    return env.add_pixels(pixels_only) if from_pixels else env
 
 
 def _refuse_network_options(

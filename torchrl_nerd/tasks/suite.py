@@ -6,6 +6,7 @@ from math import ceil
 import mujoco
 import numpy as np
 import torch
+from mujoco import MjData, MjModel
 from torch import Tensor
 
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
@@ -62,6 +63,7 @@ class SuiteTask(Task):
         self.parameters = {TARGET: width} if width else {}
         self._sizes = (model.nq, model.nv, width)
         self._forces, self._num_ctrl = judge.forces, model.nu
+        self._targets = judge.targets
         self._start, self._judge = RowMemo(judge.start), RowMemo(judge)
 
     def build_scene(self) -> Scene:
@@ -85,6 +87,11 @@ class SuiteTask(Task):
     def terminated(self, next_state: State) -> Tensor:
         """Where the suite ends an episode before its time."""
         return self._judged(next_state)[..., 1] > 0.0
+
+    def show(self, model: MjModel, data: MjData, state: State) -> None:
+        """Its targets, where this episode has them."""
+        if self.parameters:
+            model.geom_pos[self._targets] = state[TARGET].cpu().reshape(-1, 3)
 
     def _judged(self, state: State) -> Tensor:
         """Reward, end and observation of each env; the control is zero after a reset."""

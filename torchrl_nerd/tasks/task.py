@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from functools import cached_property
 
 import torch
+from mujoco import MjData, MjModel
 from torch import Tensor
 
 from torchrl_nerd.keys import QVEL
@@ -40,6 +41,11 @@ class Task(ABC):
         """What turns the action into torque; the scene's own unless a task has one."""
         return self.scene.controller
 
+    @property
+    def step_size(self) -> float:
+        """Time between two observations, s."""
+        return self.scene.control_step * self.frame_skip
+
     @abstractmethod
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Initial states, float64, from uniform numbers ``(*batch, num_uniforms)``."""
@@ -55,3 +61,14 @@ class Task(ABC):
     def terminated(self, next_state: State) -> Tensor:
         """Where the episode failed or succeeded, bool ``(*batch,)``; by default never."""
         return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)
+
+    def show(  # noqa: B027
+        self, model: MjModel, data: MjData, state: State
+    ) -> None:
+        """Put what the task draws at a reset into an image; by default nothing.
+
+        Args:
+            model: a copy that only images are drawn with.
+            data: of the model; its joint positions and its ground are set.
+            state: of one env: ``qpos (nq,)`` and the task's parameters.
+        """

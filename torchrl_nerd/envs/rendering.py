@@ -1,0 +1,236 @@
+"""Images of a task by `mujoco.Renderer`, with or without a screen.
+
+MuJoCo chooses its OpenGL library from ``MUJOCO_GL`` when it is first imported, and without
+that variable takes one that needs a screen. `find_gl` tries the libraries in a child
+process, because a broken driver can end the process.
+"""
+
+import atexit
+import copy
+import os
+import platform
+import subprocess
+import sys
+from functools import cache
+from importlib import import_module
+from typing import Any
+from weakref import WeakSet
+
+import mujoco
+import numpy as np
+from mujoco.rendering.classic import gl_context
+
+from torchrl_nerd.dynamics.base import as_numpy, ground_pose
+from torchrl_nerd.keys import GOAL, QPOS, TERRAIN
+from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks.task import State
+
+LIBRARIES = {
+    "Linux": ("egl", "osmesa", "glfw"),
+    "Darwin": ("cgl",),
+    "Windows": ("glfw",),
+}
+MARGIN = 1.25  # room around a robot that the camera follows
+SMALL = 128  # pixels; lower images are drawn without shadows and smoothing
+GOAL_RADIUS, GOAL_COLOR = 0.02, (0.9, 0.2, 0.2, 1.0)  # m
+PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+renderer = mujoco.Renderer(model, 8, 8)
+renderer.update_scene(mujoco.MjData(model))
+renderer.render()
+renderer.close()
+print("rendered", flush=True)
+"""
+
+
+def find_gl() -> str | None:
+    """The first OpenGL library that works here, such as ``"egl"``, or None.
+
+    If ``MUJOCO_GL`` is set, only the library that it names is tried.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    names = (asked,) if asked else LIBRARIES[platform.system()]
+    return next((name for name in names if _renders(name)), None)
+
+
+@cache
+def _renders(name: str) -> bool:
+    env = {**os.environ, "MUJOCO_GL": name}
+    done = subprocess.run([sys.executable, "-c", PROBE], env=env, capture_output=True)
+    return b"rendered" in done.stdout
+
+
+def require_gl() -> str:
+    """The library of `find_gl`.
+
+    Raises:
+        ValueError: none works; what to install.
+    """
+    name = find_gl()
+    if name is None:
+        raise ValueError(
+            "expected an OpenGL library for rendering, but none works on this machine: "
+            "install libegl1 and libgl1-mesa-dri, or libosmesa6"
+        )
+    return name
+
+
+class Renderer:
+    """Images of a task's robot on its terrain, with the goals of its state.
+
+    What OpenGL needs is made at the first image and freed by `close`; a copy, or one in
+    another process, makes its own.
+
+    The camera is the model's first one that stands in the world or tracks the robot.
+    Without such a camera it is MuJoCo's default free camera, whose direction and distance
+    ``<visual><global azimuth= elevation=>`` and ``<statistic center= extent=>`` of the MJCF
+    file set; it follows the center of mass of a floating base.
+
+    Args:
+        task: what is drawn; `Task.show` puts its own things into the image.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self._gl: dict[tuple[int, int], mujoco.Renderer] = {}  # by height and width
+        self._model: mujoco.MjModel | None = None
+        _ALL.add(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is drawn with."""
+        return {"task": self.task}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["task"])
+
+    def close(self) -> None:
+        """Free the OpenGL contexts; the next image makes new ones."""
+        while self._gl:
+            _, renderer = self._gl.popitem()
+            if renderer._gl_context:  # or another one would lose what it draws with
+                renderer._gl_context.make_current()
+            renderer.close()
+
+    def __del__(self) -> None:
+        self.close()
+
+    def __call__(
+        self,
+        state: State,
+        height: int = 240,
+        width: int = 320,
+        camera_id: int | str | None = None,
+    ) -> np.ndarray:
+        """Images ``(n, height, width, 3)``, uint8.
+
+        Args:
+            state: ``qpos (n, nq)`` and the task's parameters.
+            height: of an image, pixels. Images lower than `SMALL` are drawn without
+                shadows and smoothing, in a third of the time.
+            width: of an image, pixels.
+            camera_id: number or name of a camera; -1 for the free one.
+
+        Raises:
+            ValueError: no such camera, or no OpenGL library works on this machine.
+        """
+        expect_at_least(1, height=height, width=width)
+        if self._model is None:
+            self._model = copy.copy(self.task.scene.model)  # `Task.show` may change it
+            self._data = mujoco.MjData(self._model)
+        camera = self._camera(camera_id)
+        if (height, width) not in self._gl:
+            self._gl[height, width] = self._make_gl(height, width)
+        renderer = self._gl[height, width]
+        images = np.empty((len(state[QPOS]), height, width, 3), np.uint8)
+        for i in range(len(images)):
+            row = {key: value[i : i + 1] for key, value in state.items()}
+            self._draw(row, renderer, camera)
+            renderer.render(out=images[i])
+        return images
+
+    def _draw(
+        self,
+        row: State,
+        renderer: mujoco.Renderer,
+        camera: mujoco.MjvCamera | int | str,
+    ) -> None:
+        model, data, scene = self._model, self._data, self.task.scene
+        data.qpos[:] = as_numpy(row[QPOS][0])
+        pose = ground_pose(scene, row.get(TERRAIN))
+        if pose is not None:
+            position, turn = np.split(as_numpy(pose[0]), [3 * scene.model.nmocap])
+            data.mocap_pos.flat, data.mocap_quat.flat = position, turn
+        self.task.show(model, data, {key: value[0] for key, value in row.items()})
+        mujoco.mj_fwdPosition(model, data)
+        if scene.base.is_floating and isinstance(camera, mujoco.MjvCamera):
+            camera.lookat[:] = data.subtree_com[scene.base.body]
+        renderer.update_scene(data, camera)
+        if GOAL in row:
+            seen = renderer.scene
+            mujoco.mjv_initGeom(
+                seen.geoms[seen.ngeom],
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                np.full(3, GOAL_RADIUS),
+                as_numpy(row[GOAL][0]),
+                np.eye(3).ravel(),
+                np.array(GOAL_COLOR, np.float32),
+            )
+            seen.ngeom += 1
+
+    def _camera(self, camera_id: int | str | None) -> mujoco.MjvCamera | int | str:
+        model, camera = self.task.scene.model, mujoco.MjvCamera()
+        if camera_id is None:
+            is_fixed = model.cam_mode == int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
+            stands = ~is_fixed | (model.cam_bodyid == 0)
+            camera_id = int(np.argmax(stands)) if stands.any() else -1
+        if camera_id != -1:
+            return camera_id  # `mujoco.Renderer` knows its name or number
+        mujoco.mjv_defaultFreeCamera(model, camera)
+        if self.task.scene.base.is_floating:
+            camera.distance *= MARGIN
+        return camera
+
+    def _make_gl(self, height: int, width: int) -> mujoco.Renderer:
+        if _DREW and _DREW[0] != os.getpid():  # drivers hang in it
+            raise ValueError(
+                "expected a process started with 'spawn': no image can be drawn in one "
+                "that was forked from a process that had drawn some"
+            )
+        look = self._model.vis
+        look.global_.offwidth, look.global_.offheight = width, height
+        look.quality.shadowsize = 1024  # less work for a CPU
+        look.quality.offsamples = 0 if height < SMALL else 4
+        # in a small scene the ground would cast shadows on itself
+        self._model.stat.extent = max(self._model.stat.extent, 1.0)
+        # MuJoCo made its own choice when it was imported, see above
+        gl_context.GLContext = import_module(f"mujoco.{require_gl()}").GLContext
+        renderer = mujoco.Renderer(self._model, height, width)
+        _DREW[:] = [os.getpid()]
+        atexit.unregister(_close_all)  # before MuJoCo gives the display back
+        atexit.register(_close_all)
+        shadow = mujoco.mjtRndFlag.mjRND_SHADOW
+        renderer.scene.flags[shadow] = height >= SMALL
+        return renderer
+
+
+_ALL: WeakSet[Renderer] = WeakSet()
+_DREW: list[int] = []  # the process that drew
+_OF_PARENT: list[mujoco.Renderer] = []
+"""What a forked process got from its parent: it must neither draw with it nor free it."""
+
+
+def _close_all() -> None:
+    for renderer in _ALL:
+        renderer.close()
+
+
+def _disown() -> None:
+    for renderer in _ALL:
+        _OF_PARENT.extend(renderer._gl.values())
+        renderer._gl = {}
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_disown)

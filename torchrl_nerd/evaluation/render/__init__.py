@@ -1,1 +1,0 @@
-"""Side-by-side videos of a rollout in two dynamics, drawn by `mujoco.Renderer`."""
