@@ -24,6 +24,7 @@ from tensordict import TensorDict
 import torchrl_nerd
 from torchrl_nerd import load_scene
 from torchrl_nerd.checkpoint import shipped_card, shipped_models
+from torchrl_nerd.envs.rendering import find_gl
 
 ROOT = Path(__file__).parents[1]
 DOCS, README = ROOT / "docs", ROOT / "README.md"
@@ -247,6 +248,20 @@ def test_code_of_the_page_runs(page, monkeypatch, tmp_path, capsys):
     codes = [compile(code, page.name, "exec") for code in blocks(page, "python")]
     for code in codes if page == README else codes[:1]:
         exec(code, names)
+
+
+def test_code_that_uses_it_from_elsewhere_runs(monkeypatch, tmp_path):
+    """Every block, in one namespace; skrl's where it is installed."""
+    if find_gl() is None:
+        pytest.skip("no OpenGL library works on this machine")
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "__main__"}
+    for code in blocks(DOCS / "howto" / "using_it_from.md", "python"):
+        if "skrl" in code and find_spec("skrl") is None:
+            continue
+        exec(compile(code, "using_it_from.md", "exec"), names)
+    assert len(names["rollout"]) == 16
+    assert len(list(tmp_path.rglob("*.mp4"))) == 2
 
 
 @pytest.mark.slow

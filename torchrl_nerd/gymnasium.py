@@ -2,12 +2,13 @@
 
     import gymnasium, torchrl_nerd.gymnasium
     gymnasium.make("TorchrlNerd/AntRun-v0", dynamics="mujoco")
-    gymnasium.make_vec("TorchrlNerd/AntRun-v0", num_envs=512)
+    gymnasium.make_vec("TorchrlNerd/AntRun-v0", num_envs=512, render_mode="rgb_array")
     gymnasium.make("TorchrlNerd/Task-v0", task="dm_control/cheetah-run", dynamics="mujoco")
 
 Or without the import: ``gymnasium.make("torchrl_nerd.gymnasium:TorchrlNerd/AntRun-v0")``.
 """
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from torch import Tensor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
-from torchrl_nerd.robots import TASKS
+from torchrl_nerd.robots import TASKS, make_task
 from torchrl_nerd.tasks import Task
 
 Info = dict[str, Any]
@@ -42,9 +43,21 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: how many envs.
         seed: of the resets, until `reset` is given another; None for a fresh one.
         device: where the env computes.
+        render_mode: ``"rgb_array"`` for images by `render`, or None.
+        max_episode_steps: steps until ``truncated``; the task's horizon by default.
+        height: of an image, pixels.
+        width: of an image, pixels.
+        camera_id: of an image, see `envs.rendering.Renderer`.
+
+    Raises:
+        ValueError: what `make_env` refuses, an unknown render mode, or more steps than the
+            task's horizon.
     """
 
-    metadata: Info = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata: Info = {
+        "render_modes": ["rgb_array"],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
 
     def __init__(
         self,
@@ -53,28 +66,79 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: int = 1,
         seed: int | None = None,
         device: torch.device | str = "cpu",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        height: int = 240,
+        width: int = 320,
+        camera_id: int | str | None = None,
     ) -> None:
-        self.env: SceneEnv = make_env(task, dynamics, num_envs, seed, device)
-        self.num_envs = num_envs
-        width, size = (
-            self.env.task.observation_size,
-            self.env.task.controller.num_actions,
-        )
-        self.single_observation_space = Box(-np.inf, np.inf, (width,), np.float32)
-        self.single_action_space = Box(-1.0, 1.0, (size,), np.float32)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(
+                f"unknown render mode {render_mode!r}, expected None or 'rgb_array'"
+            )
+        task = _shortened(task, max_episode_steps)
+        how = {"render_size": (height, width), "camera_id": camera_id}
+        self.env: SceneEnv = make_env(task, dynamics, num_envs, seed, device, **how)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / task.step_size)}
+        shape, size = (task.observation_size,), (task.controller.num_actions,)
+        self.single_observation_space = Box(-np.inf, np.inf, shape, np.float32)
+        self.single_action_space = Box(-1.0, 1.0, size, np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._is_over = np.zeros(num_envs, bool)
+        self._shown: np.ndarray | None = None  # the last observation
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Begin an episode in each env; with a seed, the first of its envs' streams."""
+        """Begin an episode in each env, or in those of a mask.
+
+        Args:
+            seed: begin the first episode of its envs' streams.
+            options: ``{"reset_mask": mask}``, bool ``(num_envs,)``; the other envs go on,
+                and show what they last did.
+
+        Raises:
+            ValueError: unknown options, another mask, a mask of no env or together with a
+                seed, or before any reset of all envs.
+        """
         super().reset(seed=seed)
+        mask = self._mask(seed, options or {})
         if seed is not None:
             self.env.set_seed(seed)
-        self._is_over = np.zeros(self.num_envs, bool)
-        return _numpy(self.env.reset()[OBSERVATION]), {}
+        self._is_over &= ~mask
+        fresh = self._begin(mask)
+        if self._shown is not None:
+            fresh[~mask] = self._shown[~mask]
+        self._shown = fresh
+        return fresh.copy(), {}
+
+    def _mask(self, seed: int | None, options: Info) -> np.ndarray:
+        unknown = sorted(options.keys() - {"reset_mask"})
+        if unknown:
+            raise ValueError(f"unknown options {unknown}, expected reset_mask alone")
+        mask = options.get("reset_mask")
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"expected a reset_mask of bool, shape ({self.num_envs},), with an env to "
+                f"reset, got {mask.dtype}, shape {mask.shape}, {mask.sum()} envs"
+            )
+        if seed is not None or self._shown is None:
+            got = "a seed" if seed is not None else "no reset before"
+            raise ValueError(
+                f"expected a reset_mask without a seed, after a reset of all, got {got}"
+            )
+        return mask
+
+    def _begin(self, mask: np.ndarray) -> np.ndarray:
+        """Begin episodes where the mask says; observations of all envs."""
+        rows = torch.from_numpy(mask)[:, None].to(self.env.device)
+        fresh = self.env.reset(TensorDict({"_reset": rows}, self.env.batch_size))
+        return _numpy(fresh[OBSERVATION])
 
     def step(
         self, actions: np.ndarray
@@ -89,40 +153,65 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         )
         terminated, truncated = _numpy(after["terminated"]), _numpy(after["truncated"])
         if begins.any():
-            rows = torch.from_numpy(begins)[:, None].to(env.device)
-            fresh = env.reset(TensorDict({"_reset": rows}, env.batch_size))
-            observation[begins] = _numpy(fresh[OBSERVATION])[begins]
+            observation[begins] = self._begin(begins)[begins]
             for column in (reward, terminated, truncated):  # (num_envs, 1) each
                 column[begins] = 0
         reward, terminated, truncated = reward[:, 0], terminated[:, 0], truncated[:, 0]
-        self._is_over = terminated | truncated
-        return observation, reward, terminated, truncated, {}
+        self._is_over, self._shown = terminated | truncated, observation
+        return observation.copy(), reward, terminated, truncated, {}
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """An image ``(height, width, 3)``, uint8, of each env; None without a mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("no image: make the env with render_mode='rgb_array'")
+            return None
+        return tuple(self.env.render())
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what images were drawn with."""
+        self.env.close()
 
 
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
-    Its arguments are those of `GymnasiumVectorEnv`.
+    Args:
+        task: id of a task, or a task.
+        dynamics: as for `make_env`.
+        render_mode: ``"rgb_array"`` or None.
+        settings: other arguments of `GymnasiumVectorEnv`, but ``num_envs``.
     """
 
-    metadata: Info = {"render_modes": []}
+    metadata: Info = {"render_modes": ["rgb_array"]}
 
     def __init__(
         self,
         task: str | Task,
         dynamics: str | Path = "nerd",
-        seed: int | None = None,
-        device: torch.device | str = "cpu",
+        render_mode: str | None = None,
+        **settings: Any,
     ) -> None:
-        self.vector = GymnasiumVectorEnv(task, dynamics, 1, seed, device)
+        settings |= {"render_mode": render_mode, "num_envs": 1}
+        self.vector = GymnasiumVectorEnv(task, dynamics, **settings)
+        self.metadata = {
+            **self.metadata,
+            "render_fps": self.vector.metadata["render_fps"],
+        }
+        self.render_mode = render_mode
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Begin the next episode, or with a seed the first of its stream."""
+        """Begin the next episode, or with a seed the first of its stream.
+
+        Raises:
+            ValueError: options, of which there are none.
+        """
         super().reset(seed=seed)
+        if options:
+            raise ValueError(f"expected no options, got {sorted(options)}")
         observation, info = self.vector.reset(seed=seed)
         return observation[0], info
 
@@ -131,6 +220,29 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         *results, info = self.vector.step(np.asarray(action)[None])
         observation, reward, terminated, truncated = (x[0] for x in results)
         return observation, float(reward), bool(terminated), bool(truncated), info
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore
+        """An image ``(height, width, 3)``, uint8; None without a mode."""
+        images = self.vector.render()
+        return None if images is None else images[0]
+
+    def close(self) -> None:
+        """Free what images were drawn with."""
+        self.vector.close()
+
+
+def _shortened(task: str | Task, steps: int | None) -> Task:
+    """The task, a copy with that horizon where one is given."""
+    task = task if isinstance(task, Task) else make_task(task)
+    if steps is None or steps == task.horizon:
+        return task
+    if not 1 <= steps <= task.horizon:
+        raise ValueError(
+            f"expected max_episode_steps from 1 to the horizon {task.horizon}, got {steps}"
+        )
+    task = copy.copy(task)
+    task.horizon = steps
+    return task
 
 
 def _numpy(x: Tensor) -> np.ndarray:
@@ -143,9 +255,10 @@ def gymnasium_id(task: str) -> str:
     return f"TorchrlNerd/{''.join(word.capitalize() for word in words)}-v0"
 
 
-def _register(env_id: str, **kwargs: str) -> None:
+def _register(env_id: str, horizon: int | None = None, **kwargs: str) -> None:
     gymnasium.register(
         env_id,
+        max_episode_steps=horizon,
         entry_point=f"{__name__}:GymnasiumEnv",
         vector_entry_point=f"{__name__}:GymnasiumVectorEnv",
         kwargs=kwargs,
@@ -153,5 +266,5 @@ def _register(env_id: str, **kwargs: str) -> None:
 
 
 _register("TorchrlNerd/Task-v0")  # any task, by its id as the argument ``task``
-for _task in TASKS:
-    _register(gymnasium_id(_task), task=_task)
+for _task, _make in TASKS.items():
+    _register(gymnasium_id(_task), _make().horizon, task=_task)

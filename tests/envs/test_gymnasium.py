@@ -3,21 +3,29 @@
 import warnings
 
 import gymnasium
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from dynamics_helpers import act, random_model
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
+from gymnasium.wrappers import vector as vector_wrappers
 
 import torchrl_nerd.gymnasium
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.envs.rendering import find_gl
 from torchrl_nerd.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from torchrl_nerd.robots import TASKS, make_task
 
 TASK, ID = "cartpole/swingup", "TorchrlNerd/CartpoleSwingup-v0"
 STEPS = 12
+HAS_GL = find_gl() is not None
+has_gl = pytest.mark.skipif(
+    not HAS_GL, reason="no OpenGL library works on this machine"
+)
 gymnasium_id = torchrl_nerd.gymnasium.gymnasium_id
 
 
@@ -41,11 +49,19 @@ def actions_of(env, rng, steps: int = STEPS) -> np.ndarray:
 
 
 def test_gymnasium_finds_no_fault(task_id, dynamics):
-    env = gymnasium.make(gymnasium_id(task_id), dynamics=dynamics)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of bounds that observations do not have
-        check_env(env.unwrapped, skip_render_check=True)
+    """Nor warns, but of bounds that observations do not have, as of its own robots."""
+    task = make_task(task_id)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        settings = {"dynamics": dynamics, "height": 32, "width": 32}
+        mode = "rgb_array" if HAS_GL else None
+        env = gymnasium.make(gymnasium_id(task_id), render_mode=mode, **settings)
+        check_env(env.unwrapped, skip_render_check=not HAS_GL)
+    own = [str(x.message) for x in caught if "gymnasium" in x.filename.lower()]
+    assert all("observation space m" in said and "infinity" in said for said in own)
     assert env.spec is not None and env.spec.kwargs["dynamics"] == dynamics
+    assert env.spec.max_episode_steps == task.horizon
+    assert env.metadata["render_fps"] == round(1.0 / task.step_size)
 
 
 def test_a_vector_env_is_its_rows_in_one_call(task_id, dynamics, seed, rng):
@@ -141,6 +157,137 @@ def test_any_task_goes_by_its_id():
     assert {gymnasium_id(task) for task in TASKS} < set(gymnasium.registry)
     module = "torchrl_nerd.gymnasium:TorchrlNerd/CartpoleSwingup-v0"
     assert gymnasium.make(module, dynamics="mujoco").reset()[0].shape == (4,)
+
+
+def test_a_mask_begins_some_episodes_anew(seed, rng):
+    """As Gymnasium's own vector env of single envs, to the flag."""
+    many = gymnasium.make_vec(ID, num_envs=3, dynamics="mujoco", max_episode_steps=5)
+    own = gymnasium.vector.SyncVectorEnv(
+        [lambda: GymnasiumEnv(short_task(5), "mujoco")] * 3
+    )
+    observation, _ = many.reset(seed=seed)
+    own.reset(seed=[seed, seed, seed])
+    mask = np.array([True, False, False])
+    for step, action in enumerate(actions_of(many, rng, 16)):
+        if step in (
+            2,
+            5,
+            9,
+        ):  # 5: all have just ended, the first begins before its turn
+            before, _ = many.reset(options={"reset_mask": mask})
+            expected, _ = own.reset(options={"reset_mask": mask.copy()})
+            np.testing.assert_array_equal(before[0], expected[0])
+            np.testing.assert_array_equal(before[1:], observation[1:])
+            assert (before[0] != observation[0]).any()
+            before[:] = 7.0  # the user's own
+        observation, reward, terminated, truncated, _ = many.step(action)
+        found = own.step(action)
+        np.testing.assert_array_equal(observation[0], found[0][0])
+        np.testing.assert_array_equal(terminated, found[2])
+        np.testing.assert_array_equal(truncated, found[3])
+        np.testing.assert_array_equal(reward == 0.0, found[1] == 0.0)
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_an_episode_is_as_long_as_asked(steps, rng):
+    limit = {"dynamics": "mujoco", "max_episode_steps": steps}
+    one = gymnasium.make(ID, **limit)
+    many = gymnasium.make_vec(ID, num_envs=2, **limit)
+    one.reset(seed=0), many.reset(seed=0)
+    assert many.spec.max_episode_steps is not None
+    for step, action in enumerate(actions_of(many, rng, steps), 1):
+        assert one.step(action[0])[3] == (step == steps)
+        assert many.step(action)[3].tolist() == [step == steps] * 2
+    assert make_task(TASK).horizon > 4  # of others
+
+
+@has_gl
+def test_gymnasium_records_videos_and_statistics(tmp_path, seed):
+    settings = {
+        "dynamics": "mujoco",
+        "render_mode": "rgb_array",
+        "max_episode_steps": 3,
+    }
+    settings |= {"height": 32, "width": 48}
+    one = RecordVideo(gymnasium.make(ID, **settings), str(tmp_path / "one"))
+    one = RecordEpisodeStatistics(one)
+    one.reset(seed=seed)
+    first = one.render()
+    for _ in range(3):
+        *_, info = one.step(one.action_space.sample())
+    one.close()
+    frames = iio.imread(tmp_path / "one" / "rl-video-episode-0.mp4")
+    assert frames.shape == (4, 32, 48, 3) and info["episode"]["l"] == 3
+    assert abs(frames[0].astype(int) - first).mean() < 8.0
+
+    many = gymnasium.make_vec(ID, num_envs=4, **settings)
+    many = vector_wrappers.RecordVideo(many, str(tmp_path / "many"))
+    many = vector_wrappers.RecordEpisodeStatistics(many)
+    many.reset(seed=seed)
+    images = many.render()
+    assert len(images) == 4 and all(x.shape == (32, 48, 3) for x in images)
+    np.testing.assert_array_equal(images[0], first)
+    for _ in range(3):
+        *_, info = many.step(many.action_space.sample())
+    many.close()
+    assert info["episode"]["l"].tolist() == [3] * 4
+    frames = iio.imread(tmp_path / "many" / "rl-video-episode-0.mp4")
+    assert len(frames) == 4 and frames[0].size == 4 * first.size
+
+
+@has_gl
+def test_workers_that_are_spawned_know_the_ids(seed):
+    envs = gymnasium.make_vec(
+        f"torchrl_nerd.gymnasium:{ID}",
+        num_envs=1,
+        vectorization_mode="async",
+        vector_kwargs={"context": "spawn"},
+        **{"dynamics": "mujoco", "render_mode": "rgb_array", "height": 24, "width": 24},
+    )
+    observation, _ = envs.reset(seed=seed)
+    expected, _ = GymnasiumEnv(TASK, "mujoco").reset(seed=seed)
+    np.testing.assert_array_equal(observation[0], expected)
+    assert [x.shape for x in envs.render()] == [(24, 24, 3)]
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda env: env.reset(options={"speed": 2}), r"unknown options \['speed'\]"),
+        (lambda env: env.reset(options={"reset_mask": [1, 0]}), "reset_mask of bool"),
+        (lambda env: env.reset(options={"reset_mask": np.ones(3, bool)}), r"\(3,\)"),
+        (lambda env: env.reset(options={"reset_mask": np.zeros(2, bool)}), "0 envs"),
+        (
+            lambda env: env.reset(seed=1, options={"reset_mask": np.ones(2, bool)}),
+            "without a seed",
+        ),
+        (lambda env: GymnasiumEnv(TASK, "mujoco", "human"), "render mode 'human'"),
+        (
+            lambda env: GymnasiumEnv(TASK, "mujoco").reset(options={"a": 1}),
+            "no options",
+        ),
+        (
+            lambda env: GymnasiumVectorEnv(TASK, "mujoco", max_episode_steps=10**6),
+            "max_episode_steps from 1 to the horizon",
+        ),
+    ],
+)
+def test_what_is_unknown_is_refused(call, words):
+    env = GymnasiumVectorEnv(TASK, "mujoco", 2)
+    with pytest.raises(ValueError, match="no reset before"):
+        env.reset(options={"reset_mask": np.ones(2, bool)})
+    env.reset()
+    with pytest.raises(ValueError, match=words) as refusal:
+        call(env)
+    assert "\n" not in str(refusal.value)
+
+
+def test_without_a_render_mode_there_is_no_image():
+    env = GymnasiumEnv(TASK, "mujoco")
+    env.reset()
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert env.render() is None
 
 
 def test_bad_arguments_are_refused_in_one_sentence():

@@ -77,7 +77,7 @@ def _machine() -> dict[str, str]:
         "CUDA devices": ", ".join(gpus) or "none",
         "C++ compiler": compiler or "none: compile=True runs eagerly",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
-        "OpenGL": find_gl() or "none: nerd play cannot render",
+        "OpenGL": find_gl() or "none: no images",
         "display": os.environ.get("DISPLAY", "none"),
     }
 

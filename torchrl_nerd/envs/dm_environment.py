@@ -42,6 +42,10 @@ class DmEnvironment(dm_env.Environment):
         self.env: SceneEnv = make_env(task, dynamics, 1, seed, device)
         self._is_over = True
 
+    def close(self) -> None:
+        """Free what images were drawn with."""
+        self.env.close()
+
     def reset(self) -> dm_env.TimeStep:
         """Begin the next episode."""
         self._is_over = False
@@ -63,6 +67,10 @@ class DmEnvironment(dm_env.Environment):
         if self._is_over:
             make = dm_env.termination if after["terminated"] else dm_env.truncation
         return make(float(after["reward"]), after[OBSERVATION][0].cpu().numpy())
+
+    def render(self, height: int = 240, width: int = 320) -> np.ndarray:
+        """An image ``(height, width, 3)``, uint8; see `SceneEnv.render`."""
+        return self.env.render(height=height, width=width)[0]
 
     def observation_spec(self) -> specs.Array:  # pyright: ignore
         """One array, float32."""

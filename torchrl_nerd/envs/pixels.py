@@ -1,6 +1,6 @@
 """Images of an env: on demand, or as an observation."""
 
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -74,10 +74,10 @@ class RenderedEnv(EnvBase):
         if num_envs is not None:
             expect_at_least(1, num_envs=num_envs)
         state = {key: value[:num_envs] for key, value in self._state().items()}
-        asked = (height, width, camera_id)
-        usual = (*self.render_size, self.camera_id)
-        how = (b if a is None else a for a, b in zip(asked, usual, strict=True))
-        return self._renderer(state, *how)
+        height = self.render_size[0] if height is None else height
+        width = self.render_size[1] if width is None else width
+        camera_id = self.camera_id if camera_id is None else camera_id
+        return self._renderer(state, height, width, camera_id)
 
     def add_pixels(self: Env, pixels_only: bool = False) -> Env:
         """Show ``pixels`` of ``render_size`` at every reset and step; returns the env.
@@ -88,7 +88,9 @@ class RenderedEnv(EnvBase):
         """
         self.from_pixels, self.pixels_only = True, pixels_only
         shape = torch.Size((*self.batch_size, *self.render_size, 3))
-        seen = {} if pixels_only else dict(self.observation_spec.items())
+        seen: dict[Any, Any] = (
+            {} if pixels_only else dict(self.observation_spec.items())
+        )
         seen[PIXELS] = Bounded(0, 255, shape, self.device, torch.uint8)
         how = {"shape": self.batch_size, "device": self.device}
         if pixels_only:

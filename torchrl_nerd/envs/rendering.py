@@ -11,7 +11,7 @@ import os
 import platform
 import subprocess
 import sys
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from typing import Any
 from weakref import WeakSet
@@ -95,7 +95,6 @@ class Renderer:
     def __init__(self, task: Task) -> None:
         self.task = task
         self._gl: dict[tuple[int, int], mujoco.Renderer] = {}  # by height and width
-        self._model: mujoco.MjModel | None = None
         _ALL.add(self)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -104,6 +103,14 @@ class Renderer:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(state["task"])
+
+    @cached_property
+    def _model(self) -> mujoco.MjModel:
+        return copy.copy(self.task.scene.model)  # `Task.show` may change it
+
+    @cached_property
+    def _data(self) -> mujoco.MjData:
+        return mujoco.MjData(self._model)
 
     def close(self) -> None:
         """Free the OpenGL contexts; the next image makes new ones."""
@@ -136,9 +143,6 @@ class Renderer:
             ValueError: no such camera, or no OpenGL library works on this machine.
         """
         expect_at_least(1, height=height, width=width)
-        if self._model is None:
-            self._model = copy.copy(self.task.scene.model)  # `Task.show` may change it
-            self._data = mujoco.MjData(self._model)
         camera = self._camera(camera_id)
         if (height, width) not in self._gl:
             self._gl[height, width] = self._make_gl(height, width)
@@ -164,7 +168,7 @@ class Renderer:
             data.mocap_pos.flat, data.mocap_quat.flat = position, turn
         self.task.show(model, data, {key: value[0] for key, value in row.items()})
         mujoco.mj_fwdPosition(model, data)
-        if scene.base.is_floating and isinstance(camera, mujoco.MjvCamera):
+        if scene.base.is_floating and not isinstance(camera, int | str):
             camera.lookat[:] = data.subtree_com[scene.base.body]
         renderer.update_scene(data, camera)
         if GOAL in row:

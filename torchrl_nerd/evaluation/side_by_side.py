@@ -125,7 +125,7 @@ def check_video(path: Path) -> None:
         raise ValueError(f"expected a file named .gif or .mp4, got '{path}'")
     if not all(map(find_spec, ("imageio", "imageio_ffmpeg"))):
         raise ModuleNotFoundError(
-            "videos need imageio[ffmpeg]: pip install 'torchrl-nerd[examples]'"
+            "videos need imageio and imageio-ffmpeg: pip install 'torchrl-nerd[examples]'"
         )
 
 
@@ -159,7 +159,8 @@ def write_video(
 
     def write(aside: Path) -> None:
         bar = tqdm(range(steps + 1), "video", unit=" steps", disable=quiet)
-        with imageio.get_writer(aside, **how) as writer:
+        with imageio.get_writer(aside, **how) as opened:
+            writer: Any = opened
             for frame in _frames(pair, bar, width, slowdown):
                 is_gif = path.suffix == ".gif"
                 writer.append_data(SHADES[frame] if is_gif else frame)
