@@ -84,19 +84,21 @@ def test_every_command_explains_itself(command, capsys):
     assert "--json " in text and "--dry-run" in text
     assert ("--seed " in text) == (command not in NOTHING_RANDOM)
     assert ("--quiet" in text) == (command not in SOON_DONE)
+    for mark in ("`", "STR", "INT", "FLOAT", "{None}", "default: )", "default: none"):
+        assert mark not in text
 
 
-@pytest.mark.parametrize("command", ["data", "train", "finetune"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_explains_every_flag(command, capsys):
     with pytest.raises(SystemExit):
         main([command, "--help"])
-    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
     options = [i for i, line in enumerate(lines) if re.match(r"--\w", line)]
     texts = [
         " ".join(lines[first:last]).partition("(default:")[0].split()
         for first, last in pairwise([*options, len(lines)])
     ]
-    assert len(texts) > 8
+    assert len(texts) >= 2
     for words in texts:  # more than names, types and choices
         told = [w for w in words if w.isalpha() and w.islower() and len(w) > 1]
         assert len(told) >= 2, words

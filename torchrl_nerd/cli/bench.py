@@ -27,9 +27,9 @@ class Bench(MeasuringCommand):
     variants: tuple[str, ...] = ("compiled",)
     """Other ways to run each model, see nerd eval: compiled, window, bf16."""
     batches: tuple[int, ...] = (1, 64, 512, 4096)
-    """Trajectories stepped together."""
+    """How many trajectories are stepped together, for the rates."""
     num_trajectories: int = 256
-    """Trajectories per case, for the errors."""
+    """How many trajectories of each case the errors are means of."""
     rounds: int = 5
     """Samples of each candidate's speed; the median is shown."""
     seed: int = 500
@@ -37,7 +37,7 @@ class Bench(MeasuringCommand):
     steps: int | None = None
     """Horizon of the errors; the paper's by default."""
     quiet: bool = False
-    """No progress bars."""
+    """Show no progress bars."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""

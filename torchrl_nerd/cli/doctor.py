@@ -30,7 +30,7 @@ class Doctor(Command):
     """
 
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print what was found and return it.

@@ -54,7 +54,7 @@ class Eval(MeasuringCommand):
     model: Path | None = None
     """Name of a shipped model, or a checkpoint folder; all that are shipped by default."""
     num_trajectories: int = 2048
-    """Trajectories per case."""
+    """How many trajectories of each case the errors are means of."""
     seed: int = 500
     """Of the initial states; test seeds are never used in training or validation."""
     variants: tuple[str, ...] = ()
@@ -73,7 +73,7 @@ class Eval(MeasuringCommand):
     """Beside it, on recorded trajectories: MuJoCo and the analytic step with the scene's
     own parameters."""
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their rows.

@@ -3,7 +3,7 @@
 import io
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, redirect_stdout
 from itertools import pairwise
 from typing import Any
 
@@ -17,6 +17,7 @@ from torchrl_nerd.cli.doctor import Doctor
 from torchrl_nerd.cli.eval import Eval
 from torchrl_nerd.cli.explain import Explain
 from torchrl_nerd.cli.finetune import Finetune
+from torchrl_nerd.cli.help import REGISTRY, tidy
 from torchrl_nerd.cli.play import Play
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
@@ -77,20 +78,19 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
     Raises:
         SettingError: a setting out of range, in its own words and without a box.
     """
-    said = io.StringIO()
+    said, shown = io.StringIO(), io.StringIO()
+    how: dict[str, Any] = {"args": argv[1:], "prog": f"nerd {argv[0]}"}
     try:
-        with redirect_stderr(said):
-            default = _default(kind, argv[1:])
-            return tyro.cli(
-                kind, args=argv[1:], prog=f"nerd {argv[0]}", default=default
-            )
+        with redirect_stderr(said), redirect_stdout(shown), REGISTRY:
+            return tyro.cli(kind, default=_default(kind, argv[1:]), **how)
     except SystemExit as stop:
         cause = stop.__context__
         while cause is not None:
             if isinstance(cause, SettingError):
                 raise cause from None
             cause = cause.__cause__ or cause.__context__
-        sys.stderr.write(said.getvalue())
+        sys.stderr.write(tidy(said.getvalue()))
+        sys.stdout.write(tidy(shown.getvalue()))
         raise
 
 

@@ -48,11 +48,11 @@ class Play(DeviceCommand):
     out: Path | None = None
     """Video, .gif or .mp4; runs/TASK.gif by default."""
     width: int = 720
-    """Of the video, pixels."""
+    """Width of the video in pixels."""
     slowdown: float = 1.0
     """2 plays at half speed."""
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     @property
     def figure(self) -> Path:

@@ -38,7 +38,7 @@ class Stability(MeasuringCommand):
     compile: bool = False
     """Compile the model's step: long cases take a fraction of the time."""
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print a verdict per case, then the table, and return the results.

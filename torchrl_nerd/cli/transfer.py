@@ -28,11 +28,11 @@ class Transfer(MeasuringCommand):
     """Any of nerd, hybrid, analytic, mujoco, dm_control, mujoco_warp, names of shipped
     models, checkpoint folders."""
     episodes: int = 2048
-    """Episodes per dynamics."""
+    """How many episodes of each dynamics the returns are means of."""
     seed: int = 500
     """Seed of the resets."""
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows.
