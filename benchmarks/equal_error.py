@@ -15,7 +15,7 @@ from pathlib import Path
 
 import tyro
 
-from torchrl_nerd.evaluation.bench.error_table import ErrorRow
+from torchrl_nerd.evaluation.bench.errors import ErrorRow
 from torchrl_nerd.evaluation.bench.rates import RateRow
 from torchrl_nerd.evaluation.bench.report import BenchReport, pareto_front
 from torchrl_nerd.evaluation.results import read_results

@@ -19,9 +19,9 @@ from tyro.conf import Positional
 
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import models
-from torchrl_nerd.evaluation.bench.error_table import text_table
 from torchrl_nerd.evaluation.bench.rates import mid_states
 from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import History, Network
 from torchrl_nerd.robots import load_scene, source_of

@@ -22,7 +22,8 @@ import tyro
 from torch import Tensor
 
 from torchrl_nerd.cli.eval import Eval
-from torchrl_nerd.evaluation.bench.error_table import error_table
+from torchrl_nerd.evaluation.bench.candidates import models, simulators
+from torchrl_nerd.evaluation.bench.errors import error_table
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import load_scene
@@ -141,8 +142,9 @@ def main(options: Options) -> None:
     measured = Eval(
         "double_pendulum", num_trajectories=options.num_trajectories, seed=options.seed
     )
-    rows = []
-    for part in measured.measure(load_scene("double_pendulum"), UNSEEN_TERRAIN):
+    scene, rows = load_scene("double_pendulum"), []
+    candidates = [*simulators(scene), *models(scene)]
+    for part in measured.measure(UNSEEN_TERRAIN, candidates):
         print(f"\n{part[0].case}, {part[0].steps} steps\n{error_table(part)}")
         rows += [asdict(row) for row in part]
     if options.json is not None:

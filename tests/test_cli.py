@@ -17,8 +17,7 @@ from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import mujoco_name, simulators
-from torchrl_nerd.evaluation.bench.error_table import PAPER
-from torchrl_nerd.evaluation.bench.evaluation_set import cases_of
+from torchrl_nerd.evaluation.bench.errors import PAPER, cases_of
 from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import folder_name

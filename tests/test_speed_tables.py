@@ -7,7 +7,7 @@ import equal_error
 import pytest
 import torch
 
-from torchrl_nerd.evaluation.bench.error_table import ErrorRow
+from torchrl_nerd.evaluation.bench.errors import ErrorRow
 from torchrl_nerd.evaluation.bench.rates import RateRow
 from torchrl_nerd.evaluation.bench.report import BenchReport
 from torchrl_nerd.evaluation.results import write_results

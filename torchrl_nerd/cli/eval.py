@@ -5,16 +5,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tqdm import tqdm
-
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional, recorded_scene
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
-from torchrl_nerd.evaluation.bench.candidates import models, mujoco_name, simulators
-from torchrl_nerd.evaluation.bench.error_table import ErrorRow, error_rows, error_table
-from torchrl_nerd.evaluation.bench.evaluation_set import cases_of, evaluation_set
+from torchrl_nerd.evaluation.bench.candidates import (
+    Candidate,
+    models,
+    mujoco_name,
+    simulators,
+)
+from torchrl_nerd.evaluation.bench.errors import (
+    ErrorRow,
+    cases_of,
+    error_rows,
+    error_table,
+    evaluation_set,
+    measure,
+)
 from torchrl_nerd.evaluation.recorded_error import (
     STATES,
     compare,
@@ -31,8 +40,6 @@ from torchrl_nerd.robots import (
 )
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-
-GROUND_TRUTH = "ground truth"
 
 
 @dataclass(frozen=True)
@@ -85,8 +92,8 @@ class Eval(MeasuringCommand):
             return self.run_recorded(self.data)
         if self.baselines or self.split != "all" or self.states != STATES:
             raise ValueError("expected --data with --baselines, --split or --states")
-        scene = load_scene(self.scene)
         expect_at_least(2, num_trajectories=self.num_trajectories)
+        scene = load_scene(self.scene)
         solver_name = mujoco_name(self.ground_truth(scene).scene)
         solver = "the reference solver" if self.reference else "the scene's own solver"
         print(
@@ -94,11 +101,12 @@ class Eval(MeasuringCommand):
             f"{solver_name}, {solver}. "
             "Every row, coarse MuJoCo included, is measured against it."
         )
+        names = [] if self.model is None else [str(self.model)]
+        learned = models(scene, names, self.device, self.variants)
         rows = []
-        for part in self.measure(scene, protocol_of(scene)):
+        for part in self.measure(protocol_of(scene), [*simulators(scene), *learned]):
             rows += part
-            title = f"{part[0].case}, {part[0].steps} steps"
-            tqdm.write(f"\n{title}\n{error_table(part)}")
+            print(f"\n{part[0].case}, {part[0].steps} steps\n{error_table(part)}")
         return {
             "scene": self.scene,
             "num_trajectories": self.num_trajectories,
@@ -111,33 +119,16 @@ class Eval(MeasuringCommand):
         return MujocoDynamics(scene.reference if self.reference else scene)
 
     def measure(
-        self, scene: Scene, protocol: EvaluationProtocol
+        self, protocol: EvaluationProtocol, candidates: list[Candidate]
     ) -> Iterator[list[ErrorRow]]:
         """Rows of one case and horizon after the other."""
-        names = [] if self.model is None else [str(self.model)]
-        learned = models(scene, names, self.device, self.variants)
-        candidates = [*simulators(scene), *learned]
-        cases, horizons = list(cases_of(protocol)), protocol.horizons
-        steps = max(horizons)
-        solver_name = mujoco_name(self.ground_truth(scene).scene)
-        count = len(cases) * (1 + len(candidates))
-        bar = tqdm(total=count, desc=self.scene, leave=False, disable=self.quiet)
-        for case, source, is_driven in cases:
-            about = (self.num_trajectories, steps, self.seed, self.device)
+        about = self.num_trajectories, max(protocol.horizons), self.seed, self.device
+        for case, source, is_driven in cases_of(protocol):
             chosen = evaluation_set(case, source, is_driven, self.ground_truth, *about)
-            bar.update()
-            errors = {}
-            for c in candidates:
-                if c.name == solver_name:
-                    errors[c.name, GROUND_TRUTH] = chosen.zeros
-                else:
-                    errors[c.name, c.kind] = chosen.errors(c.make(chosen.scene))
-                bar.update()
-            found = error_rows(chosen.scene, case, horizons, errors, protocol.published)
-            rows = list(found)
-            for horizon in horizons:
-                yield [row for row in rows if row.steps == horizon]
-        bar.close()
+            errors = measure([chosen], candidates, case, self.quiet)
+            for horizon in protocol.horizons:
+                published = protocol.published
+                yield error_rows(chosen.scene, case, horizon, errors, published)
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
         """The same for recorded trajectories.

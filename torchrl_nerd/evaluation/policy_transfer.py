@@ -19,7 +19,7 @@ from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
-from torchrl_nerd.evaluation.bench.error_table import text_table
+from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene

@@ -15,8 +15,8 @@ from torchrl_nerd.analytic import make_step
 from torchrl_nerd.data.recorded import TORQUE, Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import NoMotion, has_step
-from torchrl_nerd.evaluation.bench.error_table import text_table
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
+from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
 

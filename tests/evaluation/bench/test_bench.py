@@ -16,17 +16,22 @@ from torchrl_nerd.evaluation.bench import rates
 from torchrl_nerd.evaluation.bench.candidates import (
     COARSE,
     RIVALS,
+    Candidate,
     NoMotion,
     models,
     mujoco_name,
     simulators,
 )
-from torchrl_nerd.evaluation.bench.error_table import PAPER, error_rows, error_table
-from torchrl_nerd.evaluation.bench.evaluation_set import (
+from torchrl_nerd.evaluation.bench.errors import (
     DRIVEN,
+    GROUND_TRUTH,
+    PAPER,
     EvaluationSet,
     cases_of,
+    error_rows,
+    error_table,
     evaluation_set,
+    measure,
 )
 from torchrl_nerd.evaluation.bench.rates import mid_states
 from torchrl_nerd.evaluation.bench.report import (
@@ -175,7 +180,9 @@ def test_errors_shrink_with_the_substeps_and_the_ground_truth_has_none(seed):
     assert 3.0 < coarse["hinge"].mean() / fine["hinge"].mean() < 6.0
     again = chosen.errors(finest(chosen.scene))
     assert all(not error.any() for error in again.values())
-    assert all(not error.any() for error in chosen.zeros.values())
+    itself = Candidate(chosen.solver, "simulator", NoMotion)  # it is not rolled out
+    assert all(not error.any() for error in chosen.candidate_errors(itself).values())
+    assert list(measure([chosen], [itself])) == [(chosen.solver, GROUND_TRUTH)]
 
 
 def test_no_motion_has_the_error_of_staying_where_one_is(name, seed):
@@ -225,8 +232,8 @@ def test_a_rollout_that_diverges_is_not_rolled_out_further(seed):
     assert len(steps) == 3
     for error in errors.values():
         assert error[:, :2].isfinite().all() and error[:, 3:].isnan().all()
-    rows = error_rows(chosen.scene, "passive", [6], {("x", "learned"): errors}, {})
-    assert "diverges" in error_table(list(rows))
+    rows = error_rows(chosen.scene, "passive", 6, {("x", "learned"): errors}, {})
+    assert "diverges" in error_table(rows)
 
 
 def test_nobody_beats_the_front(generator):
@@ -254,5 +261,5 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, (0,))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
         bench(scene, names=["nowhere"])
-    with pytest.raises(ValueError, match="variants among compiled, .*, got 'fast'"):
+    with pytest.raises(ValueError, match="unknown variant 'fast', expected one of compiled"):
         bench(scene, variants=("fast",))

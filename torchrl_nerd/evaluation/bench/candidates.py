@@ -17,6 +17,7 @@ from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.transformer import CausalTransformer
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import look_up
 
 KINDS = ("baseline", "simulator", "analytic", "hybrid", "learned")
 """In the order of the table."""
@@ -64,10 +65,7 @@ class NoMotion:
         """See `Dynamics.restore`."""
 
     def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
+        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """The same state."""
         return state.select(QPOS, QVEL)
@@ -119,16 +117,14 @@ def models(
     Raises:
         ValueError: an unknown variant; see `from_pretrained`.
     """
-    unknown = [variant for variant in variants if variant not in VARIANTS]
-    if unknown:
-        known = ", ".join(VARIANTS)
-        raise ValueError(f"expected variants among {known}, got '{unknown[0]}'")
-    found: list[Candidate] = []
+    for variant in variants:
+        look_up("variant", variant, dict.fromkeys(VARIANTS))
     own = ["analytic"] if has_step(scene) else []
-    for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
-        model = from_pretrained(name, scene).to(device)
-        found.append(_candidate(name, model))
-        found += _variants(name, model, variants)
+    found = [
+        candidate
+        for name in dict.fromkeys((*own, *(names or shipped_models(scene))))
+        for candidate in _ways(name, from_pretrained(name, scene).to(device), variants)
+    ]
     return sorted(found, key=lambda c: KINDS.index(c.kind))
 
 
@@ -141,17 +137,19 @@ def has_step(scene: Scene) -> bool:
     return True
 
 
-def _variants(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidate]:
-    """Other ways to run a model; an analytic step has no network and no history."""
+def _ways(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidate]:
+    """A model and its variants; an analytic step has no network and no history."""
+    yield _candidate(name, model)
+    has_window = isinstance(model, NeRD) and isinstance(
+        model.network, CausalTransformer
+    )
     for variant in variants:
         label = f"{name}, {variant}"
         if variant == "compiled":
             yield _candidate(label, model, compile=True)
-        elif not isinstance(model, NeRD):
-            continue
-        elif variant == "bf16":
+        elif variant == "bf16" and isinstance(model, NeRD):
             yield _candidate(label, copy.deepcopy(model).to(torch.bfloat16))
-        elif isinstance(model.network, CausalTransformer):
+        elif variant == "window" and has_window:
             yield _candidate(label, model, inference="window")
 
 

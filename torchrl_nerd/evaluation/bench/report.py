@@ -4,13 +4,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.bench.candidates import models, mujoco_name, simulators
-from torchrl_nerd.evaluation.bench.error_table import ErrorRow, error_rows, error_table
-from torchrl_nerd.evaluation.bench.evaluation_set import evaluation_set
+from torchrl_nerd.evaluation.bench.candidates import models, simulators
+from torchrl_nerd.evaluation.bench.errors import (
+    ErrorRow,
+    error_rows,
+    error_table,
+    evaluation_set,
+    measure,
+    together,
+)
 from torchrl_nerd.evaluation.bench.rates import RateRow, rate_rows
 from torchrl_nerd.robots import EvaluationProtocol, protocol_of
 from torchrl_nerd.scenes import Scene
@@ -139,12 +144,9 @@ def bench(
         )
         for case, source in protocol.cases.items()
     ]
-    errors = {
-        (c.name, c.kind): _together([s.errors(c.make(s.scene)) for s in sets])
-        for c in tqdm(candidates, "errors", disable=quiet)
-    }
+    errors = measure(sets, candidates, quiet=quiet)
     name = f"ground truth, perturbed by {PERTURBATION:.0e}"
-    errors[name, "sensitivity"] = _together(
+    errors[name, "sensitivity"] = together(
         [s.errors(ground_truth(s.scene), s.perturbed(PERTURBATION, seed)) for s in sets]
     )
     moving = [c for c in candidates if c.kind != "baseline"]
@@ -159,8 +161,8 @@ def bench(
         scene=scene.name,
         steps=horizon,
         num_trajectories=num_trajectories,
-        ground_truth=mujoco_name(reference_of(sets[-1].scene)),
-        errors=list(error_rows(scene, case, [horizon], errors, paper)),
+        ground_truth=sets[-1].solver,
+        errors=error_rows(scene, case, horizon, errors, paper),
         rates=rates,
     )
 
@@ -181,11 +183,6 @@ def bench_table(report: BenchReport) -> str:
         about = f"Pareto front of {quantity} and rate, batch {report.batch}"
         lines.append(f"{about}: {'; '.join(front)}")
     return "\n".join(lines)
-
-
-def _together(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Errors of all cases as one."""
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def _published(

@@ -1,0 +1,247 @@
+"""Open-loop errors of all candidates, from equal initial states and actions."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+from tqdm import tqdm
+
+from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
+from torchrl_nerd.evaluation.bench.candidates import Candidate, mujoco_name
+from torchrl_nerd.evaluation.rollout_error import (
+    Drive,
+    action_drive,
+    initial_states,
+    open_loop,
+    position_errors,
+    scene_of,
+    summarize,
+    unit_of,
+)
+from torchrl_nerd.evaluation.tables import text_table
+from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.keys import QPOS
+from torchrl_nerd.robots import EvaluationProtocol, Source
+from torchrl_nerd.scenes import Scene
+
+DRIVEN = "driven"
+"""The case of uniform random actions, beside the passive ones."""
+GROUND_TRUTH = "ground truth"
+PAPER = "paper (NeRD)"
+QUANTITIES = 3  # side by side: more do not fit on a line
+
+Errors = dict[str, Tensor]
+"""Quantity of `position_errors` -> ``(n, steps)``, m or rad."""
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """One case: what every candidate starts from, is driven by and is measured against.
+
+    | field | meaning |
+    |---|---|
+    | ``case`` | its name |
+    | ``source`` | whose initial states and controller |
+    | ``start`` | initial states, ``[n]`` |
+    | ``drive`` | joint torques |
+    | ``solver`` | name of the MuJoCo that made the ground truth, see `mujoco_name` |
+    | ``ground_truth`` | positions after each step, ``(n, steps, nq)`` |
+    """
+
+    case: str
+    source: Source
+    start: TensorDict
+    drive: Drive
+    solver: str
+    ground_truth: Tensor
+
+    @property
+    def scene(self) -> Scene:
+        """The robot and its terrain."""
+        return scene_of(self.source)
+
+    def errors(self, dynamics: Dynamics, start: TensorDict | None = None) -> Errors:
+        """Error at every step; NaN where it diverges.
+
+        Args:
+            dynamics: of the same robot and terrain.
+            start: other initial states ``[n]`` than the set's.
+        """
+        start = self.start if start is None else start
+        steps = self.ground_truth.shape[1]
+        path = open_loop(dynamics, start, steps, self.drive, stop_at_nan=True)
+        return position_errors(self.scene, self.ground_truth, path)
+
+    def candidate_errors(self, candidate: Candidate) -> Errors:
+        """The same of a candidate: 0 by definition of the ground truth itself."""
+        if candidate.name != self.solver:
+            return self.errors(candidate.make(self.scene))
+        both = self.ground_truth, self.ground_truth
+        return {k: 0.0 * e for k, e in position_errors(self.scene, *both).items()}
+
+    def perturbed(self, size: float, seed: int) -> TensorDict:
+        """The initial states with ``size`` (m, rad) times a normal number added to each."""
+        layout, start = self.scene.layout, self.start.clone()
+        shape, generator = (len(start), layout.nv), Generator().manual_seed(seed)
+        noise = torch.randn(shape, dtype=torch.float64, generator=generator)  # (n, nv)
+        start[QPOS] = integrate_pos(layout, start[QPOS], size * noise.to(start[QPOS]))
+        return start
+
+
+def cases_of(protocol: EvaluationProtocol) -> Iterator[tuple[str, Source, bool]]:
+    """Name, source and whether actions are random, of every case of a protocol.
+
+    A robot with actuators gets a driven case after its own, unless it has one.
+    """
+    for case, source in protocol.cases.items():
+        yield case, source, case in protocol.random_actions
+    last = list(protocol.cases.values())[-1]
+    if scene_of(last).actuated and not protocol.random_actions:
+        yield DRIVEN, last, True
+
+
+def evaluation_set(
+    case: str,
+    source: Source,
+    is_driven: bool,
+    ground_truth: Callable[[Scene], MujocoDynamics],
+    num_trajectories: int,
+    steps: int,
+    seed: int,
+    device: torch.device | str = "cpu",
+) -> EvaluationSet:
+    """The set of one case, of which the ground truth makes the trajectories."""
+    start = initial_states(source, num_trajectories, seed).to(device)
+    drive = action_drive(source, num_trajectories, steps, seed, is_driven)
+    exact = ground_truth(scene_of(source))
+    path = open_loop(exact, start, steps, drive)
+    return EvaluationSet(case, source, start, drive, mujoco_name(exact.scene), path)
+
+
+def measure(
+    sets: Sequence[EvaluationSet],
+    candidates: Sequence[Candidate],
+    title: str = "errors",
+    quiet: bool = True,
+) -> dict[tuple[str, str], Errors]:
+    """Errors over all sets together, by name and kind of the candidate."""
+    found = {}
+    for candidate in tqdm(candidates, title, leave=False, disable=quiet):
+        kind = GROUND_TRUTH if candidate.name == sets[0].solver else candidate.kind
+        parts = [each.candidate_errors(candidate) for each in sets]
+        found[candidate.name, kind] = together(parts)
+    return found
+
+
+def together(parts: Sequence[Errors]) -> Errors:
+    """Errors of several sets as one."""
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """One candidate, one case, one horizon, one quantity.
+
+    | field | meaning |
+    |---|---|
+    | ``case``, ``steps`` | what was rolled out, how long |
+    | ``name``, ``kind`` | of the candidate |
+    | ``quantity``, ``unit`` | what is measured, in m or rad |
+    | ``mean``, ``interval``, ``final``, ``p95`` | see `ErrorSummary`; None: not published |
+    """
+
+    case: str
+    steps: int
+    name: str
+    kind: str
+    quantity: str
+    unit: str
+    mean: float
+    interval: float | None = None
+    final: float | None = None
+    p95: float | None = None
+
+
+def error_rows(
+    scene: Scene,
+    case: str,
+    horizon: int,
+    errors: Mapping[tuple[str, str], Errors],
+    published: Mapping[tuple[str, int, str], float],
+) -> list[ErrorRow]:
+    """Rows of one case and horizon: every candidate in its order, the paper last.
+
+    Args:
+        scene: the robot.
+        case: its name.
+        horizon: control steps over which errors are averaged.
+        errors: (name, kind) -> errors at every step.
+        published: (case, horizon, quantity) -> the paper's mean error, m or rad.
+    """
+    rows, quantities = (
+        [],
+        dict.fromkeys(k for by_name in errors.values() for k in by_name),
+    )
+    for (name, kind), by_name in errors.items():
+        part = {k: e[:, :horizon] for k, e in by_name.items()}  # (n, horizon)
+        for quantity, error in summarize(scene, part).items():
+            rows.append(ErrorRow(case, horizon, name, kind, quantity, **vars(error)))
+    for quantity in quantities:
+        mean = published.get((case, horizon, quantity))
+        if mean is not None:
+            about = (
+                case,
+                horizon,
+                PAPER,
+                "published",
+                quantity,
+                unit_of(scene, quantity),
+            )
+            rows.append(ErrorRow(*about, mean))
+    return rows
+
+
+def error_table(
+    rows: Sequence[ErrorRow], rates: Mapping[str, Mapping[str, float]] | None = None
+) -> str:
+    """Text of the rows of one case and horizon: a line for every candidate.
+
+    Args:
+        rows: see `error_rows`.
+        rates: column -> name -> control steps per second.
+    """
+    quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
+    candidates = list(dict.fromkeys((row.name, row.kind) for row in rows))
+    found = {
+        (row.name, row.quantity): [_shown(x) for x in (row.mean, row.final, row.p95)]
+        for row in rows
+    }
+    tables = []
+    for first in range(0, len(quantities), QUANTITIES):
+        shown = quantities[first : first + QUANTITIES]
+        titles = [title for q, unit in shown for title in (f"{q} ({unit})", "", "")]
+        head = ["name", "kind", *("mean", "final", "p95") * len(shown)]
+        body = [
+            [
+                name,
+                kind,
+                *(x for q, _ in shown for x in found.get((name, q), ["-"] * 3)),
+            ]
+            for name, kind in candidates
+        ]
+        for column, speeds in (rates or {}).items():
+            head.append(column)
+            for line in body:
+                line.append(f"{speeds[line[0]]:,.0f}" if line[0] in speeds else "-")
+        tables.append(text_table(head, body, titles))
+    return "\n\n".join(tables)
+
+
+def _shown(value: float | None) -> str:
+    """Three digits; an error that is not finite is of a rollout that diverges."""
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isfinite(value) else "diverges"
