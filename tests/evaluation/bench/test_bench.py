@@ -261,5 +261,7 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, (0,))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
         bench(scene, names=["nowhere"])
-    with pytest.raises(ValueError, match="unknown variant 'fast', expected one of compiled"):
+    with pytest.raises(
+        ValueError, match="unknown variant 'fast'"
+    ):
         bench(scene, variants=("fast",))
