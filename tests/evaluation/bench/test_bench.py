@@ -261,7 +261,5 @@ def test_bad_requests_are_refused_in_a_sentence():
         bench(scene, (0,))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
         bench(scene, names=["nowhere"])
-    with pytest.raises(
-        ValueError, match="unknown variant 'fast'"
-    ):
+    with pytest.raises(ValueError, match="unknown variant 'fast'"):
         bench(scene, variants=("fast",))
