@@ -27,43 +27,31 @@ class GuardedDynamics:
 
     ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
     the inverse of `OODScore`: 0.5 is twice as far out. An env that is not finite
-    has trust 0. Envs below ``least_trust`` are untrusted. In ``"fallback"`` MuJoCo steps
-    them until they have been trusted for ``patience`` steps in a row: a swing that is too
-    fast at its bottom is familiar at its top. The network sees the states of MuJoCo, so
-    that it takes over again with their history.
+    has trust 0. Envs below trust 1 are untrusted. In ``"fallback"`` MuJoCo steps them until
+    they have been trusted for ``patience`` steps in a row: a swing that is too fast at its
+    bottom is familiar at its top. The network sees the states of MuJoCo, so that it takes
+    over again with their history.
 
     Args:
         learned: what steps the trusted envs.
         guard: what to do with the others.
-        least_trust: in (0, 1]; 1 distrusts about one training state in a hundred.
-        patience: control steps, for ``"fallback"``; 0 hands back at once.
 
     Raises:
-        ValueError: an unknown guard, a least trust outside (0, 1], a patience below 0, or
-            a model that does not know what it was trained on.
+        ValueError: an unknown guard, or a model that does not know what it was trained on.
     """
 
-    def __init__(
-        self,
-        learned: NeRDDynamics,
-        guard: Guard = "flag",
-        least_trust: float = 1.0,
-        patience: int = PATIENCE,
-    ) -> None:
+    patience = PATIENCE
+
+    def __init__(self, learned: NeRDDynamics, guard: Guard = "flag") -> None:
         if guard not in (known := get_args(Guard)):
             raise ValueError(f"expected a guard of {', '.join(known)}, got '{guard}'")
-        if not 0.0 < least_trust <= 1.0:
-            raise ValueError(f"expected a least_trust in (0, 1], got {least_trust}")
-        if patience < 0:
-            raise ValueError(f"expected a patience of at least 0, got {patience}")
         if not learned.model.training_range.is_fitted:
             raise ValueError(
                 "expected a model that knows what it was trained on, got weights of an "
                 "older version: train or fine-tune it again"
             )
         self.scene, self.learned = learned.scene, learned
-        self.kind = learned.kind
-        self.guard, self.least_trust, self.patience = guard, least_trust, patience
+        self.kind, self.guard = learned.kind, guard
         self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
         self.ground_truth = MujocoDynamics(self.scene) if guard == "fallback" else None
 
@@ -98,7 +86,7 @@ class GuardedDynamics:
         after, distance = self.learned.scored_step(state, joint_torque, terrain)
         assert distance is not None  # for the type checker: it was asked for
         trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
-        rows = trust < self.least_trust
+        rows = trust < 1.0
         if self.guard == "raise" and rows.any():
             raise UntrustedError(
                 f"expected inputs like those of training, got {int(rows.sum())} of "

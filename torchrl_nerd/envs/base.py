@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled, unaffected
-from torchrl_nerd.dynamics import Dynamics, GuardedDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import FaultRecorder
 from torchrl_nerd.envs.pixels import RenderedEnv
@@ -95,8 +95,7 @@ class SceneEnv(RenderedEnv):
         self.recorder: FaultRecorder | None = None
         if dump_dir is not None:
             about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
-            model = inner.model if isinstance(inner, NeRDDynamics) else None
-            self.recorder = FaultRecorder(Path(dump_dir), about, model)
+            self.recorder = FaultRecorder(Path(dump_dir), about)
         sizes, is_guarded = self._state_sizes, self.guard is not None
         for name, spec in make_specs(
             task, sizes, self.batch_size, self.device, is_guarded

@@ -2,7 +2,7 @@
 
 A fault ends its env as ``terminated`` at its last good state and leaves the others bitwise
 as they are. With a folder, the first fault of each kind leaves a dump there: the last
-states, torques, actions and the ground of one such env, and the model's features of them.
+states, torques, actions and the ground of one such env.
 """
 
 from collections import deque
@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.files import writable_folder
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.tensor_files import write_tensors
 
 REASONS = ("none", "action", "diverged", "runaway")
@@ -53,16 +52,13 @@ class FaultRecorder:
     Args:
         folder: where; made if it is not there.
         about: names of the ``scene`` and of the ``dynamics``, kept in the dump.
-        model: of a learned one; its ``features (T, F)`` go into the dump.
 
     Raises:
         ValueError: the folder cannot be written.
     """
 
-    def __init__(
-        self, folder: Path, about: dict[str, str], model: NeRD | None = None
-    ) -> None:
-        self.folder, self.about, self.model = writable_folder(folder), about, model
+    def __init__(self, folder: Path, about: dict[str, str]) -> None:
+        self.folder, self.about = writable_folder(folder), about
         self._steps: deque[dict[str, Tensor]] = deque(maxlen=HISTORY)
         self._written: set[int] = set()
 
@@ -89,11 +85,6 @@ class FaultRecorder:
         tensors = {
             k: torch.stack([s[k][row] for s in steps]) for k in steps[0]
         }  # (T, n)
-        if self.model is not None:
-            here = {key: value.to(self.model.device) for key, value in tensors.items()}
-            state, torque = (here[QPOS], here[QVEL]), here["joint_torque"]
-            features = self.model.features(*state, torque, here.get(TERRAIN))
-            tensors["features"] = features.detach().cpu()
         about = {**self.about, "reason": REASONS[kind], "env": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
         write_tensors(path, tensors, about)

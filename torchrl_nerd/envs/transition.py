@@ -46,9 +46,8 @@ class Transition:
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         self.task, self.dynamics = task, dynamics
         self.is_round = False
-        self.least_trust = 0.0  # no trust is below it
-        if isinstance(dynamics, GuardedDynamics) and dynamics.guard == "truncate":
-            self.least_trust = dynamics.least_trust
+        is_guarded = isinstance(dynamics, GuardedDynamics)
+        self.is_truncating = is_guarded and dynamics.guard == "truncate"
 
     def step(self, state: Tensors, action: Tensor, age: Tensor) -> Tensors:
         """All that one action leads to; an env at fault keeps its state and ends.
@@ -85,8 +84,9 @@ class Transition:
         terminated = ends | ~is_good
         truncated = (age + 1 >= self.task.horizon)[:, None]
         if trust is not None:
-            truncated = truncated | (trust < self.least_trust)
             after[TRUST] = trust
+            if self.is_truncating:
+                truncated = truncated | (trust < 1.0)
         earned = self.task.reward(state, given, shown)
         reward = self._per_env("reward", earned, action)
         return after | {

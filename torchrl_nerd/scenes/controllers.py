@@ -5,7 +5,7 @@ A controller is a function of the action and the state; a new one needs no new m
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -55,8 +55,8 @@ class TorqueController:
 class PDController:
     """A spring and damper to a target: ``clip(kp (target - q) - kd v, -limit, limit)``.
 
-    The target is ``scale * clip(action, -1, 1)`` added to zero (``absolute``), to
-    ``default`` or to the present position (``current``).
+    The target is ``scale * clip(action, -1, 1)`` from the pose ``default``, or from the
+    present position where there is none.
 
     Args:
         qpos_addresses: of the actuated joints.
@@ -64,12 +64,11 @@ class PDController:
         kp: stiffness, N m/rad or N/m, one per joint.
         kd: damping, N m s/rad or N s/m.
         scale: rad or m per unit of action.
-        relative_to: what the target is relative to.
-        default: pose of the actuated joints; needed for ``relative_to="default"``.
+        default: pose of the actuated joints, rad or m.
         limit: largest torque; None for none.
 
     Raises:
-        ValueError: lengths that differ, or no default where one is needed.
+        ValueError: lengths that differ.
     """
 
     qpos_addresses: tuple[int, ...]
@@ -77,13 +76,10 @@ class PDController:
     kp: Row
     kd: Row
     scale: Row
-    relative_to: Literal["absolute", "default", "current"] = "absolute"
     default: Row | None = None
     limit: Row | None = None
 
     def __post_init__(self) -> None:
-        if self.relative_to == "default" and self.default is None:
-            raise ValueError("expected a default pose to be relative to, got none")
         for name in ("dof_addresses", "kp", "kd", "scale", "default", "limit"):
             value = getattr(self, name)
             if value is not None and len(value) != self.num_actions:
@@ -99,15 +95,9 @@ class PDController:
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, num_actuated)``."""
         target = action.to(qpos.dtype).clamp(-1.0, 1.0) * qpos.new_tensor(self.scale)
-        if self.relative_to == "current":
-            target = target + qpos[..., self.qpos_addresses]
-        elif self.relative_to == "default":
-            target = target + qpos.new_tensor(self.default)
-        return self.torque(target, qpos, qvel)
-
-    def torque(self, target: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """Joint torques that pull to ``target (*batch, num_actuated)``."""
-        offset = target - qpos[..., self.qpos_addresses]
+        position = qpos[..., self.qpos_addresses]
+        default = position if self.default is None else qpos.new_tensor(self.default)
+        offset = target + default - position
         velocity = qvel[..., self.dof_addresses]
         torque = qpos.new_tensor(self.kp) * offset - qpos.new_tensor(self.kd) * velocity
         if self.limit is None:
@@ -205,24 +195,17 @@ class ActuatorController:
         force = _clip(force, self.force_low, self.force_high)
         return _clip(force @ moment, self.torque_low, self.torque_high)
 
-
-@dataclass(frozen=True)
-class RandomActions:
-    """Drives training trajectories of servos: a new uniform action every control step.
-
-    Uniform torques as large as a stiff servo's would throw the robot about as no servo
-    does.
-    """
-
-    controller: ActuatorController
-
-    def __call__(
+    def drive(
         self, qpos: Tensor, qvel: Tensor, scale: Tensor, generator: Generator
     ) -> Tensor:
-        """Joint torques ``(rows, D)``, times each row's scale ``(rows, 1)``."""
-        size = (len(qpos), self.controller.num_actions)
+        """Torques ``(rows, D)`` of uniform actions, times each row's scale ``(rows, 1)``.
+
+        For training trajectories of servos: uniform torques as large as a stiff servo's
+        would throw the robot about as no servo does.
+        """
+        size = (len(qpos), self.num_actions)
         u = torch.rand(size, dtype=torch.float64, generator=generator)
-        return scale * self.controller(2.0 * u - 1.0, qpos, qvel)
+        return scale * self(2.0 * u - 1.0, qpos, qvel)
 
 
 def driven_dofs(model: mujoco.MjModel) -> list[int]:

@@ -25,7 +25,7 @@ import torch
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE
 from torchrl_nerd.scenes.contact_points import contact_points, ground_geoms
-from torchrl_nerd.scenes.controllers import ActuatorController, RandomActions
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling, uniform
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def default_sampling(
         qvel_high=tuple(speed[skipped_v:]),
         torque=tuple(torque),
         base=_base_sampling(model, speed) if base.is_floating else None,
-        drive=None if controller.is_motor else RandomActions(controller),
+        drive=None if controller.is_motor else controller.drive,
         clearance=0.0 if len(contact_points(model, base)) else None,
     )
     return replace(sampling, **ranges)

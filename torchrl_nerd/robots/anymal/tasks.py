@@ -46,7 +46,6 @@ class Anymal(WalkingTask):
             kp=(KP,) * 12,
             kd=(KD,) * 12,
             scale=(ACTION_SCALE,) * 12,
-            relative_to="default",
             default=STANDING_POSE,
         )
 

@@ -94,9 +94,7 @@ class FrankaReach(FrankaReachTorque):
     def controller(self) -> PDController:
         """Springs to a place near the present one, within the effort limits."""
         joints, scale = tuple(range(7)), (ACTION_SCALE,) * 7
-        return PDController(
-            joints, joints, KP, KD, scale, relative_to="current", limit=GAIN
-        )
+        return PDController(joints, joints, KP, KD, scale, limit=GAIN)
 
 
 class FrankaReachOSC(FrankaReachTorque):
