@@ -416,7 +416,8 @@ def test_what_cannot_be_learned_is_refused_by_name(named, tmp_path):
         ("gymnasium/Unicycle-v5", "unknown environment 'Unicycle-v5'"),
         ("dm_control/unicycle-ride", "unknown domain .* expected one of acrobot"),
         ("dm_control/cheetah-fly", "unknown task .* expected one of run$"),
-        ("dm_control/cheetah", "unknown scene 'dm_control/cheetah'"),
+        ("dm_control/cheetah", "unknown task in .*cheetah-', expected one of run$"),
+        ("gymnasium/", "unknown environment '' of Gymnasium"),
         ("nowhere/robot.xml", "expected an MJCF file, found none at nowhere"),
     ],
 )

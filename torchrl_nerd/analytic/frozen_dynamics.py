@@ -52,7 +52,7 @@ class DynamicsEvaluation(nn.Module):
         places = points.positions, axes.positions, self.rigid_body.positions
         places = np.concatenate(places)
         self.kinematics = PointKinematics(model, scene.base, bodies, places)
-        self.pose = BasePose(scene.base, scene.fixed_base_pose)
+        self.pose = BasePose(scene.model, scene.base)
         self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
         # linear ones, which move every point; the base's angular ones come next
         self.num_base_dofs = 3 * scene.base.is_floating

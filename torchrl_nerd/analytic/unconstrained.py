@@ -49,7 +49,7 @@ class UnconstrainedStep(AnalyticStep):
         bodies = axes.bodies + self.rigid_body.bodies
         positions = np.concatenate((axes.positions, self.rigid_body.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, positions)
-        self.pose = BasePose(scene.base, scene.fixed_base_pose)
+        self.pose = BasePose(scene.model, scene.base)
         self.layout = scene.layout
         is_limited = model.jnt_limited[axes.joints] != 0
         self.limits, self.num_solves = None, 1

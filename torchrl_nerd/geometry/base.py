@@ -76,15 +76,16 @@ def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.n
 
 
 class BasePose(nn.Module):
-    """World position and rotation of B_t; ``mount``: `fixed_base_pose` of a fixed base."""
+    """World position and rotation of the base frame B_t of a compiled model."""
 
     position: Tensor
     rotation: Tensor
 
-    def __init__(self, base: Base, mount: tuple[np.ndarray, np.ndarray]) -> None:
+    def __init__(self, model: mujoco.MjModel, base: Base) -> None:
         super().__init__()
         self.base = base
-        keep_constants(self, position=mount[0], rotation=mount[1])
+        position, rotation = fixed_base_pose(model, base)
+        keep_constants(self, position=position, rotation=rotation)
 
     def forward(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """Position ``(*batch, 3)``, m, and rotation ``(*batch, 3, 3)`` for ``qpos``."""

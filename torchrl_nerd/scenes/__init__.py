@@ -21,18 +21,13 @@ def import_scene(name: str) -> Scene:
     Raises:
         ValueError: no such robot, or one with something not supported (named).
     """
-    origin, _, rest = name.partition("/")
-    domain, _, task = rest.partition("-")
-    if origin == "dm_control" and task:
-        return Scene.from_dm_control(domain, task)
-    if origin == "gymnasium" and rest:
-        return Scene.from_gymnasium(rest)
     if name.endswith(".xml"):
         return Scene.from_mjcf(name)
-    raise ValueError(
-        f"unknown scene {name!r}, expected dm_control/DOMAIN-TASK, gymnasium/ID or "
-        "an MJCF file"
-    )
+    origin, _, rest = name.partition("/")
+    if origin == "gymnasium":
+        return Scene.from_gymnasium(rest)
+    domain, _, task = rest.partition("-")
+    return Scene.from_dm_control(domain, task)
 
 
 __all__ = ["Scene", "import_scene", "is_import"]

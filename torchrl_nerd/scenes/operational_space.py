@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.base import Base, BasePose, JointAxes, fixed_base_pose
+from torchrl_nerd.geometry.base import Base, BasePose, JointAxes
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.geometry.serial_chain import SiteKinematics, bias_acceleration
@@ -94,7 +94,7 @@ class OperationalSpaceController:
         bodies = axes.bodies + self.rigid_body.bodies
         positions = np.concatenate((axes.positions, self.rigid_body.positions))
         self.kinematics = PointKinematics(model, base, bodies, positions)
-        self.base_pose = BasePose(base, fixed_base_pose(model, base))
+        self.base_pose = BasePose(model, base)
 
     def _check(self, model: mujoco.MjModel) -> None:
         if len(self.scale) not in AXES:

@@ -280,7 +280,7 @@ class Scene:
     # constants as tensors that stay: compiled code would make them anew of arrays
     @cached_property
     def _pose(self) -> BasePose:
-        return BasePose(self.base, self.fixed_base_pose)
+        return BasePose(self.model, self.base)
 
     @cached_property
     @torch.inference_mode(False)

@@ -115,7 +115,7 @@ class ContactFeatures(FeatureTransform):
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
         self.count, self.num_known = count, count + self.num_places
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
-        self.pose = BasePose(scene.base, scene.fixed_base_pose)
+        self.pose = BasePose(scene.model, scene.base)
         self.predicted_penetration = PredictedPenetration(scene, self.ground, self.pose)
         keep_constants(self, radii=points.radii, margins=points.margins)
 
