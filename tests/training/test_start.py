@@ -119,7 +119,7 @@ def test_symmetry_needs_statistics_that_images_share(generator):
     scene, network = load_scene("ant"), NETWORKS["mlp-1x16"]
     data = simulate(scene, 64, 4, generator)
     data = data[is_sound(data)]
-    symmetry, stats = Symmetry.of(scene), data_stats(scene, data)
+    symmetry, stats = Symmetry(scene), data_stats(scene, data)
     shared = NeRD(scene, NO_PREDICTIONS, network, symmetry.complete(stats))
     begin_from(shared, scene, MLP, symmetry)
     alone = NeRD(scene, NO_PREDICTIONS, network, stats)

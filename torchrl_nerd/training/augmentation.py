@@ -4,20 +4,20 @@ The image of a token or target under an isometry is a signed permutation of its 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import cast
 
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.geometry.base import keep_constants, keep_indices
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.samples import raw_tokens
-from torchrl_nerd.training.symmetry import Isometry, find_isometries, states_in_contact
+from torchrl_nerd.training.symmetry import find_isometries, states_in_contact
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 RTOL = 1e-7  # of equal entries, relative to the largest of a column
@@ -27,7 +27,7 @@ OVERSHOOT = 0.2  # of a joint's range, beyond its limits
 MAX_DEPTHS = 0.01, 1.0  # m: with some of the contact points in the ground, and with all
 
 
-class SignedPermutations:
+class SignedPermutations(nn.Module):
     """Images of a kind of vector under isometries: ``image[j] = sign[j] x[source[j]]``.
 
     Sources and signs are found from samples and their images.
@@ -40,11 +40,16 @@ class SignedPermutations:
         ValueError: an entry of an image that is none of the original's.
     """
 
-    def __init__(self, original: Tensor, images: Sequence[Tensor]) -> None:
-        pairs = [_match(original, image) for image in images]
-        self.sources, self.signs = (torch.stack(x) for x in zip(*pairs, strict=True))
+    sources: Tensor
+    signs: Tensor
 
-    def __call__(self, x: Tensor, choice: Tensor) -> Tensor:
+    def __init__(self, original: Tensor, images: Sequence[Tensor]) -> None:
+        super().__init__()
+        sources, signs = zip(*(_match(original, x) for x in images), strict=True)
+        keep_indices(self, sources=sources)  # (isometries, F)
+        keep_constants(self, signs=signs)
+
+    def forward(self, x: Tensor, choice: Tensor) -> Tensor:
         """Images of ``x (rows, length, F)``, each row by isometry ``choice (rows,)``."""
         sources = self.sources[choice][:, None].expand(x.shape)  # (rows, length, F)
         return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
@@ -65,13 +70,8 @@ class SignedPermutations:
         apart = torch.maximum((means - mean).abs(), (stds - std).abs())
         return bool((apart < STATS_TOL * std).all())
 
-    def to(self, device: torch.device) -> "SignedPermutations":
-        """On another device, in place."""
-        self.sources, self.signs = self.sources.to(device), self.signs.to(device)
-        return self
 
-
-def _match(original: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+def _match(original: Tensor, image: Tensor) -> tuple[list[int], list[float]]:
     scale = RTOL * (original.abs().amax(0) + 1e-3)
     sources, signs = [], []
     for j, column in enumerate(image.T):
@@ -84,24 +84,21 @@ def _match(original: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
                 break
         else:
             raise ValueError(f"entry {j} of the image is no entry of the original")
-    return torch.tensor(sources), torch.tensor(signs, dtype=torch.float64)
+    return sources, signs
 
 
-@dataclass(frozen=True, eq=False)
-class Symmetry:
-    """Isometries of a robot and their effect on its tokens and targets."""
+class Symmetry(nn.Module):
+    """Isometries of a robot, the identity first, and their effect on tokens and targets.
 
-    isometries: tuple[Isometry, ...]  # the identity first
-    permutations: dict[str, SignedPermutations]  # of `TOKEN` and `TARGET`
+    The permutations of `TOKEN` and `TARGET` are found from random states.
 
-    @classmethod
-    def of(cls, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> "Symmetry":
-        """The symmetry of a robot; permutations are found from random states.
+    Raises:
+        ValueError: see `find_isometries`; a feature that is zero in all of these states.
+    """
 
-        Raises:
-            ValueError: a feature that is zero in all of these states.
-        """
-        isometries = find_isometries(scene)
+    def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
+        super().__init__()
+        self.isometries = nn.ModuleList(find_isometries(scene))
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]
         states, model = cast(TensorDict, TensorDict.cat(parts)), scene.model
@@ -113,32 +110,29 @@ class Symmetry:
             states[QPOS][:, model.jnt_qposadr[joint]] = low + (high - low) * mixed
         for key in (QPOS, QVEL):  # a change between any two states will do
             states["next", key] = states[key].roll(1, 0)
-        images = [raw_tokens(*encode, isometry(states)) for isometry in isometries]
+        images = [raw_tokens(*encode, image(states)) for image in self.isometries]
         still = (images[0][0] == 0.0).all(0).nonzero()[:, 0].tolist()
-        if still and len(isometries) > 1:
+        if still and len(images) > 1:
             raise ValueError(
                 f"expected random states of '{scene.name}' to fill every feature, got "
                 f"none for {still}: train without use_symmetry"
             )
-        pairs = zip((TOKEN, TARGET), zip(*images, strict=True), strict=True)
-        found = {key: SignedPermutations(x[0], x) for key, x in pairs}
-        return cls(isometries, found)
+        tokens, targets = zip(*images, strict=True)
+        found = {TOKEN: SignedPermutations(tokens[0], tokens)}
+        found[TARGET] = SignedPermutations(targets[0], targets)
+        self.permutations = nn.ModuleDict(found)
+
+    def of(self, key: NestedKey) -> SignedPermutations:
+        """The permutations of `TOKEN` or `TARGET`."""
+        return cast(SignedPermutations, self.permutations[str(key)])
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
         """Statistics of tokens and targets with all their images."""
-        return {
-            key: self.permutations[str(key)].complete(x) for key, x in stats.items()
-        }
+        return {key: self.of(key).complete(value) for key, value in stats.items()}
 
     def keeps(self, normalize: Normalize) -> bool:
         """Whether images of normalised tokens and targets are those of raw ones."""
         return all(
-            permutation.keep(normalize.mean(key), normalize.std(key))
-            for key, permutation in self.permutations.items()
+            self.of(key).keep(normalize.mean(key), normalize.std(key))
+            for key in (TOKEN, TARGET)
         )
-
-    def to(self, device: torch.device) -> "Symmetry":
-        """The same on another device."""
-        isometries = tuple(isometry.to(device) for isometry in self.isometries)
-        moved = {key: x.to(device) for key, x in self.permutations.items()}
-        return Symmetry(isometries, moved)

@@ -92,9 +92,8 @@ class Sequences:
             return inputs, targets
         count = len(self.symmetry.isometries)
         choice = torch.randint(count, (rows,), generator=generator).to(targets.device)
-        permute = self.symmetry.permutations
-        inputs = inputs._replace(token=permute[TOKEN](inputs.token, choice))
-        return inputs, permute[TARGET](targets, choice)
+        token = self.symmetry.of(TOKEN)(inputs.token, choice)
+        return inputs._replace(token=token), self.symmetry.of(TARGET)(targets, choice)
 
     def rollout(
         self, rows: int, length: int, generator: Generator
@@ -105,7 +104,7 @@ class Sequences:
         if self.symmetry is not None:  # the rows are in no order: a part for each
             isometries = self.symmetry.isometries
             parts = zip(isometries, batch.chunk(len(isometries)), strict=False)
-            images = [isometry(cast(TensorDict, part)) for isometry, part in parts]
+            images = [isometry(part) for isometry, part in parts]
             batch = cast(TensorDict, torch.cat(images))  # pyright: ignore
         qpos = torch.cat((batch[QPOS], batch[NEXT_QPOS][:, -1:]), 1)
         qvel = torch.cat((batch[QVEL], batch[NEXT_QVEL][:, -1:]), 1)

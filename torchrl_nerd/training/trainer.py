@@ -101,7 +101,7 @@ class Trainer:
         """The model, its statistics and its batches."""
         symmetry = None
         if self.config.use_symmetry:
-            symmetry = Symmetry.of(self.scene, self.config.features)
+            symmetry = Symmetry(self.scene, self.config.features)
         if init_from is None:
             model = self.make_model(data, symmetry)
         else:
