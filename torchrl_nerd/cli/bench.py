@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.cli.options import Positional, SceneName
 from torchrl_nerd.evaluation.bench.report import bench, bench_table
 from torchrl_nerd.robots import load_scene
 
@@ -20,8 +20,7 @@ class Bench(MeasuringCommand):
     Example: nerd bench dm_control/cheetah-run --models runs/dm_control-cheetah-run/best
     """
 
-    scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, ant, ..., dm_control/DOMAIN-TASK."""
+    scene: Positional[SceneName]
     models: tuple[str, ...] = ()
     """Names of models, or checkpoint folders; all that are shipped for it by default."""
     variants: tuple[str, ...] = ("compiled",)
@@ -36,8 +35,6 @@ class Bench(MeasuringCommand):
     """Of the initial states."""
     steps: int | None = None
     """Horizon of the errors; the paper's by default."""
-    quiet: bool = False
-    """Show no progress bars."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""

@@ -71,6 +71,8 @@ class DeviceCommand(Command):
 
     device: str = "cpu"
     """Device of the model: cpu, cuda, or cuda:1 for the second GPU."""
+    quiet: bool = False
+    """Show no progress bar."""
 
     def __post_init__(self) -> None:
         expect_device(self.device)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import Positional, recorded_scene
+from torchrl_nerd.cli.options import Positional, SceneName, recorded_scene
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.bench.candidates import (
@@ -55,9 +55,7 @@ class Eval(MeasuringCommand):
     Example: nerd eval cube --data cube_tosses.npz --split test --baselines
     """
 
-    scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
-    or an MJCF file."""
+    scene: Positional[SceneName]
     model: Path | None = None
     """Name of a shipped model, or a checkpoint folder; all that are shipped by default."""
     num_trajectories: int = 2048
@@ -79,8 +77,6 @@ class Eval(MeasuringCommand):
     baselines: bool = False
     """Beside it, on recorded trajectories: MuJoCo and the analytic step with the scene's
     own parameters."""
-    quiet: bool = False
-    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their rows.

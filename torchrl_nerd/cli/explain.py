@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from torchrl_nerd.cli.command import Command
-from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.cli.options import Positional, SceneName
 from torchrl_nerd.evaluation.explain import explain
 from torchrl_nerd.robots import load_scene
 
@@ -16,9 +16,7 @@ class Explain(Command):
     Example: nerd explain double_pendulum --json results/explain.json
     """
 
-    scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, dm_control/DOMAIN-TASK, gymnasium/ID,
-    or an MJCF file."""
+    scene: Positional[SceneName]
 
     def run(self) -> dict[str, Any]:
         """Print the report and return its contents."""

@@ -36,8 +36,6 @@ class Finetune(DeviceCommand):
     """Where to start: a shipped model, a checkpoint folder, or analytic (one free body with
     physical parameters); default analytic for the cube, else the robot's model."""
     config: Flat[FinetuneConfig] = field(default_factory=FinetuneConfig)
-    quiet: bool = False
-    """Show no progress bar."""
 
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""

@@ -51,8 +51,6 @@ class Play(DeviceCommand):
     """Width of the video in pixels."""
     slowdown: float = 1.0
     """2 plays at half speed."""
-    quiet: bool = False
-    """Show no progress bar."""
 
     @property
     def figure(self) -> Path:

@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.cli.options import Positional, SceneName
 from torchrl_nerd.dynamics import dynamics_of
 from torchrl_nerd.evaluation.stability.case import as_table, run_cases
 from torchrl_nerd.evaluation.stability.cases import CASES
@@ -25,8 +25,7 @@ class Stability(MeasuringCommand):
     Example: nerd stability cartpole --json results/stability.json
     """
 
-    scene: Positional[str]
-    """Name of the robot: cartpole, double_pendulum, ant, franka, anymal, cube, ..."""
+    scene: Positional[SceneName]
     cases: tuple[str, ...] = ()
     """Names of cases; all that apply by default."""
     model: str | None = None
@@ -37,8 +36,6 @@ class Stability(MeasuringCommand):
     """Fraction of long rollouts and of large batches, in (0, 1]."""
     compile: bool = False
     """Compile the model's step: long cases take a fraction of the time."""
-    quiet: bool = False
-    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print a verdict per case, then the table, and return the results.

@@ -62,8 +62,6 @@ class Train(DeviceCommand):
     """Where metrics go besides log.csv; csv: nowhere else."""
     threads: int | None = None
     """Processor threads of torch; default torch's own choice."""
-    quiet: bool = False
-    """Show no progress bar."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -31,8 +31,6 @@ class Transfer(MeasuringCommand):
     """How many episodes of each dynamics the returns are means of."""
     seed: int = 500
     """Seed of the resets."""
-    quiet: bool = False
-    """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows.
