@@ -5,6 +5,7 @@ __version__ = "0.1.0"
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.envs import GroundTruthEnv, NeRDEnv, make_env
 from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots.registry import load_named_robots
 from torchrl_nerd.scenes import Scene
 
 __all__ = [
@@ -15,3 +16,5 @@ __all__ = [
     "load_scene",
     "make_env",
 ]
+
+load_named_robots()  # last: their modules import all of this

@@ -21,6 +21,7 @@ from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots.registry import MODELS
 from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.selfcheck import PREFIX as CHECK
 from torchrl_nerd.selfcheck import (
@@ -112,7 +113,7 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     if scene is not None and (found == "analytic" or found in STEPS):
         return make_step(scene, STEPS.get(found))
     if found in shipped_models():
-        return load_checkpoint(PRETRAINED / found, scene)
+        return load_checkpoint(model_folder(found), scene)
     if os.path.isdir(found):  # False, too, for what no path can be
         return load_checkpoint(Path(found), scene)
     if found in ENGINES:
@@ -158,8 +159,12 @@ def _known() -> str:
 
 
 def shipped_models(scene: Scene | None = None) -> list[str]:
-    """Names of the models that come with the package, all or those of a scene."""
-    names = sorted(path.parent.name for path in PRETRAINED.glob(f"*/{CARD}"))
+    """Names of the models that come with the package, or with a robot of a user.
+
+    All, or those of a scene.
+    """
+    own = {name for name, folder in MODELS.items() if (Path(folder) / CARD).is_file()}
+    names = sorted({path.parent.name for path in PRETRAINED.glob(f"*/{CARD}")} | own)
     if scene is None:
         return names
     return [name for name in names if shipped_card(name)["scene"] == scene.name]
@@ -167,7 +172,12 @@ def shipped_models(scene: Scene | None = None) -> list[str]:
 
 def shipped_card(name: str) -> dict[str, Any]:
     """The card of a shipped model."""
-    return read_json(PRETRAINED / name / CARD)
+    return read_json(model_folder(name) / CARD)
+
+
+def model_folder(name: str) -> Path:
+    """Where a shipped model is."""
+    return Path(MODELS.get(name, PRETRAINED / name))
 
 
 def _build(

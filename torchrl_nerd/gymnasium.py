@@ -25,6 +25,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
 from torchrl_nerd.robots import TASKS, make_task
+from torchrl_nerd.robots.registry import for_each_task
 from torchrl_nerd.tasks import Task
 
 Info = dict[str, Any]
@@ -266,5 +267,8 @@ def _register(env_id: str, horizon: int | None = None, **kwargs: str) -> None:
 
 
 _register("TorchrlNerd/Task-v0")  # any task, by its id as the argument ``task``
-for _task, _make in TASKS.items():
-    _register(gymnasium_id(_task), _make().horizon, task=_task)
+for_each_task(
+    lambda task: _register(
+        gymnasium_id(task), getattr(TASKS[task], "horizon", None), task=task
+    )
+)

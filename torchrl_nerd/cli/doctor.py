@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from torchrl_nerd import __version__
-from torchrl_nerd.checkpoint import PRETRAINED, read_checkpoint, shipped_models
+from torchrl_nerd.checkpoint import model_folder, read_checkpoint, shipped_models
 from torchrl_nerd.cli.command import Command
 from torchrl_nerd.envs.rendering import find_gl
 from torchrl_nerd.evaluation.results import versions
@@ -86,7 +86,7 @@ def _check(name: str) -> dict[str, Any]:
     """Self-check of a shipped model: differences, seconds to load, or what failed."""
     began = time.monotonic()
     try:
-        model, check = read_checkpoint(PRETRAINED / name)
+        model, check = read_checkpoint(model_folder(name))
     except ValueError as error:
         return {"agrees": False, "error": str(error)}
     return {

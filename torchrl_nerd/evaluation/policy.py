@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.keys import ACTION, OBSERVATION
-from torchrl_nerd.robots import make_task
+from torchrl_nerd.robots import make_task, registry
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
@@ -223,9 +223,11 @@ def policy_task(folder: Path) -> Task:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Task id -> folder of its policy, see `load_policy`."""
+    """Task id -> folder of its policy, see `load_policy`; robots of users included."""
     folders = sorted(card.parent for card in POLICIES.glob(f"*/{CARD}"))
-    return {read_json(folder / CARD)["task"]: folder for folder in folders}
+    shipped = {read_json(folder / CARD)["task"]: folder for folder in folders}
+    own = {task: Path(folder) for task, folder in registry.POLICIES.items()}
+    return shipped | {k: v for k, v in own.items() if (v / CARD).is_file()}
 
 
 def shipped_policy(task: str) -> Path:

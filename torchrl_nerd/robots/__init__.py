@@ -1,4 +1,7 @@
-"""Robots, a folder each, registered by being there: the ``ROBOT`` of ``presets.py``."""
+"""Robots, a folder each, registered by being there: the ``ROBOT`` of ``presets.py``.
+
+Robots of users are registered by `register`.
+"""
 
 from collections.abc import Collection
 from difflib import get_close_matches
@@ -6,6 +9,14 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from torchrl_nerd.configs import DataConfig, TrainConfig
+from torchrl_nerd.robots.registry import (
+    NOT_LOADED,
+    PPO_CONFIGS,
+    PRESETS,
+    SCENES,
+    TASKS,
+    register,
+)
 from torchrl_nerd.robots.robot import (
     EvaluationProtocol,
     Preset,
@@ -22,10 +33,8 @@ ROBOTS: dict[str, Robot] = {
     for found in iter_modules(__path__)
     if found.ispkg
 }
-SCENES = {k: v for robot in ROBOTS.values() for k, v in robot.scenes.items()}
-TASKS = {k: v for robot in ROBOTS.values() for k, v in robot.tasks.items()}
-PRESETS = {k: v for robot in ROBOTS.values() for k, v in robot.presets.items()}
-PPO_CONFIGS = {k: v for robot in ROBOTS.values() for k, v in robot.ppo.items()}
+for _robot in ROBOTS.values():
+    register(_robot)
 THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
     protocol=None,
     data=DataConfig(trajectories=10_000, steps=100),
@@ -47,15 +56,21 @@ def load_scene(name: str) -> Scene:
             of an MJCF file.
 
     Raises:
-        ValueError: no such scene, or a robot with something not supported (named).
+        ValueError: no such scene, one registered as something else, or a robot with
+            something not supported (named).
     """
     if isinstance(name, str) and name in SCENES:
-        return SCENES[name]()
+        scene = SCENES[name]()
+        if not isinstance(scene, Scene) or scene.name != name:
+            got = f"'{scene.name}'" if isinstance(scene, Scene) else repr(scene)
+            raise ValueError(f"expected a Scene with the name '{name}', got {got}")
+        return scene
     if is_import(name):
         return import_scene(name)
     raise ValueError(
         f"unknown scene {name!r}{_meant(name, SCENES)}, expected one of "
         f"{', '.join(SCENES)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
+        f"{_not_loaded()}"
     )
 
 
@@ -65,17 +80,27 @@ def make_task(name: str) -> Task:
     An MJCF file and ``gymnasium/ID`` name a robot alone, which becomes a `SceneTask`.
 
     Raises:
-        ValueError: no such task, or one whose robot has something not supported (named).
+        ValueError: no such task, one registered as something else, or a robot with
+            something not supported (named).
     """
     if isinstance(name, str) and name in TASKS:
-        return TASKS[name]()
+        task = TASKS[name]()
+        if not isinstance(task, Task):
+            raise ValueError(f"expected a Task by the id '{name}', got {task!r}")
+        return task
     if is_import(name):
         is_suite = name.startswith("dm_control/")
         return SuiteTask(name) if is_suite else SceneTask(import_scene(name))
     raise ValueError(
         f"unknown task {name!r}{_meant(name, TASKS)}, expected one of "
         f"{', '.join(TASKS)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
+        f"{_not_loaded()}"
     )
+
+
+def _not_loaded() -> str:
+    """What of ``NERD_ROBOTS`` failed, or nothing."""
+    return "".join(f"; {sentence}" for sentence in NOT_LOADED)
 
 
 def _meant(name: object, known: Collection[str]) -> str:
@@ -131,12 +156,15 @@ __all__ = [
     "SCENES",
     "TASKS",
     "EvaluationProtocol",
+    "Preset",
+    "Robot",
     "Source",
     "load_scene",
     "make_task",
     "preset_of",
     "protocol_of",
     "recorded_protocol",
+    "register",
     "source_of",
     "task_id",
 ]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
@@ -58,6 +59,10 @@ class Robot:
     """One robot, in one or more scenes."""
 
     scenes: Mapping[str, Callable[[], Scene]]  # builders: the same scene at every call
-    tasks: Mapping[str, Callable[[], Task]]  # "scene/task" -> class
-    presets: Mapping[str, Preset]  # by the scene's name
+    # "scene/task" -> class
+    tasks: Mapping[str, Callable[[], Task]] = field(default_factory=dict)
+    presets: Mapping[str, Preset] = field(default_factory=dict)  # by the scene's name
     ppo: Mapping[str, PPOConfig] = field(default_factory=dict)  # of tasks with a goal
+    # of a user's robot: "scene" (transformer), "scene-mlp" or "scene-hybrid" -> folder
+    models: Mapping[str, Path] = field(default_factory=dict)
+    policies: Mapping[str, Path] = field(default_factory=dict)  # "scene/task" -> folder

@@ -71,13 +71,18 @@ class Scene:
 
     @classmethod
     def from_mjcf(
-        cls, path: str | Path, control_step: float | None = None, **ranges: Any
+        cls,
+        path: str | Path,
+        control_step: float | None = None,
+        name: str | None = None,
+        **ranges: Any,
     ) -> "Scene":
         """The robot in an MJCF file, driven by its own actuators.
 
         Args:
-            path: the file; also the scene's name.
+            path: the file.
             control_step: s; by default the whole number of timesteps nearest to 0.02 s.
+            name: the scene's name; by default the path.
             ranges: fields of `Sampling` in place of those that follow from the joints'
                 limits and the actuators' strengths.
 
@@ -86,7 +91,7 @@ class Scene:
                 something not supported (named).
         """
         parts = read_mjcf(Path(path), control_step)
-        return cls._from(str(path), *parts, ranges)
+        return cls._from(name or str(path), *parts, ranges)
 
     @classmethod
     def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":

@@ -1,0 +1,139 @@
+"""All robots by their names: those of the package, and those that users register."""
+
+import os
+import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from torchrl_nerd.configs import PPOConfig
+from torchrl_nerd.robots.robot import Preset, Robot
+from torchrl_nerd.scenes import Scene, is_import
+from torchrl_nerd.tasks import Task
+
+VARIABLE = "NERD_ROBOTS"
+"""Environment variable: modules or files that register robots, separated as in PATH."""
+
+SCENES: dict[str, Callable[[], Scene]] = {}
+TASKS: dict[str, Callable[[], Task]] = {}
+PRESETS: dict[str, Preset] = {}
+PPO_CONFIGS: dict[str, PPOConfig] = {}
+MODELS: dict[str, Path] = {}
+"""Folders of models of users' robots; a folder may be filled later."""
+POLICIES: dict[str, Path] = {}
+"""Task id -> folder of its policy, of users' robots; a folder may be filled later."""
+
+TABLES: dict[str, dict[str, Any]] = {
+    "scenes": SCENES,
+    "tasks": TASKS,
+    "presets": PRESETS,
+    "ppo": PPO_CONFIGS,
+    "models": MODELS,
+    "policies": POLICIES,
+}
+"""Field of `Robot` -> what is known of it, of all robots."""
+NOT_LOADED: list[str] = []
+"""A sentence for each entry of ``NERD_ROBOTS`` that could not be loaded."""
+_LISTENERS: list[Callable[[str], object]] = []
+
+
+def register(robot: Robot) -> None:
+    """Make a robot known by its names: to `make_env`, Gymnasium and every command.
+
+    Nothing is built yet: a scene or task is, when its name is first asked for. Commands
+    and worker processes find a robot whose module ``NERD_ROBOTS`` names.
+
+    Args:
+        robot: its scenes, and tasks, presets, models and policies of these.
+
+    Raises:
+        TypeError: no robot, or a field that holds something else than it should.
+        ValueError: a name that is taken, or does not go with the scenes.
+    """
+    if not isinstance(robot, Robot):
+        raise TypeError(f"expected a Robot to register, got {type(robot).__name__}")
+    _check_types(robot)
+    _check_names(robot)
+    for field, table in TABLES.items():
+        given: Mapping[str, Any] = getattr(robot, field)
+        for name in given:
+            if name in table:
+                raise ValueError(
+                    f"'{name}' is among the {field} of another robot: expected a new name"
+                )
+    for field, table in TABLES.items():
+        table.update(getattr(robot, field))
+    for listener in _LISTENERS:
+        for task in robot.tasks:
+            listener(task)
+
+
+def for_each_task(function: Callable[[str], object]) -> None:
+    """Call a function with the id of every task, of those that are registered later too."""
+    _LISTENERS.append(function)
+    for task in TASKS:
+        function(task)
+
+
+def load_named_robots() -> None:
+    """Import what ``NERD_ROBOTS`` names: modules, or files and folders of Python code.
+
+    What fails is told where a name is asked for that is unknown: a broken entry must not
+    stop work with another robot.
+    """
+    for entry in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
+        module, path = entry, Path(entry)
+        if path.exists():
+            sys.path.insert(0, str(path.resolve().parent))
+            module = path.stem
+        try:
+            import_module(module)
+        except Exception as error:  # whatever a user's file may raise
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            NOT_LOADED.append(f"{VARIABLE} names '{entry}', which fails with {reason}")
+
+
+def _check_types(robot: Robot) -> None:
+    expected: dict[str, tuple[Any, str]] = {
+        "scenes": (Callable, "functions that return a Scene"),
+        "tasks": (Callable, "subclasses of Task"),
+        "presets": (Preset, "a Preset"),
+        "ppo": (PPOConfig, "a PPOConfig"),
+        "models": (str | Path, "a folder"),
+        "policies": (str | Path, "a folder"),
+    }
+    for field, (kind, words) in expected.items():
+        given = getattr(robot, field)
+        if not isinstance(given, Mapping):
+            raise TypeError(f"expected names and {words} as {field}, got {given!r}")
+        for name, value in given.items():
+            if not isinstance(name, str) or not isinstance(value, kind):
+                raise TypeError(f"expected {words} as {field}, got {name!r}: {value!r}")
+
+
+def _check_names(robot: Robot) -> None:
+    scenes = robot.scenes
+    bad = [s for s in scenes if not s or "/" in s or is_import(s)]
+    if bad or not scenes:
+        found = repr(bad[0]) if bad else "none"
+        raise ValueError(f"expected names of scenes without / or .xml, got {found}")
+    of_scenes = {
+        "tasks": ("SCENE/TASK", lambda name: name.partition("/")[0]),
+        "presets": ("SCENE", lambda name: name),
+        "models": ("SCENE or SCENE-KIND", lambda name: name.partition("-")[0]),
+    }
+    for field, (form, scene_in) in of_scenes.items():
+        for name in getattr(robot, field):
+            if scene_in(name) not in scenes or name.endswith("/"):
+                raise ValueError(
+                    f"expected {form} of its scenes ({', '.join(scenes)}) as {field}, got "
+                    f"'{name}'"
+                )
+    for field in ("ppo", "policies"):
+        for name in getattr(robot, field):
+            if name not in robot.tasks:
+                known = ", ".join(robot.tasks) or "none"
+                raise ValueError(
+                    f"expected its tasks ({known}) as {field}, got '{name}'"
+                )
