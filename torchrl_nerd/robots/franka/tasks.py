@@ -100,15 +100,15 @@ class FrankaReach(FrankaReachTorque):
 class FrankaReachOSC(FrankaReachTorque):
     """The same reward by moves of the hand: the action is a displacement of 0.1 m a.
 
-    An `OperationalSpaceController` turns it into torque, within the effort limits. Each
-    action holds for two control steps. Not in the paper.
+    An `OperationalSpaceController` turns it into torque, within the effort limits. Each of
+    64 actions holds for four control steps, 1/30 s. Not in the paper.
 
     A goal is where the hand is at joint positions uniform within 0.5 rad of home and
     within the joint limits. So the arm reaches every goal, 0.15 m or more over the table.
     Observation: joint angles in [-pi, pi), the point, the way from it to the goal.
     """
 
-    frame_skip = 2
+    horizon, frame_skip = 64, 4
     num_uniforms = 14
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
