@@ -23,7 +23,10 @@ def test_the_report_adds_up_and_its_text_names_all(scene):
     assert text.startswith(f"{scene.name}: {report.token_width} features a step")
     assert all(feature.key in text for feature in report.features)
     assert all(body in text for body in report.contact_bodies)
-    assert len(report.contact_bodies) == report.solver.points_kept
+    assert len(report.contact_bodies) == len(scene.contacts)
+    solver = report.solver
+    kept = solver.points_found - solver.points_merged - solver.points_fixed
+    assert kept == len(scene.contacts) and f", {kept} kept" in text
     assert type(scene.controller).__name__ in text
     assert ("none that the robot can touch" in text) == (scene.terrain is None)
 
@@ -57,6 +60,7 @@ def test_self_contacts_are_those_that_mujoco_finds():
 
 
 def test_merged_and_fixed_contact_points_are_counted():
-    solver = explain(load_scene("double_pendulum")).solver
+    report = explain(load_scene("double_pendulum"))
+    solver = report.solver
     assert (solver.points_found, solver.points_merged, solver.points_fixed) == (4, 1, 1)
-    assert "4 found, 1 merged" in str(solver)
+    assert "4 found, 1 merged" in str(report)

@@ -16,7 +16,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import own_contacts
-from torchrl_nerd.scenes.explain import SolverReport
+from torchrl_nerd.scenes.symmetries import Effect, base_effects
 from torchrl_nerd.scenes.terrain import PLANE
 
 MEANINGS = {
@@ -40,31 +40,29 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class SceneReport:
-    """What ``nerd explain`` prints; its text by ``print``.
-
-    | field | meaning |
-    |---|---|
-    | ``scene`` | its name |
-    | ``features`` | of the token, in order |
-    | ``solver`` | effect of every coordinate; contact points found, merged, dropped |
-    | ``contact_bodies`` | body of each contact point that is kept |
-    | ``self_contacts`` | pairs of bodies of the robot that can touch each other |
-    | ``terrain`` | the ground, in words |
-    | ``controller`` | what turns an action into joint torque, in words |
-    | ``analytic_step`` | name of the step that supports the scene; None where none does |
-    | ``why_no_step`` | the reason in a sentence where none does |
-    """
+class SolverReport:
+    """What stepping MuJoCo says about a scene."""
 
     scene: str
-    features: tuple[Feature, ...]
+    effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
+    points_found: int  # contact points of the robot's shapes
+    points_merged: int  # of these, how many always coincide with another one
+    points_fixed: int  # of these, how many no joint can move
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """What ``nerd explain`` prints; its text by ``print``."""
+
+    scene: str
+    features: tuple[Feature, ...]  # of the token, in order
     solver: SolverReport
-    contact_bodies: tuple[str, ...]
-    self_contacts: tuple[tuple[str, str], ...]
-    terrain: str
-    controller: str
-    analytic_step: str | None
-    why_no_step: str | None
+    contact_bodies: tuple[str, ...]  # body of each contact point that is kept
+    self_contacts: tuple[tuple[str, str], ...]  # bodies that can touch each other
+    terrain: str  # the ground, in words
+    controller: str  # what turns an action into joint torque, in words
+    analytic_step: str | None  # name of the step that supports the scene, if any does
+    why_no_step: str | None  # the reason in a sentence where none does
 
     @property
     def token_width(self) -> int:
@@ -72,20 +70,32 @@ class SceneReport:
         return sum(feature.width for feature in self.features)
 
     def __str__(self) -> str:
+        solver, bodies = self.solver, Counter(self.contact_bodies).items()
         pairs = ["-".join(pair) for pair in self.self_contacts]
-        found = f"{len(pairs)} pairs of bodies, without features: {', '.join(pairs)}"
-        counts = Counter(self.contact_bodies).items()
-        on = ", ".join(f"{body} {count}" for body, count in counts)
+        touching = f"{len(pairs)} pairs of bodies, without features: {', '.join(pairs)}"
+        lines = [
+            f"{self.scene}: {self.token_width} features a step\n",
+            f"{'feature':<18}{'width':>6}  meaning",
+            *(f"{f.key:<18}{f.width:>6}  {f.meaning}" for f in self.features),
+            f"\n{'coordinate moved':<30}{'change of step':>16}  feature",
+        ]
+        for effect in solver.effects:
+            ignored = "dropped: the step does not depend on it"
+            what = f"{effect.name} {effect.key}[{effect.address}]"
+            verdict = ignored if effect.is_ignored else "kept"
+            lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
+        lines.append(
+            f"contact points: {solver.points_found} found, {solver.points_merged} merged "
+            f"with one at the same place, {solver.points_fixed} dropped since no joint "
+            f"moves them, {len(self.contact_bodies)} kept"
+        )
+        if bodies:
+            on = ", ".join(f"{body} {count}" for body, count in bodies)
+            lines.append(f"contact points kept, by body: {on}")
         return "\n".join(
             [
-                f"{self.scene}: {self.token_width} features a step",
-                "",
-                f"{'feature':<18}{'width':>6}  meaning",
-                *(f"{f.key:<18}{f.width:>6}  {f.meaning}" for f in self.features),
-                "",
-                str(self.solver),
-                *([f"contact points kept, by body: {on}"] if on else []),
-                f"self-contacts: {found if pairs else 'none'}",
+                *lines,
+                f"self-contacts: {touching if pairs else 'none'}",
                 f"terrain: {self.terrain}",
                 f"controller: {self.controller}",
                 f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
@@ -103,6 +113,9 @@ def explain(scene: Scene) -> SceneReport:
     features, model = SceneFeatures(scene), scene.model
     sizes = {**features.robot.sizes, **features.contact.sizes}
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
+    found, kept = scene.contacts.stands_for, len(scene.contacts)
+    fixed = found.count(-1)
+    effects = base_effects(model, scene.base, scene.substeps)
 
     def name(body: int) -> str:
         return model.body(body).name or f"body {body}"
@@ -116,7 +129,13 @@ def explain(scene: Scene) -> SceneReport:
     return SceneReport(
         scene=scene.name,
         features=tuple(Feature(str(k), n, meanings[str(k)]) for k, n in sizes.items()),
-        solver=scene.explain(),
+        solver=SolverReport(
+            scene=scene.name,
+            effects=effects + scene.symmetries.effects,
+            points_found=len(found),
+            points_merged=len(found) - fixed - kept,
+            points_fixed=fixed,
+        ),
         contact_bodies=tuple(map(name, scene.contacts.bodies)),
         self_contacts=tuple((low, high) for low, high in sorted(pairs)),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),

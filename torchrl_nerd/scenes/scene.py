@@ -20,12 +20,6 @@ from torchrl_nerd.scenes.contact_points import (
     ground_geoms,
 )
 from torchrl_nerd.scenes.controllers import ActuatorController, Controller, driven_dofs
-from torchrl_nerd.scenes.explain import (
-    SolverReport,
-    Symmetries,
-    base_effects,
-    find_symmetries,
-)
 from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
 from torchrl_nerd.scenes.importer import (
     default_sampling,
@@ -35,6 +29,7 @@ from torchrl_nerd.scenes.importer import (
 )
 from torchrl_nerd.scenes.sampling import Sampling, draw_initial
 from torchrl_nerd.scenes.support import check_supported, unit_gravity
+from torchrl_nerd.scenes.symmetries import Symmetries, find_symmetries
 from torchrl_nerd.scenes.terrain import Terrain, TerrainDistance
 
 REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's own
@@ -209,19 +204,6 @@ class Scene:
     def symmetries(self) -> Symmetries:
         """Coordinates that the dynamics do not depend on."""
         return find_symmetries(self.model, self.substeps)
-
-    def explain(self) -> SolverReport:
-        """Which coordinates and contact points are kept, found by stepping MuJoCo."""
-        found, kept = self.contacts.stands_for, len(self.contacts)
-        fixed = found.count(-1)
-        effects = base_effects(self.model, self.base, self.substeps)
-        return SolverReport(
-            scene=self.name,
-            effects=effects + self.symmetries.effects,
-            points_found=len(found),
-            points_merged=len(found) - fixed - kept,
-            points_fixed=fixed,
-        )
 
     @cached_property
     def hash(self) -> str:

@@ -49,49 +49,14 @@ class Symmetries:
     effects: tuple[Effect, ...]
 
     @property
-    def positions(self) -> frozenset[int]:
+    def positions(self) -> set[int]:
         """Addresses in qpos that are ignored."""
-        return self._ignored(QPOS)
+        return {e.address for e in self.effects if e.key == QPOS and e.is_ignored}
 
     @property
-    def velocities(self) -> frozenset[int]:
+    def velocities(self) -> set[int]:
         """Addresses in qvel that are ignored."""
-        return self._ignored(QVEL)
-
-    def _ignored(self, key: str) -> frozenset[int]:
-        found = (e for e in self.effects if e.key == key and e.is_ignored)
-        return frozenset(effect.address for effect in found)
-
-
-@dataclass(frozen=True)
-class SolverReport:
-    """What MuJoCo says about a scene; its text by ``print``."""
-
-    scene: str
-    effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
-    points_found: int  # contact points of the robot's shapes
-    points_merged: int  # of these, how many always coincide with another one
-    points_fixed: int  # of these, how many no joint can move
-
-    @property
-    def points_kept(self) -> int:
-        """Contact points that have features."""
-        return self.points_found - self.points_merged - self.points_fixed
-
-    def __str__(self) -> str:
-        lines = [f"{'coordinate moved':<30}{'change of step':>16}  feature"]
-        for effect in self.effects:
-            verdict = "kept"
-            if effect.is_ignored:
-                verdict = "dropped: the step does not depend on it"
-            what = f"{effect.name} {effect.key}[{effect.address}]"
-            lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
-        lines.append(
-            f"contact points: {self.points_found} found, {self.points_merged} merged "
-            f"with one at the same place, {self.points_fixed} dropped since no joint "
-            f"moves them, {self.points_kept} kept"
-        )
-        return "\n".join(lines)
+        return {e.address for e in self.effects if e.key == QVEL and e.is_ignored}
 
 
 def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
@@ -141,6 +106,8 @@ def _without(model: mujoco.MjModel, flags: int) -> mujoco.MjModel:
 
 
 def _shift(key: str, address: int) -> Move:
+    """Move one coordinate by a normal number."""
+
     def move(data: mujoco.MjData, rng: np.random.Generator) -> None:
         getattr(data, key)[address] += rng.normal()
 
