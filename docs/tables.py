@@ -1,6 +1,7 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
-A page asks for one by a comment: ``<!-- table: eval -->``, ``bench`` or ``stability``.
+A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability`` or
+``compiled_env``.
 """
 
 import json
@@ -117,7 +118,34 @@ def stability_tables(folder: Path = RESULTS) -> str:
     return rows(table)
 
 
-TABLES = {"eval": eval_tables, "bench": bench_tables, "stability": stability_tables}
+def env_table(folder: Path = RESULTS) -> str:
+    """One row per task: microseconds of an action of one env, seconds to compile."""
+    path = folder / "compiled_env.json"
+    if not path.exists():
+        return ""
+    record = json.loads(path.read_text())
+    names = {
+        "eager_us": "learned, eager (us)",
+        "compiled_us": "learned, compiled (us)",
+        "mujoco_us": "MuJoCo (us)",
+        "cold_s": "first compiled step (s)",
+        "warm_s": "with torch's cache (s)",
+    }
+    tasks = record["results"]["tasks"]
+    table = [["task", *names.values()]]
+    for task, row in tasks.items():
+        table.append([task, *(f"{row[key]:.0f}" for key in names)])
+    return f"{rows(table)}\n\n{made_by(record)}"
+
+
+TABLES = {
+    "eval": eval_tables,
+    "bench": bench_tables,
+    "stability": stability_tables,
+    "compiled_env": env_table,
+}
+COMMANDS = {"compiled_env": "python benchmarks/compiled_env.py --json results/{}.json"}
+COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 
 def render(markdown: str, folder: Path = RESULTS) -> str:
@@ -125,10 +153,8 @@ def render(markdown: str, folder: Path = RESULTS) -> str:
 
     def table(found: re.Match[str]) -> str:
         name = found[1]
-        missing = (
-            f"`not measured` yet: `nerd {name} ROBOT --json results/{name}_ROBOT.json`."
-        )
-        return TABLES[name](folder) or missing
+        command = COMMANDS.get(name, COMMAND).format(name)
+        return TABLES[name](folder) or f"`not measured` yet: `{command}`."
 
     return MARKER.sub(table, markdown)
 
