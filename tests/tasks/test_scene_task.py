@@ -35,6 +35,19 @@ def test_a_robots_file_is_an_env_in_every_dynamics(path, tmp_path, generator):
         assert not found["reward"].any() and not found["terminated"].any()
 
 
+def test_a_subclass_gives_the_robot_a_reward(path):
+    class Spin(SceneTask):
+        """Reward: speed of the joint."""
+
+        def reward(self, state, action, next_state):
+            return next_state["qvel"][..., 0]
+
+    env = make_env(Spin(load_scene(path)), "mujoco", num_envs=2)
+    found = env.rollout(3)["next"]
+    assert task_id(env.task) == "Spin" and found["reward"].any()
+    assert torch.equal(found["reward"], found["qvel"].float())
+
+
 def test_an_episode_ends_by_its_horizon(path):
     env = make_env(path, "mujoco")
     env.task.horizon = 5

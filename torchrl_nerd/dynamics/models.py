@@ -236,14 +236,14 @@ class AnalyticDynamics(TorchDynamics):
         return result.qpos, result.qvel, None
 
 
-def dynamics_of(
-    model: Model, compile: bool = False, differentiable: bool = False, **how: Any
-) -> NeRDDynamics | AnalyticDynamics:
+def dynamics_of(model: Model, **how: Any) -> NeRDDynamics | AnalyticDynamics:
     """The dynamics of a learned, hybrid or analytic model.
 
-    ``how``: further arguments of `NeRDDynamics`; an analytic step ignores them.
+    ``how``: arguments of `NeRDDynamics`; an analytic step ignores those of a history.
     """
-    how |= {"compile": compile, "differentiable": differentiable}
     if isinstance(model, NeRD):
         return NeRDDynamics(model, **how)
-    return AnalyticDynamics(model, compile, differentiable)
+    of_history = ("inference", "window")
+    return AnalyticDynamics(
+        model, **{k: v for k, v in how.items() if k not in of_history}
+    )

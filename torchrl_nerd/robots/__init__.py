@@ -114,7 +114,7 @@ def _meant(name: object, known: Collection[str]) -> str:
 
 def task_id(task: Task) -> str:
     """The id of a task, or the name of its class."""
-    if isinstance(task, SuiteTask | SceneTask):
+    if isinstance(task, SuiteTask) or type(task) is SceneTask:
         return task.name
     ids = (name for name, kind in TASKS.items() if kind is type(task))
     return next(ids, type(task).__name__)
