@@ -3,6 +3,7 @@
 import copy
 import multiprocessing
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -229,6 +230,17 @@ def test_copies_draw_the_same_and_forked_processes_refuse():
     process.join()
     assert process.exitcode == 0
     np.testing.assert_array_equal(env.render(), expected)
+
+
+def test_threads_draw_the_same(seed):
+    env = make_env("cartpole/swingup", "mujoco", render_size=SIZE, seed=seed)
+    env.reset()
+    expected = env.render()
+    with ThreadPoolExecutor(2) as pool:
+        found = [pool.submit(env.render).result() for _ in range(3)]
+        pool.submit(env.close).result()
+    for image in (*found, env.render()):
+        np.testing.assert_array_equal(image, expected)
 
 
 def test_what_images_need_is_made_late_and_freed():
