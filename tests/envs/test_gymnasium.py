@@ -155,6 +155,10 @@ def test_any_task_goes_by_its_id():
     env = gymnasium.make("TorchrlNerd/Task-v0", task=name, dynamics="mujoco")
     assert env.reset(seed=0)[0].shape == (3,)
     assert {gymnasium_id(task) for task in TASKS} < set(gymnasium.registry)
+    spec = gymnasium.envs.registration.EnvSpec.from_json(gymnasium.spec(ID).to_json())
+    assert gymnasium.make(
+        spec, dynamics="mujoco"
+    ).unwrapped.observation_space.shape == (4,)
     module = "torchrl_nerd.gymnasium:TorchrlNerd/CartpoleSwingup-v0"
     assert gymnasium.make(module, dynamics="mujoco").reset()[0].shape == (4,)
 
@@ -179,13 +183,15 @@ def test_a_mask_begins_some_episodes_anew(seed, rng):
             np.testing.assert_array_equal(before[0], expected[0])
             np.testing.assert_array_equal(before[1:], observation[1:])
             assert (before[0] != observation[0]).any()
-            before[:] = 7.0  # the user's own
         observation, reward, terminated, truncated, _ = many.step(action)
         found = own.step(action)
         np.testing.assert_array_equal(observation[0], found[0][0])
         np.testing.assert_array_equal(terminated, found[2])
         np.testing.assert_array_equal(truncated, found[3])
         np.testing.assert_array_equal(reward == 0.0, found[1] == 0.0)
+    many.reset(options={"reset_mask": mask})[0][:] = 7.0
+    again, _ = many.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(again[1:], observation[1:])
 
 
 @pytest.mark.parametrize("steps", [1, 4])
@@ -198,7 +204,9 @@ def test_an_episode_is_as_long_as_asked(steps, rng):
     for step, action in enumerate(actions_of(many, rng, steps), 1):
         assert one.step(action[0])[3] == (step == steps)
         assert many.step(action)[3].tolist() == [step == steps] * 2
-    assert make_task(TASK).horizon > 4  # of others
+    task = make_task(TASK)
+    GymnasiumVectorEnv(task, "mujoco", max_episode_steps=steps)
+    assert task.horizon > 4  # the user's own
 
 
 @has_gl

@@ -116,7 +116,7 @@ class Renderer:
         """Free the OpenGL contexts; the next image makes new ones."""
         while self._gl:
             _, renderer = self._gl.popitem()
-            if renderer._gl_context:  # or another one would lose what it draws with
+            if renderer._gl_context:  # or nothing of it would be freed
                 renderer._gl_context.make_current()
             renderer.close()
             _release()
