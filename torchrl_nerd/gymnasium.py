@@ -26,6 +26,7 @@ from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
 from torchrl_nerd.robots import TASKS, make_task
 from torchrl_nerd.robots.registry import for_each_task
+from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
 
 Info = dict[str, Any]
@@ -45,14 +46,13 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seed: of the resets, until `reset` is given another; None for a fresh one.
         device: where the env computes.
         render_mode: ``"rgb_array"`` for images by `render`, or None.
-        max_episode_steps: steps until ``truncated``; the task's horizon by default.
+        max_episode_steps: steps until ``truncated``, where the task's horizon is longer.
         height: of an image, pixels.
         width: of an image, pixels.
         camera_id: of an image, see `envs.rendering.Renderer`.
 
     Raises:
-        ValueError: what `make_env` refuses, an unknown render mode, or more steps than the
-            task's horizon.
+        ValueError: what `make_env` refuses, an unknown render mode, or no steps.
     """
 
     metadata: Info = {
@@ -233,14 +233,12 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def _shortened(task: str | Task, steps: int | None) -> Task:
-    """The task, a copy with that horizon where one is given."""
+    """The task, or a copy of it with that horizon where its own is longer."""
     task = task if isinstance(task, Task) else make_task(task)
-    if steps is None or steps == task.horizon:
+    if steps is not None:
+        expect_at_least(1, max_episode_steps=steps)
+    if steps is None or steps >= task.horizon:
         return task
-    if not 1 <= steps <= task.horizon:
-        raise ValueError(
-            f"expected max_episode_steps from 1 to the horizon {task.horizon}, got {steps}"
-        )
     task = copy.copy(task)
     task.horizon = steps
     return task

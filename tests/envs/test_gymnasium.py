@@ -207,6 +207,8 @@ def test_an_episode_is_as_long_as_asked(steps, rng):
     task = make_task(TASK)
     GymnasiumVectorEnv(task, "mujoco", max_episode_steps=steps)
     assert task.horizon > 4  # the user's own
+    longer = GymnasiumVectorEnv(short_task(steps), "mujoco", max_episode_steps=9)
+    assert longer.env.task.horizon == steps  # as TimeLimit around a shorter env
 
 
 @has_gl
@@ -276,8 +278,8 @@ def test_workers_that_are_spawned_know_the_ids(seed):
             "no options",
         ),
         (
-            lambda env: GymnasiumVectorEnv(TASK, "mujoco", max_episode_steps=10**6),
-            "max_episode_steps from 1 to the horizon",
+            lambda env: GymnasiumVectorEnv(TASK, "mujoco", max_episode_steps=0),
+            "max_episode_steps of at least 1, got 0",
         ),
     ],
 )
