@@ -14,7 +14,8 @@ import mujoco
 import torch
 
 from torchrl_nerd.analytic import STEPS, make_step
-from torchrl_nerd.card import FORMAT, config_of, make_card
+from torchrl_nerd.card import FORMAT, config_of
+from torchrl_nerd.card import make_card as make_card
 from torchrl_nerd.dynamics import ENGINES, Model
 from torchrl_nerd.files import folder_name, read_json, writable_folder, write_json
 from torchrl_nerd.modules.hybrid import HybridNeRD
@@ -267,18 +268,3 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
             + ", ".join(differing),
             stacklevel=3,
         )
-
-
-__all__ = [
-    "CARD",
-    "PRETRAINED",
-    "WEIGHTS",
-    "from_pretrained",
-    "load_checkpoint",
-    "make_card",
-    "model_name",
-    "read_checkpoint",
-    "save_checkpoint",
-    "shipped_card",
-    "shipped_models",
-]

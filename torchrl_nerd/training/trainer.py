@@ -33,7 +33,13 @@ from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Sequences
 from torchrl_nerd.training.start import begin_from, fingerprint, make_model
-from torchrl_nerd.training.validation import Errors, Validation, for_card, metrics
+from torchrl_nerd.training.validation import (
+    Errors,
+    for_card,
+    metrics,
+    score,
+    validate,
+)
 
 STATE = "state.json"  # card of a run that can be resumed
 
@@ -83,7 +89,7 @@ class Trainer:
             )
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
-        self.validation = Validation(source, horizons, random_actions)
+        self.validation = source, horizons, random_actions
         self.quiet = quiet
         self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
@@ -220,12 +226,12 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Mean errors of the averaged model; the best model so far is saved."""
-        self.errors = self.validation(self.averaged_model(), self.device)
-        score = self.validation.score(self.errors)
+        self.errors = validate(self.averaged_model(), *self.validation, self.device)
+        found = score(self.errors)
         # the first model is saved even if its rollouts diverge
-        if score < self.best or not (self.folder / "best").exists():
+        if found < self.best or not (self.folder / "best").exists():
             self._save_model("best")
-        self.best = min(self.best, score)
+        self.best = min(self.best, found)
         return metrics(self.errors)
 
     def save(self) -> None:

@@ -1,6 +1,6 @@
 """Validation of a model in training: open-loop error against the ground truth."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -17,30 +17,29 @@ Errors = dict[int, dict[str, ErrorSummary]]
 """Error by horizon in control steps and by quantity."""
 
 
-@dataclass(frozen=True)
-class Validation:
-    """Rollouts that measure a model."""
+def validate(
+    model: NeRD,
+    source: Source,
+    horizons: tuple[int, ...],
+    random_actions: bool,
+    device: torch.device,
+) -> Errors:
+    """Errors of a model on the device that it is on; see `passive_errors`."""
+    return passive_errors(
+        source,
+        NeRDDynamics(model),
+        MujocoDynamics(model.scene),
+        list(horizons),
+        num_trajectories=ROLLOUTS,
+        seed=SEED,
+        device=device,
+        random_actions=random_actions,
+    )
 
-    source: Source  # task or scene whose resets or ranges give the initial states
-    horizons: tuple[int, ...]  # control steps averaged over, the shortest first
-    random_actions: bool  # uniform actions in [-1, 1] in place of zero
 
-    def __call__(self, model: NeRD, device: torch.device) -> Errors:
-        """Errors of a model on the device that it is on."""
-        return passive_errors(
-            self.source,
-            NeRDDynamics(model),
-            MujocoDynamics(model.scene),
-            list(self.horizons),
-            num_trajectories=ROLLOUTS,
-            seed=SEED,
-            device=device,
-            random_actions=self.random_actions,
-        )
-
-    def score(self, errors: Errors) -> float:
-        """Sum of the mean errors at the longest horizon, by which models are compared."""
-        return sum(summary.mean for summary in errors[self.horizons[-1]].values())
+def score(errors: Errors) -> float:
+    """Sum of the mean errors at the longest horizon, by which models are compared."""
+    return sum(summary.mean for summary in errors[max(errors)].values())
 
 
 def metrics(errors: Errors) -> dict[str, float]:
