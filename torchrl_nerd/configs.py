@@ -86,7 +86,8 @@ class TrainConfig:
     """Settings of a training: one-step targets first, then rollouts of the model.
 
     Raises:
-        SettingError: a number that is too small.
+        SettingError: a number that is too small, or symmetry images of a hybrid, whose
+            analytic change has none.
     """
 
     network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width
@@ -121,6 +122,10 @@ class TrainConfig:
         for name, value in asdict(self).items():
             if not isinstance(value, str | None):
                 expect_at_least(1 if name in COUNTS else 0, **{name: value})
+        if self.use_symmetry and self.step is not None:
+            raise SettingError(
+                "expected training without use_symmetry for a hybrid, got it with one"
+            )
 
     @property
     def features(self) -> FeatureConfig:

@@ -47,10 +47,7 @@ class Inputs(NamedTuple):
 class Sequences:
     """Batches of sequences from a data set ``[trajectories, steps]``, on a device.
 
-    With ``symmetry`` each sample is shown as a random one of its images.
-
-    Raises:
-        ValueError: symmetry images of a hybrid, whose analytic change has none.
+    With ``symmetry`` each sample of a learned model is shown as a random one of its images.
     """
 
     def __init__(
@@ -60,10 +57,6 @@ class Sequences:
         device: torch.device,
         symmetry: Symmetry | None = None,
     ) -> None:
-        if symmetry is not None and model.kind == "hybrid":
-            raise ValueError(
-                "expected training without use_symmetry for a hybrid, got it with one"
-            )
         features, targets = normalised(model, data)
         self.features, self.targets = features, targets.to(device)
         self.inputs = Inputs(*(x.to(device) for x in Inputs.of(model, data, features)))
