@@ -155,7 +155,7 @@ def test_the_command_continues_from_several_data_sets(tmp_path, monkeypatch, cap
             ["--data", "a", "--init-from", "ant"],
             "is for robot 'ant', expected 'cartpole'",
         ),
-        (["--data", "a", "--init-from", "none"], "checkpoint folder, got 'none'"),
+        (["--data", "a", "--init-from", "none"], "unknown dynamics 'none', expected"),
         (
             ["--data", "a", "--init-from", "cartpole-mlp"],
             "start from, mlp-1x32, got",
