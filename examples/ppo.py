@@ -29,7 +29,7 @@ from torchrl_nerd.configs import PPOConfig
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
-from torchrl_nerd.evaluation.policy_transfer import mean_returns, report_transfer
+from torchrl_nerd.evaluation.policy_transfer import report_transfer, transfer
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import PPO_CONFIGS
 from torchrl_nerd.tasks import Task
@@ -129,7 +129,8 @@ def train(
         progress.update(frames)
         if number % cfg.evaluate_every == 0 or number * frames == total:
             episodes, seed = min(256, cfg.episodes), cfg.seed + 1
-            means = mean_returns(task, actor, [cfg.dynamics], episodes, seed=seed)
+            found = transfer(task, actor, [cfg.dynamics], episodes, seed=seed)
+            means = {name: returns.mean for name, returns in found.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})
     return policy, curve

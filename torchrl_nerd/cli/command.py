@@ -30,16 +30,9 @@ class Command(ABC):
         """Run the command and return its results."""
 
     @property
-    def figure(self) -> Path | None:
-        """The video or figure that `run` writes, where it writes one."""
-        return None
-
-    @property
     def record(self) -> Path | None:
-        """Where results and settings go: ``json``, or beside the video or figure."""
-        if self.json is not None or self.figure is None:
-            return self.json
-        return self.figure.with_name(f"{self.figure.name}.json")
+        """Where results and settings go."""
+        return self.json
 
     def configuration(self) -> dict[str, Any]:
         """Every option and its value, which repeat the command."""

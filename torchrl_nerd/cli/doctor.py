@@ -48,14 +48,11 @@ class Doctor(Command):
         checks = {}
         for name in tqdm(shipped_models(), "models", leave=False, disable=self.quiet):
             check = checks[name] = _check(name)
-            if "error" in check:
-                tqdm.write(f"  {name:<28}{check['error']}")
-                continue
-            differences = f"MuJoCo {check['mujoco']:.0e}, model {check['model']:.0e}"
-            verdict = "ok" if check["agrees"] else "DIFFERS"
-            tqdm.write(
-                f"  {name:<28}{differences:<30}{check['seconds']:>5} s  {verdict}"
+            shown = check.get("error") or (
+                f"MuJoCo {check['mujoco']:.0e}, model {check['model']:.0e}"
+                f"{check['seconds']:>7} s  {'ok' if check['agrees'] else 'DIFFERS'}"
             )
+            tqdm.write(f"  {name:<29} {shown}")
         wrong = [name for name, check in checks.items() if not check["agrees"]]
         if wrong:
             raise RuntimeError(
@@ -89,10 +86,8 @@ def _check(name: str) -> dict[str, Any]:
         model, check = read_checkpoint(model_folder(name))
     except ValueError as error:
         return {"agrees": False, "error": str(error)}
-    return {
-        "agrees": check is not None and check.agrees,
-        "mujoco": None if check is None else check.mujoco,
-        "model": None if check is None else check.model,
-        "kind": model.kind,
-        "seconds": round(time.monotonic() - began, 2),
-    }
+    if check is None:
+        return {"agrees": False, "error": "no steps are stored"}
+    seconds = round(time.monotonic() - began, 2)
+    about = {"kind": model.kind, "seconds": seconds, "agrees": check.agrees}
+    return {**about, "mujoco": check.mujoco, "model": check.model}

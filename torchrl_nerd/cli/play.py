@@ -53,9 +53,14 @@ class Play(DeviceCommand):
     """2 plays at half speed."""
 
     @property
-    def figure(self) -> Path:
-        """The video."""
+    def video(self) -> Path:
+        """Where it goes."""
         return self.out or Path("runs") / f"{folder_name(self.task)}.gif"
+
+    @property
+    def record(self) -> Path:
+        """Where results and settings go: ``json``, or beside the video."""
+        return self.json or self.video.with_name(f"{self.video.name}.json")
 
     def run(self) -> dict[str, Any]:
         """Roll out, write the video and return what happened.
@@ -63,7 +68,7 @@ class Play(DeviceCommand):
         Raises:
             ValueError: in one sentence, an option out of range or no such task or model.
         """
-        task, out = make_task(self.task), self.figure
+        task, out = make_task(self.task), self.video
         check_video(out)
         if not 0.0 < self.slowdown < float("inf"):
             raise ValueError(f"expected slowdown above 0, got {self.slowdown}")

@@ -19,6 +19,7 @@ from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
+from torchrl_nerd.evaluation.rollout_error import interval_of_mean
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import make_task
@@ -27,7 +28,6 @@ from torchrl_nerd.tasks import Task
 
 GROUND_TRUTH = "mujoco"
 TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
-NORMAL_95 = 1.96  # half width of a 95% interval, in standard errors
 PAPER_NOTE = (
     "The paper's returns are of another simulator (Warp) as ground truth: compare with "
     "them only the return difference."
@@ -108,14 +108,10 @@ def summarize(
         episodes=len(returns),
         mean=float(returns.mean()),
         std=float(returns.std()),
-        interval=_interval(returns),
+        interval=interval_of_mean(returns),
         difference=float(difference.mean()) / scale,
-        difference_interval=_interval(difference) / scale,
+        difference_interval=interval_of_mean(difference) / scale,
     )
-
-
-def _interval(samples: Tensor) -> float:
-    return float(NORMAL_95 * samples.std() / len(samples) ** 0.5)
 
 
 def transfer(
@@ -162,18 +158,6 @@ def transfer(
 def model_title(scene: Scene, name: str) -> str:
     """The model that a name stands for; engines by their proper names."""
     return TITLES.get(name) or model_name(name, scene)
-
-
-def mean_returns(
-    task: str | Task,
-    actor: Actor,
-    dynamics: Sequence[str | Path],
-    episodes: int,
-    seed: int = 0,
-) -> dict[str, float]:
-    """Mean returns of `transfer`, by name of the dynamics."""
-    summaries = transfer(task, actor, dynamics, episodes, seed=seed)
-    return {name: summary.mean for name, summary in summaries.items()}
 
 
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:

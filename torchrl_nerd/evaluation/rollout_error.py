@@ -5,7 +5,7 @@ distribution, the same actions in both (zero: passive), the error averaged over 
 trajectories.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import cast
 
@@ -104,13 +104,9 @@ def open_loop(
         stop_at_nan: stop once a trajectory is not finite; what is left is NaN. An engine
             takes long over states that diverge.
     """
-    terrain, drive = start.get(TERRAIN, None), _drive(dynamics, start, joint_torque)
-    state: TensorDictBase = start.select(QPOS, QVEL)
-    dynamics.reset(state)
     shape = (len(start), steps, start[QPOS].shape[1])
     positions = torch.full(shape, torch.nan).to(start[QPOS])
-    for step in range(steps):
-        state = dynamics.step(state, drive(step, state), terrain)
+    for step, state in enumerate(_states(dynamics, start, steps, joint_torque)):
         positions[:, step] = state[QPOS]
         if stop_at_nan and not state[QPOS].isfinite().all():
             break
@@ -134,26 +130,32 @@ def rollout(
             and state; or None for none.
         every: steps between two states that are kept.
     """
-    terrain, drive = start.get(TERRAIN, None), _drive(dynamics, start, joint_torque)
-    state: TensorDictBase = start.select(QPOS, QVEL)
-    dynamics.reset(state)
-    kept = [state]
-    for step in range(steps):
-        state = dynamics.step(state, drive(step, state), terrain)
-        if (step + 1) % every == 0:
+    kept: list[TensorDictBase] = [start.select(QPOS, QVEL)]
+    for step, state in enumerate(_states(dynamics, start, steps, joint_torque), 1):
+        if step % every == 0:
             kept.append(state.select(QPOS, QVEL))
     return cast(TensorDict, TensorDict.stack(kept, 1))
 
 
-def _drive(
-    dynamics: Dynamics, start: TensorDict, joint_torque: Tensor | Drive | None
-) -> Drive:
-    """Torques as a function of step and state."""
-    if callable(joint_torque):
-        return joint_torque
-    idle = torch.zeros(len(start), 1, len(dynamics.scene.actuated))
-    torque = idle.to(start[QPOS]) if joint_torque is None else joint_torque
-    return lambda step, state: torque[:, step % torque.shape[1]]  # (n, num_actuated)
+def _states(
+    dynamics: Dynamics,
+    start: TensorDict,
+    steps: int,
+    joint_torque: Tensor | Drive | None,
+) -> Iterator[TensorDictBase]:
+    """The state after each step."""
+    terrain, state = start.get(TERRAIN, None), start.select(QPOS, QVEL)
+    if joint_torque is None:
+        idle = torch.zeros(len(start), 1, len(dynamics.scene.actuated))
+        joint_torque = idle.to(start[QPOS])
+    dynamics.reset(state)
+    for step in range(steps):
+        if callable(joint_torque):
+            torque = joint_torque(step, state)  # (n, num_actuated)
+        else:
+            torque = joint_torque[:, step % joint_torque.shape[1]]
+        state = dynamics.step(state, torque, terrain)
+        yield state
 
 
 def position_errors(
@@ -200,6 +202,11 @@ def unit_of(scene: Scene, quantity: str) -> str:
     return "m" if is_slide else "rad"
 
 
+def interval_of_mean(samples: Tensor) -> float:
+    """Half width of the 95% interval of the mean of independent samples ``(n,)``."""
+    return float(1.96 * samples.std() / len(samples) ** 0.5)
+
+
 def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary]:
     """Summary of each quantity of `position_errors`, ``(n, steps)``, m or rad.
 
@@ -212,7 +219,7 @@ def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary
             unit=unit_of(scene, name),
             mean=float(over_time.mean()),
             # trajectories are independent, steps of one are not
-            interval=float(1.96 * over_time.std() / len(over_time) ** 0.5),
+            interval=interval_of_mean(over_time),
             final=float(error[:, -1].mean()),
             p95=float(over_time.quantile(0.95)),
         )
