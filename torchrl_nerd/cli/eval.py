@@ -141,11 +141,6 @@ class Eval(MeasuringCommand):
             raise ValueError(f"expected split {expected}, got '{self.split}'")
         chosen = None if self.split == "all" else split[self.split]
         starts = recording.starts(self.states, chosen)
-        if len(starts) == 0:
-            raise ValueError(
-                f"expected a trajectory of at least {self.states} states in {path}, got "
-                "none"
-            )
         others = rivals(scene) if self.baselines else {}
         others["model"] = dynamics_of(model)
         table = compare(others, scene, recording, starts, self.states)

@@ -58,12 +58,20 @@ class Recording:
         """Rows ``(windows,)`` where ``states`` consecutive states begin.
 
         Of the trajectories with these ``numbers (n,)``, or of all.
+
+        Raises:
+            ValueError: none is long enough.
         """
         found, bounds = [torch.zeros(0, dtype=torch.long)], self.trajectories
         for i in range(len(self)) if numbers is None else numbers.tolist():
             first, end = bounds[i].start, bounds[i].stop
             found.append(torch.arange(first, max(first, end - states + 1)))
-        return torch.cat(found)
+        rows = torch.cat(found)
+        if len(rows) == 0:
+            raise ValueError(
+                f"expected a trajectory of at least {states} states, got none"
+            )
+        return rows
 
     @property
     def trajectories(self) -> list[slice]:

@@ -97,9 +97,8 @@ class FineTuner:
         self.config, self.recording, self.quiet = config, recording, quiet
         self.model, self.train, self.keep = copy.deepcopy(model), train, keep
         states = config.states if is_fit else config.sequence_length + 1
-        self.starts = _starts(recording, states, train, "training")
-        checks = _starts(recording, config.states, validation, "validation")
-        self.checks = checks[::VALIDATION_STRIDE]
+        self.starts = recording.starts(states, train)
+        self.checks = recording.starts(config.states, validation)[::VALIDATION_STRIDE]
         self.curve: list[dict[str, float]] = []
         if isinstance(self.model, NeRD):
             chosen = []
@@ -223,15 +222,6 @@ class FineTuner:
         """Configuration and convergence, for a checkpoint's card."""
         how = asdict(self.config) | {"update": self.update}
         return {"finetuning": {**how, **converged(self.curve)}}
-
-
-def _starts(recording: Recording, states: int, numbers: Tensor, what: str) -> Tensor:
-    found = recording.starts(states, numbers)
-    if len(found) == 0:
-        raise ValueError(
-            f"expected {what} trajectories of at least {states} states, got none"
-        )
-    return found
 
 
 def rollout_error(model: Model, window: TensorDict) -> Tensor:
