@@ -178,26 +178,21 @@ class Result:
 
 
 def run_cases(
-    tested: Dynamics,
-    cases: list[Case],
-    seed: int = 0,
-    scale: float = 1.0,
-    ground_truth: Dynamics | None = None,
+    tested: Dynamics, cases: list[Case], seed: int = 0, scale: float = 1.0
 ) -> Iterator[Result]:
-    """Every case that applies, one after the other.
+    """Every case that applies, in MuJoCo and in the dynamics under test.
 
     Args:
         tested: any dynamics; cases of models are left out for others.
         cases: which.
         seed: of starts and torques; each case has a stream of its own, the same in both.
         scale: fraction of long rollouts and large batches, in (0, 1].
-        ground_truth: what stands beside it; by default MuJoCo.
     """
     for case in cases:
         if not case.supports(tested):
             continue
         began, found = time.monotonic(), []
-        for dynamics in (ground_truth or MujocoDynamics(tested.scene), tested):
+        for dynamics in (MujocoDynamics(tested.scene), tested):
             stream = Generator().manual_seed(crc32(case.name.encode(), seed))
             trial = Trial(dynamics, stream, scale)
             found.append(list(case.run(trial)) if case.supports(dynamics) else [])
