@@ -173,7 +173,7 @@ class Renderer:
         if scene.base.is_floating and not isinstance(camera, int | str):
             camera.lookat[:] = data.subtree_com[scene.base.body]
         renderer.update_scene(data, camera)
-        if GOAL in row:
+        if GOAL in row and row[GOAL].shape[-1] == 3:  # a task of users may mean another
             seen = renderer.scene
             mujoco.mjv_initGeom(
                 seen.geoms[seen.ngeom],
