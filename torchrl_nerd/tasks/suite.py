@@ -1,6 +1,7 @@
 """Tasks of the dm_control suite in any dynamics: the suite's own code, envs of tensors."""
 
 import copy
+from collections.abc import Callable
 from math import ceil
 
 import mujoco
@@ -9,11 +10,12 @@ import torch
 from mujoco import MjData, MjModel
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
+from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.importer import load_suite
-from torchrl_nerd.tasks.rows import RowMemo, on_rows
 from torchrl_nerd.tasks.task import State, Task
 
 SEEDS = 2**32  # of NumPy's RandomState, which the suite draws from
@@ -64,7 +66,7 @@ class SuiteTask(Task):
         self._sizes = (model.nq, model.nv, width)
         self._forces, self._num_ctrl = judge.forces, model.nu
         self._targets = judge.targets
-        self._start, self._judge = RowMemo(judge.start), RowMemo(judge)
+        self._start, self._judge = _RowMemo(judge.start), _RowMemo(judge)
 
     def build_scene(self) -> Scene:
         """The suite's robot and its ground."""
@@ -72,7 +74,7 @@ class SuiteTask(Task):
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """By the suite's ``initialize_episode``, seeded with u."""
-        qpos, qvel, target = on_rows(self._start, u).split(self._sizes, -1)
+        qpos, qvel, target = _on_rows(self._start, u).split(self._sizes, -1)
         targets = {TARGET: target} if self.parameters else {}
         return {QPOS: qpos, QVEL: qvel, **targets}
 
@@ -106,7 +108,7 @@ class SuiteTask(Task):
             felt = state[SENSORDATA][..., self._forces]
         target = [state[key] for key in self.parameters]
         row = torch.cat((qpos, state[QVEL], *target, ctrl, felt), -1)
-        return on_rows(self._judge, row)
+        return _on_rows(self._judge, row)
 
 
 class SuiteReward:
@@ -217,3 +219,38 @@ def _bytes(model: mujoco.MjModel) -> np.ndarray:
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer
+
+
+_ONE_AT_A_TIME = fork_safe_lock()
+
+
+class _RowMemo:
+    """A slow function of rows; a row that is the same as last time keeps its answer."""
+
+    def __init__(self, function: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.function = function
+        self._given, self._answers = np.zeros((0, 0)), np.zeros((0, 0))
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Answers to ``rows (n, k)``; of the same n and k as last time, or all anew."""
+        with _ONE_AT_A_TIME:  # one `Physics`, written in and read
+            return self._answer(rows)
+
+    def _answer(self, rows: np.ndarray) -> np.ndarray:
+        is_known = np.zeros(len(rows), bool)
+        if rows.shape == self._given.shape:  # bit for bit: NaN equals NaN
+            is_known = (rows.view(np.int64) == self._given.view(np.int64)).all(-1)
+        answers = [
+            self._answers[i] if is_known[i] else self.function(row)
+            for i, row in enumerate(rows)
+        ]
+        self._given, self._answers = rows, np.array(answers)
+        return self._answers
+
+
+@uncompiled
+def _on_rows(function: _RowMemo, rows: Tensor) -> Tensor:
+    """A function of NumPy rows ``(n, k)``, of float64 tensors ``(*batch, k)``."""
+    flat = rows.double().flatten(0, -2).cpu().contiguous().numpy().copy()
+    answers = torch.from_numpy(function(flat).copy())
+    return answers.to(rows.device).unflatten(0, rows.shape[:-1])
