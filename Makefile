@@ -158,7 +158,7 @@ SHIP_POLICY = mkdir -p $(POLICIES)/$* && cp runs/$@/policy.* $(POLICIES)/$*/
 LEGGED := $(addprefix policy-,ant-run ant-spin ant-spin_track anymal-forward anymal-sideways)
 FRAMES := 8000000
 
-policies: policy-cartpole-swingup $(LEGGED) policy-franka-reach policy-franka-reach_torque ## a policy for every task with a goal, eight hours on one core
+policies: policy-cartpole-swingup $(LEGGED) policy-franka-reach policy-franka-reach_osc policy-franka-reach_torque ## a policy for every task with a goal, eight hours on one core
 
 policy-cartpole-swingup: policy-%: $(STAMP)
 	$(PPO) --total-frames 6000000 --out runs/$@
@@ -174,6 +174,10 @@ policy-franka-reach: policy-%: $(STAMP)
 	$(PPO) --task franka/reach --dynamics analytic --compile --seed 1 --out runs/$@-ppo
 	$(BY_GRADIENTS) --task franka/reach --dynamics analytic --start runs/$@-ppo --updates 850 --seed 1 --out runs/$@-on
 	$(BY_GRADIENTS) --task franka/reach --dynamics analytic --start runs/$@-on --updates 340 --seed 1 --out runs/$@
+	$(SHIP_POLICY)
+
+policy-franka-reach_osc: policy-%: $(STAMP)
+	$(PPO) --task franka/reach_osc --compile --out runs/$@
 	$(SHIP_POLICY)
 
 policy-franka-reach_torque: policy-%: $(STAMP)

@@ -1,7 +1,7 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
-A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability`` or
-``compiled_env``.
+A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
+``compiled_env`` or ``kinematics_libraries``.
 """
 
 import json
@@ -138,13 +138,29 @@ def env_table(folder: Path = RESULTS) -> str:
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
+def kinematics_table(folder: Path = RESULTS) -> str:
+    """A row per robot, library and way to run it."""
+    path = folder / "kinematics_libraries.json"
+    if not path.exists():
+        return ""
+    record = json.loads(path.read_text())
+    table = [["robot", "library", "run", "positions (ms)", "with velocities (ms)"]]
+    for row in record["results"]:
+        times = (row[key] for key in ("positions_ms", "with_velocities_ms"))
+        way = "compiled" if row["compiled"] else "eager"
+        table.append([row["scene"], row["library"], way, *map(number, times)])
+    return f"{rows(table)}\n\n{made_by(record)}"
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
     "stability": stability_tables,
     "compiled_env": env_table,
+    "kinematics_libraries": kinematics_table,
 }
-COMMANDS = {"compiled_env": "python benchmarks/compiled_env.py --json results/{}.json"}
+MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
+COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -368,12 +368,15 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
         "machine": machine,
     }
     rate = {"name": "a", "batch": 512, "steps_per_s": 12345.6}
+    chain = {"scene": "ant", "library": "own", "compiled": True}
+    chain |= {"positions_ms": 0.123, "with_velocities_ms": 1.5}
     for name, results in (
-        ("eval", {"errors": errors}),
-        ("bench", {"errors": errors, "rates": [rate], "steps": 100}),
-        ("stability", {"drop": {"passes": False}}),
+        ("eval_robot", {"errors": errors}),
+        ("bench_robot", {"errors": errors, "rates": [rate], "steps": 100}),
+        ("stability_robot", {"drop": {"passes": False}}),
+        ("kinematics_libraries", [chain]),
     ):
-        path = tmp_path / f"{name}_robot.json"
+        path = tmp_path / f"{name}.json"
         path.write_text(json.dumps({**record, "results": results}))
     page = "\n".join(f"<!-- table: {name} -->" for name in tables_hook.TABLES)
     shown = tables_hook.render(page, tmp_path)
@@ -381,6 +384,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "| b | learned | diverges | diverges | diverges |" in shown
     assert "| a | learned | 0.12 | 0.12 | 0.12 | 12,346 |" in shown
     assert "| drop | **fail** |" in shown
+    assert "| ant | own | compiled | 0.12 | 1.5 |" in shown
     assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
 
 

@@ -17,6 +17,7 @@ from torchrl_nerd.geometry.rotations import quat_matrix
 
 if TYPE_CHECKING:  # importing it takes a second: only who builds a chain waits for it
     from pytorch_kinematics import SerialChain
+    from pytorch_kinematics.frame import Frame
 
 END = "end"
 
@@ -103,51 +104,66 @@ def bias_acceleration(jacobian: Tensor, rates: Tensor) -> Tensor:
 def serial_chain(model: mujoco.MjModel, site: str) -> "SerialChain":
     """pytorch-kinematics' chain from the world to a site, float64; its joints take qpos.
 
-    A frame per joint, at the joint's anchor. MuJoCo's ``ref`` and the fixed parts of the
-    way are in the frames' offsets.
-
     Raises:
         ValueError: as for `SiteKinematics`.
     """
     from pytorch_kinematics import Chain, SerialChain
+
+    _joints_to(model, site)
+    root = last = make_frame("world", np.eye(4))
+    offset = np.eye(4)
+    for body in _bodies_to(model, site):
+        last, offset = add_body(model, body, last, offset)
+    place = model.site(site)
+    end = make_frame(END, offset @ _matrix(place.pos, place.quat))
+    last.children = [end]
+    float64: dict[str, Any] = {"dtype": torch.float64}
+    return SerialChain(Chain(root, **float64), END, **float64)
+
+
+def make_frame(name: str, offset: np.ndarray, **joint: Any) -> "Frame":
+    """A frame of pytorch-kinematics, ``offset (4, 4)`` in its parent before it moves."""
     from pytorch_kinematics.frame import Frame, Joint, Link
     from pytorch_kinematics.transforms import Transform3d
 
-    float64: dict[str, Any] = {"dtype": torch.float64}
+    place = Transform3d(matrix=torch.from_numpy(offset[None]), dtype=torch.float64)
+    return Frame(name, Link(name, place), Joint(name, dtype=torch.float64, **joint))
 
-    def frame(name: str, offset: np.ndarray, **joint: Any) -> Frame:
-        matrix = torch.from_numpy(offset[None])
-        link = Link(name, Transform3d(matrix=matrix, **float64))
-        return Frame(name, link, Joint(name, **float64, **joint))
 
-    joints, is_limited = _joints_to(model, site), model.jnt_limited
-    root = last = frame("world", np.eye(4))
-    offset = np.eye(4)
-    for body in _bodies_to(model, site):
-        offset = offset @ _matrix(model.body_pos[body], model.body_quat[body])
-        for joint in (joint for joint in joints if model.jnt_bodyid[joint] == body):
-            axis, anchor = model.jnt_axis[joint], model.jnt_pos[joint]
-            is_hinge, ref = model.jnt_type[joint] == HINGE, np.eye(4)
-            start = -model.qpos0[model.jnt_qposadr[joint]]
-            if is_hinge:
-                quat = np.empty(4)
-                mujoco.mju_axisAngle2Quat(quat, axis, start)
-                ref = _matrix(np.zeros(3), quat)
-            else:
-                ref[:3, 3] = start * axis
-            kind = "revolute" if is_hinge else "prismatic"
-            next_frame = frame(
-                f"joint {joint}",
-                offset @ _matrix(anchor) @ ref,
-                joint_type=kind,
-                axis=torch.from_numpy(axis.copy()),
-                limits=tuple(model.jnt_range[joint]) if is_limited[joint] else None,
-            )
-            last.children = [next_frame]
-            last, offset = next_frame, _matrix(-anchor)
-    place = model.site(site)
-    last.children = [frame(END, offset @ _matrix(place.pos, place.quat))]
-    return SerialChain(Chain(root, **float64), END, **float64)
+def add_body(
+    model: mujoco.MjModel, body: int, last: "Frame", offset: np.ndarray
+) -> tuple["Frame", np.ndarray]:
+    """Add a frame for each hinge and slide of a body, at the joint's anchor.
+
+    Args:
+        model: compiled model.
+        body: its id; its parent's joints are in ``last`` and above.
+        last: frame that the body's parent moves with.
+        offset: the parent in ``last``, ``(4, 4)``.
+
+    Returns:
+        The frame that the body moves with, and the body in it. MuJoCo's ``ref`` is in
+        these offsets.
+    """
+    offset = offset @ _matrix(model.body_pos[body], model.body_quat[body])
+    start = int(model.body_jntadr[body])
+    for joint in range(start, start + int(model.body_jntnum[body])):
+        axis, anchor = model.jnt_axis[joint], model.jnt_pos[joint]
+        is_hinge, quat = model.jnt_type[joint] == HINGE, np.array([1.0, 0.0, 0.0, 0.0])
+        ref = model.qpos0[model.jnt_qposadr[joint]]
+        if is_hinge:
+            mujoco.mju_axisAngle2Quat(quat, axis, -ref)
+        shift = anchor - ref * axis * (not is_hinge)
+        frame = make_frame(
+            f"joint {joint}",
+            offset @ _matrix(shift, quat),
+            joint_type="revolute" if is_hinge else "prismatic",
+            axis=torch.from_numpy(axis.copy()),
+            limits=tuple(model.jnt_range[joint]) if model.jnt_limited[joint] else None,
+        )
+        last.children = [*last.children, frame]
+        last, offset = frame, _matrix(-anchor)
+    return last, offset
 
 
 def _matrix(position: np.ndarray, quat: np.ndarray | None = None) -> np.ndarray:

@@ -71,7 +71,7 @@ ROBOT = Robot(
         # the controller brakes: one observation is enough, and it pays to be greedy
         "franka/reach_osc": replace(
             PPO,
-            total_frames=700_000,
+            total_frames=1_600_000,
             num_envs=512,
             minibatch=2048,
             gamma=0.95,
