@@ -20,6 +20,7 @@ from torchrl_nerd.evaluation.bench.candidates import mujoco_name, simulators
 from torchrl_nerd.evaluation.bench.errors import PAPER, cases_of
 from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.files import folder_name
 from torchrl_nerd.robots import PRESETS, SCENES, load_scene, protocol_of
 
@@ -431,3 +432,15 @@ def test_the_shipped_cartpole_is_as_good_as_the_paper(seed):
     for quantity in ("slider", "hinge"):
         published = protocol.published["passive", 100, quantity]
         assert 0.0 < found[quantity].mean < 2.0 * published
+
+
+@pytest.mark.parametrize("name", slow_but(["analytic"], ["nerd", "cartpole-mlp"]))
+def test_a_model_has_the_same_names_in_all_commands(name, capsys):
+    quick = ["--scale", "0.01", "--cases", next(iter(CASES)), "--quiet"]
+    for argv in (
+        ["eval", "cartpole", "--num-trajectories", "2", "--model", name, "--quiet"],
+        ["stability", "cartpole", "--model", name, *quick],
+    ):
+        assert main(argv) == 0
+        kind = from_pretrained(name, load_scene("cartpole")).kind
+        assert kind in capsys.readouterr().out

@@ -22,7 +22,7 @@ class Bench(MeasuringCommand):
 
     scene: Positional[SceneName]
     models: tuple[str, ...] = ()
-    """Names of models, or checkpoint folders; all that are shipped for it by default."""
+    """As --model of other commands, several of them; all that are shipped by default."""
     variants: tuple[str, ...] = ("compiled",)
     """Other ways to run each model, see nerd eval: compiled, window, bf16."""
     batches: tuple[int, ...] = (1, 64, 512, 4096)

@@ -7,7 +7,12 @@ from typing import Any, Literal
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import Positional, SceneName, recorded_scene
+from torchrl_nerd.cli.options import (
+    ModelName,
+    Positional,
+    SceneName,
+    recorded_scene,
+)
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.bench.candidates import (
@@ -56,8 +61,7 @@ class Eval(MeasuringCommand):
     """
 
     scene: Positional[SceneName]
-    model: Path | None = None
-    """Name of a shipped model, or a checkpoint folder; all that are shipped by default."""
+    model: ModelName = None
     num_trajectories: int = 2048
     """How many trajectories of each case the errors are means of."""
     seed: int = 500
@@ -97,7 +101,7 @@ class Eval(MeasuringCommand):
             f"{solver_name}, {solver}. "
             "Every row, coarse MuJoCo included, is measured against it."
         )
-        names = [] if self.model is None else [str(self.model)]
+        names = [] if self.model is None else [self.model]
         learned = models(scene, names, self.device, self.variants)
         rows = []
         for part in self.measure(protocol_of(scene), [*simulators(scene), *learned]):

@@ -17,6 +17,13 @@ SceneName = Annotated[
         "an MJCF file."
     ),
 ]
+ModelName = Annotated[
+    str | None,
+    tyro.conf.arg(
+        help="nerd, hybrid, analytic, the name of a shipped model, or a checkpoint folder; "
+        "by default what is shipped for the robot."
+    ),
+]
 Reference = Annotated[
     Literal["rk4"] | None,
     tyro.conf.arg(

@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import Positional, SceneName
+from torchrl_nerd.cli.options import ModelName, Positional, SceneName
 from torchrl_nerd.dynamics import dynamics_of
 from torchrl_nerd.evaluation.stability.case import as_table, run_cases
 from torchrl_nerd.evaluation.stability.cases import CASES
@@ -28,8 +28,7 @@ class Stability(MeasuringCommand):
     scene: Positional[SceneName]
     cases: tuple[str, ...] = ()
     """Names of cases; all that apply by default."""
-    model: str | None = None
-    """Checkpoint folder; the shipped model by default."""
+    model: ModelName = None
     seed: int = 0
     """Seed of starts and torques."""
     scale: float = 1.0
