@@ -434,7 +434,9 @@ def test_the_shipped_cartpole_is_as_good_as_the_paper(seed):
         assert 0.0 < found[quantity].mean < 2.0 * published
 
 
-@pytest.mark.parametrize("name", slow_but(["analytic"], ["nerd", "cartpole-mlp"]))
+@pytest.mark.parametrize(
+    "name", slow_but(["analytic"], ["analytic", "nerd", "cartpole-mlp"])
+)
 def test_a_model_has_the_same_names_in_all_commands(name, capsys):
     quick = ["--scale", "0.01", "--cases", next(iter(CASES)), "--quiet"]
     for argv in (
