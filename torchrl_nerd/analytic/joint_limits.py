@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import JointAxes, keep_constants
+from torchrl_nerd.geometry.constants import take
 
 NUM_SWEEPS = 3  # of the iteration; it starts from the forces of the solve before
 MAX_DAMPED = 1.0 / 3.0  # of its speed: what a limit may take from a joint per solve
@@ -78,13 +79,18 @@ class JointLimits(nn.Module):
         mass matrix. The forces are solved anew in ``num_solves`` equal parts of the period.
         ``lag``, s: substep of semi-implicit Euler; positions move by the new velocity.
         """
-        step, force = period / max(num_solves, 1), torch.zeros_like(qpos[self.joints])
-        coupling = inverse[self.joints][:, self.joints]
+        step, force = (
+            period / max(num_solves, 1),
+            torch.zeros_like(qpos[: len(self.joints)]),
+        )
+        coupling = take(take(inverse, self.joints, 0), self.joints, 1)
         for _ in range(num_solves):
-            position, velocity = qpos[self.joints], qvel[self.joints]
-            smooth = acceleration[self.joints]
+            position, velocity = (take(x, self.joints, 0) for x in (qpos, qvel))
+            smooth = take(acceleration, self.joints, 0)
             force, side = self._solve(position, velocity, smooth, coupling, force)
-            qacc = acceleration + (inverse[:, self.joints] * (side * force)).sum(1)
+            qacc = acceleration + (take(inverse, self.joints, 1) * (side * force)).sum(
+                1
+            )
             qpos = qpos + step * (qvel + 0.5 * (step + lag) * qacc)
             qvel = qvel + step * qacc
         return qpos, qvel

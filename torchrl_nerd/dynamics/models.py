@@ -94,10 +94,11 @@ class TorchDynamics:
     @unaffected
     def restore(self, history: Any, rows: Tensor) -> None:
         """See `Dynamics.restore`."""
-        if history is not None:
-            self._memory.restore(history, rows.to(self.device))
-        elif self._memory is not None:
-            self._memory.clear(rows.to(self.device))
+        with torch.set_grad_enabled(self.differentiable):
+            if history is not None:
+                self._memory.restore(history, rows.to(self.device))
+            elif self._memory is not None:
+                self._memory.clear(rows.to(self.device))
 
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
@@ -192,10 +193,14 @@ class NeRDDynamics(TorchDynamics):
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""
         count = state[QPOS].shape[0]
-        if rows is None or rows.all() or self._rows != count:
+        memory = self._memory if self._rows == count else None
+        # gradients keep their history, and the past of all envs is forgotten
+        is_left = self.differentiable and rows is not None and bool(rows.all())
+        if rows is None or memory is None or is_left:
             self._memory, self._rows = self.network.empty_memory(count), count
-        elif self._memory is not None and rows.any():
-            self._memory.clear(rows.reshape(count).to(self.device))
+        else:  # asks nothing of the device, and the memory stays where it is
+            with torch.set_grad_enabled(self.differentiable):
+                memory.clear(rows.reshape(count).to(self.device))
 
     def _prepare(self, rows: int) -> None:
         if self._memory is None or self._rows != rows:

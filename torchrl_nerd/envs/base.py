@@ -137,6 +137,8 @@ class SceneEnv(RenderedEnv):
             # in parts on threads a model compiles its own step, the env what is round it
             inner.compile = not kwargs and inner.parts(self.batch_size.numel()) > 1
             self._transition.is_round = inner.compile
+            # analytic steps for one thread are long code; a network's are not
+            self._transition.is_whole = not inner.compile_options
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
         self._transit = Compiled(self._transition.step, **options)
         self._restart = Compiled(self._transition.restart, **options)
@@ -218,7 +220,8 @@ class SceneEnv(RenderedEnv):
             if not self._is_differentiable:
                 given = {key: value.detach() for key, value in given.items()}
         old = self._state()
-        if rows.all():  # nothing of the past is left: no gradients of it either
+        # nothing of the past is left: no gradients of it either
+        if self._is_differentiable and rows.all():
             old = {key: value.detach() for key, value in old.items()}
         streams = self._keys, self._episode, self._offsets
         found = self._restart(old, rows, streams, given)
@@ -238,7 +241,7 @@ class SceneEnv(RenderedEnv):
         if not self._is_differentiable:
             action = action.detach()
         state, moves = self._state(), tensordict.get("_step", None)
-        held = None if moves is None or moves.all() else ~moves.reshape(self.batch_size)
+        held = None if moves is None else ~moves.reshape(self.batch_size)
         past = None if held is None else self.dynamics.history()
         found, age = self._transit(state, action, self._age), self._age + 1
         if held is not None:

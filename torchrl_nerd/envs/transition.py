@@ -41,11 +41,12 @@ class Transition:
     |---|---|
     | ``is_round`` | the dynamics has compiled code of its own, and `step` compiles to what
       is round it |
+    | ``is_whole`` | all control steps of an action are one compiled piece, not one each |
     """
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         self.task, self.dynamics = task, dynamics
-        self.is_round = False
+        self.is_round, self.is_whole = False, True
         is_guarded = isinstance(dynamics, GuardedDynamics)
         self.is_truncating = is_guarded and dynamics.guard == "truncate"
 
@@ -68,7 +69,8 @@ class Transition:
         moved, torque = self._control_step(state, given, terrain)
         trust = moved.get(TRUST)
         for _ in range(self.task.frame_skip - 1):
-            graph_break()  # two steps in one piece take minutes to compile
+            if not self.is_whole:
+                graph_break()  # two in one piece take minutes to compile
             moved, torque = self._control_step(moved, given, terrain)
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])
         fault = find_faults(action, state, moved)  # (num_envs, 1)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import BALL, SLIDE
 from torchrl_nerd.geometry.rotations import (
     matrix_from_quat,
@@ -192,7 +193,8 @@ class _Joint(nn.Module):
             local = torch.stack([qvel[at : at + 3] for at in self.dof_at], 1)
             spin = rotate_by(turned[..., moving], local)
         else:
-            q, v = qpos[self.qpos_at] - self.rest, qvel[self.dof_at]  # (n, N)
+            q = take(qpos, self.qpos_at, 0) - self.rest  # (n, N)
+            v = take(qvel, self.dof_at, 0)
             axis = rotate_by(rotation, self.axis)
             spin = axis[..., moving] * v
             if self.kind == SLIDE:
@@ -233,7 +235,7 @@ def _pick(motion: Motion, places: list[int]) -> Motion:
     """The motions of the bodies at these places, in this order."""
     if places == list(range(motion[0].shape[-2])):
         return motion
-    return tuple(x[..., places, :] for x in motion)  # pyright: ignore
+    return tuple(take(x, places, -2) for x in motion)  # pyright: ignore
 
 
 def _join(motions: list[Motion]) -> Motion:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base, JointAxes, keep_constants
+from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.kinematics import cross
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.geometry.spd import matvec, spd_solve
@@ -57,7 +58,9 @@ class RigidBodyDynamics(nn.Module):
         self, model: mujoco.MjModel, base: Base, axes: JointAxes, actuated: list[int]
     ) -> None:
         super().__init__()
-        self.actuated = actuated
+        where = {dof: at for at, dof in enumerate(actuated)}
+        # of each dof its place among the torques, behind them where there is none
+        self.torque_at = [where.get(dof, len(actuated)) for dof in range(model.nv)]
         has_mass = (model.body_weldid != 0) & (model.body_mass > 0.0)
         found = np.flatnonzero(has_mass).tolist()
         self.bodies = [body for body in found for _ in CORNERS]
@@ -144,10 +147,10 @@ class RigidBodyDynamics(nn.Module):
         push = -self._bias(bodies, spin, slide, rate, gravity)
         push = push - self.damping[:, None] * rate
         if joint_torque is not None:
-            driven = torch.zeros_like(rate)
-            driven[self.actuated] = rows_last(joint_torque, 1)
-            push = push + driven
-        stretch = self.rest[:, None] - position[self.qpos_addresses]
+            torque = rows_last(joint_torque, 1)
+            torque = torch.cat((torque, torch.zeros_like(rate[:1])))
+            push = push + take(torque, self.torque_at, 0)
+        stretch = self.rest[:, None] - take(position, self.qpos_addresses, 0)
         base, joints = push[: self.num_base_dofs], push[self.num_base_dofs :]
         joints = joints + self.stiffness[:, None] * stretch
         return mass_matrix, torch.cat((base, joints))

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.geometry.rotations import quat_matrix
 
@@ -58,7 +59,8 @@ class SiteKinematics:
     def __call__(self, qpos: Tensor) -> EndEffector:
         """Pose and Jacobian at ``qpos (*batch, nq)``, in the dtype of ``qpos``."""
         batch, chain = qpos.shape[:-1], self.chain(qpos.device)
-        joints = qpos.reshape(batch.numel(), qpos.shape[-1])[:, self.qpos_addresses]
+        joints = qpos.reshape(batch.numel(), qpos.shape[-1])
+        joints = take(joints, self.qpos_addresses)
         jacobian, pose = chain.jacobian_tensor(joints.double(), ret_eef_pose=True)
         parts = pose[:, :3, 3], pose[:, :3, :3], jacobian
         return EndEffector(

@@ -14,6 +14,7 @@ from torchrl_nerd.modules.transformer import (
     TransformerConfig,
     initialize,
     make_head,
+    stored,
 )
 from torchrl_nerd.settings import look_up
 
@@ -89,11 +90,16 @@ class HiddenState:
 
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
-        self.value = torch.where(rows[:, None], 0.0, self.value)
+        self.value = stored(self.value, torch.where(rows[:, None], 0.0, self.value))
+
+    def __copy__(self) -> "HiddenState":
+        """Apart from the original, which is written to in place."""
+        return HiddenState(self.value.clone())
 
     def restore(self, past: "HiddenState", rows: Tensor) -> None:
         """See `History.restore`."""
-        self.value = torch.where(rows[:, None], past.value, self.value)
+        value = torch.where(rows[:, None], past.value, self.value)
+        self.value = stored(self.value, value)
 
 
 class GRU(nn.Module):
@@ -118,7 +124,8 @@ class GRU(nn.Module):
     def step(self, token: Tensor, memory: HiddenState) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
         inputs = self.embed(token)[:, None]  # (rows, 1, width)
-        output, memory.value = self.gru(inputs, memory.value)
+        output, value = self.gru(inputs, memory.value)
+        memory.value = stored(memory.value, value)
         return self.head(output[:, 0])
 
 

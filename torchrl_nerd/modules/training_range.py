@@ -10,6 +10,7 @@ outside stays finite and bounded.
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.scenes.scene import Scene
 
@@ -116,7 +117,7 @@ class TrainingRange(nn.Module):
             return qpos, qvel
         within = qpos.clamp(self.qpos_low, self.qpos_high)
         within = torch.where(qpos.abs() < MAX_POSITION, within, qpos)  # faults stay
-        push = (within - qpos)[..., self.joint_of] * self.is_limited  # (*batch, nv)
+        push = take(within - qpos, self.joint_of) * self.is_limited  # (*batch, nv)
         slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
         return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
 

@@ -32,6 +32,14 @@ class TransformerConfig:
         return CausalTransformer(self, num_inputs, num_outputs)
 
 
+def stored(old: Tensor, new: Tensor) -> Tensor:
+    """``new``, in the memory of ``old`` unless gradients are recorded.
+
+    A history that stays where it is can be part of a CUDA graph.
+    """
+    return new if torch.is_grad_enabled() else old.copy_(new)
+
+
 @dataclass
 class KeyValueCache:
     """Keys and values of the last ``band - 1`` tokens of every layer."""
@@ -45,14 +53,18 @@ class KeyValueCache:
 
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
-        self.age = self.age.masked_fill(rows, 0)
-        for past in (*self.keys, *self.values):
-            past[rows] = 0.0  # whatever stood there, a masked NaN would still spread
+        self.age.masked_fill_(rows, 0)
+        self.slot.masked_fill_(rows.all(), 0)  # as in a new one
+        mask = rows[:, None, None, None]
+        # whatever stood there, a masked NaN would still spread
+        for ring in (self.keys, self.values):
+            for layer, past in enumerate(ring):
+                ring[layer] = stored(past, past.masked_fill(mask, 0.0))
 
     def __copy__(self) -> "KeyValueCache":
         """Apart from the original, which is written to in place."""
         keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
-        return KeyValueCache(keys, values, self.age, self.slot)
+        return KeyValueCache(keys, values, self.age.clone(), self.slot.clone())
 
     def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
         """See `History.restore`: its rings turned to where the oldest token lies now."""
@@ -62,8 +74,8 @@ class KeyValueCache:
         for now, then in ((self.keys, past.keys), (self.values, past.values)):
             for layer, ring in enumerate(then):
                 ring = ring.index_select(2, turned)
-                now[layer] = torch.where(mask, ring, now[layer])
-        self.age = torch.where(rows, past.age, self.age)
+                now[layer] = stored(now[layer], torch.where(mask, ring, now[layer]))
+        self.age.copy_(torch.where(rows, past.age, self.age))
 
     def write(self, layer: int, key: Tensor, value: Tensor) -> None:
         """Store one token ``(rows, heads, head width)``; with gradients, out of place."""
@@ -79,9 +91,11 @@ class KeyValueCache:
     def advance(self) -> None:
         """Count one token."""
         size = self.keys[0].shape[2]
-        later = (self.slot + 1) % size  # `write` shifts, where gradients are recorded
-        self.slot = torch.zeros_like(later) if torch.is_grad_enabled() else later
-        self.age = (self.age + 1).clamp_max(size)
+        if torch.is_grad_enabled():  # there `write` shifts
+            self.slot.zero_()
+        else:
+            self.slot.add_(1).remainder_(size)
+        self.age.add_(1).clamp_(max=size)
 
 
 class Attention(nn.Module):
@@ -253,13 +267,21 @@ class TokenWindow:
 
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
-        self.tokens = torch.where(rows[:, None, None], 0.0, self.tokens)
-        self.age = self.age.masked_fill(rows, 0)
+        tokens = torch.where(rows[:, None, None], 0.0, self.tokens)
+        self.tokens = stored(self.tokens, tokens)
+        self.age.masked_fill_(rows, 0)
+
+    def __copy__(self) -> "TokenWindow":
+        """Apart from the original, which is written to in place."""
+        twin = object.__new__(TokenWindow)
+        twin.tokens, twin.age = self.tokens.clone(), self.age.clone()
+        return twin
 
     def restore(self, past: "TokenWindow", rows: Tensor) -> None:
         """See `History.restore`."""
-        self.tokens = torch.where(rows[:, None, None], past.tokens, self.tokens)
-        self.age = torch.where(rows, past.age, self.age)
+        tokens = torch.where(rows[:, None, None], past.tokens, self.tokens)
+        self.tokens = stored(self.tokens, tokens)
+        self.age.copy_(torch.where(rows, past.age, self.age))
 
     def append(self, token: Tensor) -> Tensor:
         """Add a token to every row; returns the index it got, ``(rows,)``."""
@@ -268,8 +290,9 @@ class TokenWindow:
         tokens = torch.where(is_full, self.tokens.roll(-1, 1), self.tokens)
         index = self.age.clamp_max(size - 1)  # (rows,)
         slots = torch.arange(size, device=token.device) == index[:, None]
-        self.tokens = torch.where(slots[..., None], token[:, None], tokens)
-        self.age = (self.age + 1).clamp_max(size)
+        tokens = torch.where(slots[..., None], token[:, None], tokens)
+        self.tokens = stored(self.tokens, tokens)
+        self.age.add_(1).clamp_(max=size)
         return index
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
+from torchrl_nerd.geometry.constants import constant, take
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 
 Row = tuple[float, ...]
@@ -48,7 +49,7 @@ class TorqueController:
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, num_actuated)``."""
-        return action.to(qpos.dtype).clamp(-1.0, 1.0) * qpos.new_tensor(self.gain)
+        return action.to(qpos.dtype).clamp(-1.0, 1.0) * constant(qpos, self.gain)
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,12 @@ class PDController:
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, num_actuated)``."""
-        target = action.to(qpos.dtype).clamp(-1.0, 1.0) * qpos.new_tensor(self.scale)
-        position = qpos[..., self.qpos_addresses]
-        default = position if self.default is None else qpos.new_tensor(self.default)
+        target = action.to(qpos.dtype).clamp(-1.0, 1.0) * constant(qpos, self.scale)
+        position = take(qpos, self.qpos_addresses)
+        default = position if self.default is None else constant(qpos, self.default)
         offset = target + default - position
-        velocity = qvel[..., self.dof_addresses]
-        torque = qpos.new_tensor(self.kp) * offset - qpos.new_tensor(self.kd) * velocity
+        velocity = take(qvel, self.dof_addresses)
+        torque = constant(qpos, self.kp) * offset - constant(qpos, self.kd) * velocity
         if self.limit is None:
             return torque
         return _clip(torque, [-limit for limit in self.limit], self.limit)
@@ -174,22 +175,22 @@ class ActuatorController:
 
     def ctrl(self, action: Tensor) -> Tensor:
         """What MuJoCo's ``data.ctrl`` would be at an action, ``(*batch, A)``."""
-        low, high = action.new_tensor((self.ctrl_low, self.ctrl_high))
+        low, high = constant(action, (self.ctrl_low, self.ctrl_high))
         return torch.lerp(low, high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, D)``, in the dtype of qpos."""
         shape = (self.num_actions, len(self.dof_addresses))
         length, moment = (
-            qpos.new_tensor(x).reshape(shape) for x in (self.length, self.moment)
+            constant(qpos, x).reshape(shape) for x in (self.length, self.moment)
         )
         gain, bias = (  # three of (A,) each
-            qpos.new_tensor(x).reshape(self.num_actions, 3).unbind(-1)
+            constant(qpos, x).reshape(self.num_actions, 3).unbind(-1)
             for x in (self.gain, self.bias)
         )
         ctrl = self.ctrl(action.to(qpos.dtype))
-        stretch = qpos[..., self.qpos_addresses] @ length.mT  # (*batch, A)
-        speed = qvel[..., self.dof_addresses] @ moment.mT
+        stretch = take(qpos, self.qpos_addresses) @ length.mT  # (*batch, A)
+        speed = take(qvel, self.dof_addresses) @ moment.mT
         force = (gain[0] + gain[1] * stretch + gain[2] * speed) * ctrl
         force = force + bias[0] + bias[1] * stretch + bias[2] * speed
         force = _clip(force, self.force_low, self.force_high)
@@ -236,4 +237,4 @@ def _rows(matrix: np.ndarray) -> tuple[Row, ...]:
 
 
 def _clip(x: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
-    return torch.minimum(torch.maximum(x, x.new_tensor(low)), x.new_tensor(high))
+    return torch.minimum(torch.maximum(x, constant(x, low)), constant(x, high))

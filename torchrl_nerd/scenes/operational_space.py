@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.geometry.base import Base, BasePose, JointAxes
+from torchrl_nerd.geometry.constants import constant, take
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.geometry.serial_chain import SiteKinematics, bias_acceleration
@@ -130,10 +131,10 @@ class OperationalSpaceController:
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, num_actuated)``, N m and N, in the dtype of qpos."""
-        offset = action.to(qpos.dtype).clamp(-1.0, 1.0) * qpos.new_tensor(self.scale)
+        offset = action.to(qpos.dtype).clamp(-1.0, 1.0) * constant(qpos, self.scale)
         if self.center is not None:
-            offset = offset + qpos.new_tensor(self.center) - self.site(qpos).position
-        return self.torque(qpos.new_tensor(self.kp) * offset, qpos, qvel)
+            offset = offset + constant(qpos, self.center) - self.site(qpos).position
+        return self.torque(constant(qpos, self.kp) * offset, qpos, qvel)
 
     def torque(self, acceleration: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Torques that accelerate the site, less its damping kd x'.
@@ -150,20 +151,23 @@ class OperationalSpaceController:
         a, q, v = (x.double() for x in given)
         mass_matrix, bias = self._equation_of_motion(q, v)
         found, dofs = self.site(q).jacobian, self.site.dof_addresses
-        drift = bias_acceleration(found, v[..., dofs])[..., :count]  # J' q'
-        jacobian = found.new_zeros(*v.shape[:-1], count, v.shape[-1])
-        jacobian[..., dofs] = found[..., :count, :]
-        free = self.home_kp * (q.new_tensor(self.home) - q) - self.home_kd * v
-        wanted = a - q.new_tensor(self.kd) * _times(jacobian, v)
+        drift = bias_acceleration(found, take(v, dofs))[..., :count]  # J' q'
+        found = found[..., :count, :]
+        found = torch.cat((found, torch.zeros_like(found[..., :1])), -1)
+        where = {dof: at for at, dof in enumerate(dofs)}
+        at = [where.get(dof, len(dofs)) for dof in range(v.shape[-1])]
+        jacobian = take(found, at)
+        free = self.home_kp * (constant(q, self.home) - q) - self.home_kd * v
+        wanted = a - constant(q, self.kd) * _times(jacobian, v)
         wanted = wanted - drift - _times(jacobian, free)
         solve = torch.linalg.solve_ex  # what is not finite stays so, without an error
         pulled = solve(mass_matrix, jacobian.mT)[0]  # M^-1 J^T
         one = torch.eye(count, dtype=q.dtype, device=q.device)
         force = solve(jacobian @ pulled + one / self.max_mass, wanted[..., None])[0]
         qacc = free + (pulled @ force)[..., 0]
-        torque = (_times(mass_matrix, qacc) + bias)[..., self.actuated]
+        torque = take(_times(mass_matrix, qacc) + bias, self.actuated)
         if self.limit is not None:
-            limit = q.new_tensor(self.limit)
+            limit = constant(q, self.limit)
             torque = torch.minimum(torch.maximum(torque, -limit), limit)
         return torque.to(qpos.dtype)
 

@@ -9,9 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
-from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose
+from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose, keep_constants
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.scenes.contact_points import (
@@ -257,7 +257,8 @@ class Scene:
         points, _ = self.point_kinematics.to(qpos.device)(qpos, still)
         ground = self.terrain_distance.to(qpos.device)
         distance, normal = ground(points, terrain, *self.base_pose(qpos))
-        return distance - self._radii.to(qpos), normal
+        radii = self._radii.to(qpos.device).get_buffer("radii")
+        return distance - radii.to(qpos.dtype), normal
 
     def base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
@@ -270,9 +271,10 @@ class Scene:
         return BasePose(self.model, self.base)
 
     @cached_property
-    @torch.inference_mode(False)
-    def _radii(self) -> Tensor:
-        return torch.as_tensor(self.contacts.radii)
+    def _radii(self) -> nn.Module:
+        module = nn.Module()
+        keep_constants(module, radii=self.contacts.radii)  # (P,)
+        return module
 
     @cached_property
     def point_kinematics(self) -> PointKinematics:

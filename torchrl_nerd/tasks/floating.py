@@ -7,6 +7,7 @@ reference code's axes are y up; here z is up, x forward and y to the left (its -
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.rotations import rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.tasks.task import State, Task
@@ -19,7 +20,7 @@ def symmetric(u: Tensor, half: Tensor | float) -> Tensor:
 
 def between(u: Tensor, low: tuple[float, ...], high: tuple[float, ...]) -> Tensor:
     """Numbers in [low, high) from uniform ones in [0, 1), ``(*batch, n)``."""
-    a, b = u.new_tensor(low), u.new_tensor(high)
+    a, b = constant(u, low), constant(u, high)
     return a + (b - a) * u
 
 

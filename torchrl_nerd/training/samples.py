@@ -1,5 +1,7 @@
 """Tokens, targets and their statistics from a data set."""
 
+from typing import cast
+
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
@@ -26,8 +28,14 @@ def raw_tokens(
 def data_stats(
     scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
 ) -> dict[NestedKey, Stats]:
-    """Exact statistics of a scene's features and targets over a data set."""
-    return stats_of(SceneFeatures(scene, config), StateDelta(scene), data)
+    """Exact statistics of a scene's features and targets over a data set.
+
+    Computed where the data are, and given on the CPU.
+    """
+    device = data[QPOS].device
+    tokens, state_delta = SceneFeatures(scene, config), StateDelta(scene)
+    found = stats_of(tokens.to(device), cast(StateDelta, state_delta.to(device)), data)
+    return {k: Stats(x.count, x.mean.cpu(), x.m2.cpu()) for k, x in found.items()}
 
 
 def stats_of(

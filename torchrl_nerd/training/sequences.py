@@ -68,11 +68,15 @@ class Sequences:
         self, rows: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor]:
         """Random trajectories and times: indices ``(rows, 1), (rows, length)``."""
-        device = self.targets.device
         row = torch.randint(len(self.targets), (rows, 1), generator=generator)
         last = self.steps - length + 1
         start = torch.randint(last, (rows, 1), generator=generator)
-        return row.to(device), (start + torch.arange(length)).to(device)
+        row, start = self._sent(row), self._sent(start)
+        return row, start + torch.arange(length, device=start.device)
+
+    def _sent(self, drawn: Tensor) -> Tensor:
+        """Random numbers of the host on the device, which it does not wait for."""
+        return drawn.to(self.targets.device, non_blocking=True)
 
     def one_step(
         self, rows: int, length: int, generator: Generator
@@ -84,7 +88,7 @@ class Sequences:
         if self.symmetry is None:
             return inputs, targets
         count = len(self.symmetry.isometries)
-        choice = torch.randint(count, (rows,), generator=generator).to(targets.device)
+        choice = self._sent(torch.randint(count, (rows,), generator=generator))
         token = self.symmetry.of(TOKEN)(inputs.token, choice)
         return inputs._replace(token=token), self.symmetry.of(TARGET)(targets, choice)
 

@@ -13,6 +13,7 @@ from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.modules.nerd import NeRD
@@ -31,7 +32,7 @@ from torchrl_nerd.training.optimizers import (
 )
 from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.samples import cover, data_stats
-from torchrl_nerd.training.sequences import Sequences
+from torchrl_nerd.training.sequences import Inputs, Sequences
 from torchrl_nerd.training.start import begin_from, fingerprint, make_model
 from torchrl_nerd.training.validation import (
     Errors,
@@ -63,6 +64,7 @@ class Trainer:
         logger: ``tensorboard``, ``wandb``, or ``csv`` for ``log.csv`` alone.
         init_from: a model whose weights and statistics the training continues, see
             `begin_from`. The training range covers its data and these.
+        compile: compile network and loss of one step; by default on CUDA alone.
 
     Raises:
         ValueError: a folder of another run, short trajectories, or a misfit ``init_from``.
@@ -81,6 +83,7 @@ class Trainer:
         quiet: bool = False,
         logger: LoggerName = "tensorboard",
         init_from: NeRD | None = None,
+        compile: bool | None = None,
     ) -> None:
         if data.batch_size[1] < config.longest:
             raise ValueError(
@@ -98,6 +101,9 @@ class Trainer:
         weights = self.model.network.named_parameters()
         self.average = {name: weight.detach().clone() for name, weight in weights}
         self.state = RunState(self.model.network, self.average, self.optimizers)
+        self._loss_of_batch = self._batch_loss
+        if self.device.type == "cuda" if compile is None else compile:
+            self._loss_of_batch = Compiled(self._batch_loss, warmup=0, dynamic=False)
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
         self.errors: Errors = {}  # of the last validation
         if (self.folder / STATE).exists():
@@ -105,6 +111,7 @@ class Trainer:
 
     def _build(self, data: TensorDict, init_from: NeRD | None) -> None:
         """The model, its statistics and its batches."""
+        data = data.to(self.device)  # which makes all of what follows of them
         symmetry = None
         if self.config.use_symmetry:
             symmetry = Symmetry(self.scene, self.config.features)
@@ -113,9 +120,10 @@ class Trainer:
         else:
             model = begin_from(init_from, self.scene, self.config, symmetry)
         self.init_from = None if init_from is None else fingerprint(init_from)
+        self.model = model.to(self.device)
         self.sequences = Sequences(model, data, self.device, symmetry)
-        self.model, self.resting = model.to(self.device), resting(self.sequences.data)
-        samples = self.sequences.features.to(self.device), self.sequences.targets
+        self.resting = resting(self.sequences.data)
+        samples = self.sequences.features, self.sequences.targets
         cover(self.model, self.sequences.data, samples)
         if init_from is not None:
             self.model.training_range.widen(init_from.training_range)
@@ -173,9 +181,18 @@ class Trainer:
         loss.backward()
         parameters = list(self.model.network.parameters())
         norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
-        if norm.isfinite():
-            for optimizer in self.optimizers.values():
-                optimizer.step()
+        if (
+            self.device.type != "cpu"
+        ):  # it is not waited for: such a batch counts nothing
+            for weight in parameters:
+                grad = weight.grad
+                if grad is not None:
+                    grad.copy_(torch.where(norm.isfinite(), grad, 0.0))
+        elif not norm.isfinite():
+            self._update_average()
+            return loss.detach()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
         self._update_average()
         return loss.detach()
 
@@ -193,9 +210,12 @@ class Trainer:
         count, length = config.batch_size, config.sequence_length
         if torch.rand((), generator=generator) < config.single_step_fraction:
             count, length = count * length, 1  # more diverse: neighbours are alike
-        inputs, targets = self.sequences.one_step(count, length, generator)
+        return self._loss_of_batch(*self.sequences.one_step(count, length, generator))
+
+    def _batch_loss(self, inputs: Inputs, targets: Tensor) -> Tensor:
+        """Of network inputs and targets ``(*batch, D)``."""
         changes = inputs.change(self.model.network(inputs.token).float())
-        return one_step_loss(changes, targets, config.loss_eps)
+        return one_step_loss(changes, targets, self.config.loss_eps)
 
     def _rollout_loss(self, generator: Generator) -> Tensor:
         """Loss of the model's own rollouts."""

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.geometry.constants import constant, take
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
@@ -143,31 +144,31 @@ class _JointFeatures:
         return configuration + len(self.velocities) + limits
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
-        angles = qpos[..., self.angles]
-        parts = [angles.sin(), angles.cos(), qpos[..., self.positions]]
+        angles = take(qpos, self.angles)
+        parts = [angles.sin(), angles.cos(), take(qpos, self.positions)]
         for q in self.balls:
             columns = matrix_from_quat(qpos[..., q : q + 4])[..., :2]  # (*batch, 3, 2)
             parts.append(columns.flatten(-2))
-        parts.append(qvel[..., self.velocities])
+        parts.append(take(qvel, self.velocities))
         if self.limited:
-            low, high, margin = qpos.new_tensor(self.limits).unbind(-1)
-            position = qpos[..., self.limited]
+            low, high, margin = constant(qpos, self.limits).unbind(-1)
+            position = take(qpos, self.limited)
             below = (position - low - margin).clamp_max(0.0)
             above = (high - position - margin).clamp_max(0.0)
             parts += [below, above]
             if self.gated:
                 rows, dofs = map(list, zip(*self.gated, strict=True))
                 depth = -torch.minimum(below, above) / (FADE * margin)
-                parts.append(qvel[..., dofs] * depth[..., rows].clamp(0.0, 1.0))
+                parts.append(take(qvel, dofs) * take(depth, rows).clamp(0.0, 1.0))
         if self.predicted:
-            parts.append(self._limit_torque(qpos[..., self.limited], qvel))
+            parts.append(self._limit_torque(take(qpos, self.limited), qvel))
         return parts
 
     def _limit_torque(self, position: Tensor, qvel: Tensor) -> Tensor:
         """Mean predicted torque of the limits' springs and dampers over the step, N m."""
-        low, high, _ = position.new_tensor(self.limits)[..., None].unbind(-2)  # (J, 1)
-        stiffness, damping = position.new_tensor(self.springs)[..., None].unbind(-2)
-        speed = qvel[..., self.predicted, None]  # (*batch, J, 1)
+        low, high, _ = constant(position, self.limits)[..., None].unbind(-2)  # (J, 1)
+        stiffness, damping = constant(position, self.springs)[..., None].unbind(-2)
+        speed = take(qvel, self.predicted)[..., None]  # (*batch, J, 1)
         how = {"dtype": qvel.dtype, "device": qvel.device}
         times = torch.linspace(0.0, self.step_size, NUM_TIMES + 1, **how)
         there = position[..., None] + speed * times

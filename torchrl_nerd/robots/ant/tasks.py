@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.rotations import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.ant.scene import STANDING_POSE, ant
@@ -42,8 +43,8 @@ class Ant(WalkingTask):
         """
         where, turn, linear, angular, pose, rates = u.split([3, 4, 3, 3, 8, 8], -1)
         quat = random_tilt(turn, START_TILT)
-        position = u.new_tensor(START) + symmetric(where, u.new_tensor(START_SPREAD))
-        pose = u.new_tensor(STANDING_POSE) + symmetric(pose, 0.2)
+        position = constant(u, START) + symmetric(where, constant(u, START_SPREAD))
+        pose = constant(u, STANDING_POSE) + symmetric(pose, 0.2)
         velocity = rotate(quat, symmetric(linear, 0.1))
         rates = symmetric(torch.cat((angular, rates), -1), 0.25)  # (*batch, 3 + 8)
         return {

@@ -8,6 +8,7 @@ import mujoco
 import torch
 from torch import Generator, Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty_law import set_penalty_contact, set_penalty_limit
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling
@@ -93,5 +94,5 @@ def random_pd(
     kd = low_kd + (high_kd - low_kd) * draw[:, 1:2] + 0.5 * CONTROL_STEP * kp
     kd = torch.where(is_quiet, KD, kd)
     reach = ACTION_SCALE * scale * (2.0 * draw[:, 2:] - 1.0)
-    offset = draw.new_tensor(STANDING_POSE) + reach - qpos[:, 7:]
+    offset = constant(draw, STANDING_POSE) + reach - qpos[:, 7:]
     return torch.where(scale > 0.0, kp * offset - kd * qvel[:, 6:], 0.0)

@@ -6,6 +6,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant, take
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.anymal.scene import ACTION_SCALE, KD, KP, STANDING_POSE, anymal
 from torchrl_nerd.scenes.controllers import PDController
@@ -51,9 +52,9 @@ class Anymal(WalkingTask):
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Upright at rest, 8 cm up; joints at 0.5 to 1.5 times the pose, +-0.1 rad/s."""
-        pose = u.new_tensor(STANDING_POSE) * (0.5 + u[..., :12])
+        pose = constant(u, STANDING_POSE) * (0.5 + u[..., :12])
         rates = symmetric(u[..., 12:], START_SPEED)
-        base = u.new_tensor((0.0, 0.0, START_HEIGHT, 1.0, 0.0, 0.0, 0.0))
+        base = constant(u, (0.0, 0.0, START_HEIGHT, 1.0, 0.0, 0.0, 0.0))
         batch = u.shape[:-1]
         return {
             QPOS: torch.cat((base.expand(*batch, 7), pose), -1),
@@ -62,7 +63,7 @@ class Anymal(WalkingTask):
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
         """Of the state that the step led to, and of the torque on the way."""
-        offset = next_state[QVEL][..., :2] - next_state[QVEL].new_tensor(self.velocity)
+        offset = next_state[QVEL][..., :2] - constant(next_state[QVEL], self.velocity)
         spin = angular_velocity(next_state)[..., 2]
         torque = self.controller(action, state[QPOS], state[QVEL]).sum(-1)
         tracking = torch.exp(-(offset**2).sum(-1)) + 0.5 * torch.exp(-(spin**2))
@@ -71,7 +72,7 @@ class Anymal(WalkingTask):
     def terminated(self, next_state: State) -> Tensor:
         """Too low, or base or knees at the ground."""
         qpos = next_state[QPOS]
-        clearance = self.scene.clearances(qpos)[..., self._upper_points].amin(-1)
+        clearance = take(self.scene.clearances(qpos), self._upper_points).amin(-1)
         return (qpos[..., 2] < MIN_HEIGHT) | (clearance < MIN_CLEARANCE)
 
     @cached_property

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots.cartpole.scene import cartpole
@@ -27,7 +28,7 @@ class CartpoleSwingup(Task):
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """``qpos (*batch, 2)`` within 1 m and pi rad, ``qvel`` within 1 m/s and 1 rad/s."""
-        start = (2.0 * u - 1.0) * u.new_tensor(START)
+        start = (2.0 * u - 1.0) * constant(u, START)
         return {QPOS: start[..., :2], QVEL: start[..., 2:]}
 
     def observation(self, state: State) -> Tensor:

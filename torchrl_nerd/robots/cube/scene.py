@@ -8,6 +8,7 @@ import mujoco
 import torch
 from torch import Generator, Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.rotations import matrix_from_quat
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.penalty_law import set_penalty_contact
@@ -108,7 +109,7 @@ def slope_beneath(qpos: Tensor, u: Tensor) -> Tensor:
     across, up = angle.sin(), angle.cos()
     normal = torch.stack((across * heading.cos(), across * heading.sin(), up), -1)
     place, quat = qpos[..., :3], qpos[..., 3:]
-    gap = place[..., 2] - cube_reach(quat, quat.new_tensor(UP))
+    gap = place[..., 2] - cube_reach(quat, constant(quat, UP))
     offset = (normal * place).sum(-1) - cube_reach(quat, normal) - gap
     return torch.cat((normal, offset[..., None]), -1)  # (*batch, 3 + 1)
 

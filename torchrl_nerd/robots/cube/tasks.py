@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.rotations import random_tilt, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots.cube.scene import (
@@ -39,10 +40,10 @@ class CubeToss(Task):
         """
         where, turn, linear, angular = u.split([3, 4, 3, 3], -1)
         quat = random_tilt(turn, START.tilt)
-        reach = cube_reach(quat, quat.new_tensor(UP))
-        low = u.new_tensor(START.low).expand_as(where).clone()
+        reach = cube_reach(quat, constant(quat, UP))
+        low = constant(u, START.low).expand_as(where).clone()
         low[..., 2] = low[..., 2].maximum(reach + CLEARANCE)
-        position = low + (u.new_tensor(START.high) - low) * where
+        position = low + (constant(u, START.high) - low) * where
         velocity = between(linear, START.linear_low, START.linear_high)
         spin = between(angular, START.angular_low, START.angular_high)
         return {

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots.double_pendulum.scene import (
@@ -33,7 +34,7 @@ class DoublePendulumPassive(Task):
 
     def __init__(self, ground: int | None = None) -> None:
         numbers = range(len(GROUNDS)) if ground is None else [ground]
-        self.planes = torch.stack([evaluation_ground(number) for number in numbers])
+        self.planes = [evaluation_ground(number).tolist() for number in numbers]
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """Joint 1 within pi; joint 2 such that the second link points up; within 2 rad/s.
@@ -48,7 +49,7 @@ class DoublePendulumPassive(Task):
         return {
             QPOS: torch.stack((first, second), -1),
             QVEL: speed,
-            TERRAIN: self.planes.to(u.device)[number],
+            TERRAIN: constant(u, self.planes)[number],
         }
 
     def observation(self, state: State) -> Tensor:

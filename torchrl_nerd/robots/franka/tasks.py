@@ -5,6 +5,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
@@ -50,7 +51,7 @@ class FrankaReachTorque(Task):
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """At rest near home; the goal is uniform in a box before the robot."""
         return {
-            QPOS: u.new_tensor(HOME) + symmetric(u[..., :7], START_SPREAD),
+            QPOS: constant(u, HOME) + symmetric(u[..., :7], START_SPREAD),
             QVEL: torch.zeros_like(u[..., :7]),
             GOAL: between(u[..., 7:], GOAL_LOW, GOAL_HIGH),
         }
@@ -114,8 +115,8 @@ class FrankaReachOSC(FrankaReachTorque):
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """At rest near home; the goal is the hand of another pose near home."""
         start = super().initial_state(u[..., :10])
-        pose = u.new_tensor(HOME) + symmetric(u[..., 7:], GOAL_SPREAD)
-        low, high = u.new_tensor(LOW), u.new_tensor(HIGH)
+        pose = constant(u, HOME) + symmetric(u[..., 7:], GOAL_SPREAD)
+        low, high = constant(u, LOW), constant(u, HIGH)
         pose = torch.minimum(torch.maximum(pose, low), high)
         return start | {GOAL: self.controller.site(pose).position}
 

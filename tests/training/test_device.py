@@ -1,0 +1,95 @@
+"""A training update waits for no number of its device, and is the same compiled."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from dynamics_helpers import little_data
+from helpers import slow_but
+from meta_helpers import META, meta  # noqa: F401
+from tensordict import TensorDict
+
+from torchrl_nerd.compiled import Compiled
+from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.robots import SCENES, load_scene, source_of
+from torchrl_nerd.training.sequences import Inputs
+from torchrl_nerd.training.trainer import Trainer
+
+CONFIG = TrainConfig(
+    steps=1,
+    rollout_steps=1,
+    batch_size=8,
+    sequence_length=2,
+    rollout_batch_size=4,
+    rollout_length=2,
+    single_step_fraction=0.0,
+)
+NETWORKS = ("transformer-2x64", "mlp-2x32")
+
+
+def make_trainer(name: str, config: TrainConfig, folder: Path, **how) -> Trainer:
+    scene = load_scene(name)
+    data, source = little_data(scene), source_of(scene)
+    return Trainer(
+        scene, data, source, config, folder, horizons=(2,), quiet=True, **how
+    )
+
+
+def move_to_meta(trainer: Trainer) -> None:
+    """Weights, their average, optimizers and data; nothing is computed any more."""
+    trainer.device = META
+    trainer.model.to(META)
+    trainer.optimizers = trainer.make_optimizers()
+    trainer.average = {k: v.to(META) for k, v in trainer.average.items()}
+    sequences = trainer.sequences
+    sequences.targets = sequences.targets.to(META)
+    sequences.inputs = Inputs(*(x.to(META) for x in sequences.inputs))
+    sequences.data = TensorDict(
+        {key: value.to(META) for key, value in sequences.data.items(True, True)},
+        sequences.data.batch_size,
+    )
+    if sequences.symmetry is not None:
+        sequences.symmetry = sequences.symmetry.to(META)
+
+
+@pytest.mark.parametrize("name", slow_but(("cartpole", "ant"), SCENES))
+@pytest.mark.parametrize("network", slow_but(NETWORKS[:1], NETWORKS))
+def test_updates_read_nothing(name, network, meta, tmp_path):  # noqa: F811
+    """One of each kind; symmetry images where a robot has them."""
+    is_symmetric = name == "ant"
+    config = replace(CONFIG, network=network, use_symmetry=is_symmetric)
+    trainer = make_trainer(name, config, tmp_path)
+    move_to_meta(trainer)
+    for trainer.step in (0, 1):
+        loss = trainer.update()
+        assert loss.device == META and loss.shape == ()
+    weights = trainer.model.network.parameters()
+    assert all(weight.device == META for weight in weights)
+
+
+def test_compiled_updates_are_the_eager_ones(tmp_path):
+    losses = []
+    for is_compiled in (False, True):
+        trainer = make_trainer(
+            "cartpole", CONFIG, tmp_path / str(is_compiled), compile=is_compiled
+        )
+        if is_compiled:  # its tracer alone, which takes no minutes
+            assert isinstance(trainer._loss_of_batch, Compiled)
+            trainer._loss_of_batch.options = {"backend": "eager", "fullgraph": True}
+        losses.append([trainer.update() for trainer.step in (0, 1)])
+    torch.testing.assert_close(losses[0], losses[1])
+
+
+def test_a_batch_that_is_not_finite_counts_nothing(tmp_path, monkeypatch):
+    """On the CPU, where it is seen, and where nobody waits to see it."""
+    for device in ("cpu", "cuda"):
+        trainer = make_trainer("cartpole", CONFIG, tmp_path / device)
+        trainer.device = torch.device(device)
+        monkeypatch.setattr(trainer, "_autocast", nullcontext)
+        before = {k: v.clone() for k, v in trainer.model.network.state_dict().items()}
+        monkeypatch.setattr(trainer.sequences, "targets", trainer.sequences.targets / 0)
+        trainer.update()
+        after = trainer.model.network.state_dict()
+        assert all(torch.equal(after[k], v) for k, v in before.items())

@@ -1,0 +1,51 @@
+"""Numbers of a robot on the device of a state: copied there once, not at every step.
+
+A copy from the host makes an accelerator wait, and cannot be part of a CUDA graph.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_kept: dict[tuple, Tensor] = {}
+
+
+def constant(like: Tensor, values: Any) -> Tensor:
+    """``values`` with the dtype and device of ``like``; never write to it.
+
+    Args:
+        like: a tensor.
+        values: numbers, in sequences as deep as the result has dimensions.
+    """
+    return _constant(_frozen(values), like.dtype, like.device)
+
+
+def take(x: Tensor, places: Sequence[int], dim: int = -1) -> Tensor:
+    """The entries of ``x`` at ``places`` along a dimension, in this order; a copy."""
+    if x.device.type == "cpu":  # reads a list as fast, and compiled code knows it
+        return x[(slice(None),) * (dim % x.ndim) + (list(places),)]
+    return x.index_select(dim, _constant(tuple(places), torch.int64, x.device))
+
+
+def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    if torch.compiler.is_compiling() and _bakes(device):
+        return torch.tensor(values, dtype=dtype, device=device)
+    key = values, dtype, str(device)
+    if key not in _kept:
+        with torch.inference_mode(False):
+            _kept[key] = torch.tensor(values, dtype=dtype, device=device)
+    return _kept[key]
+
+
+def _bakes(device: torch.device) -> bool:
+    """Whether compiled code holds constants itself; elsewhere it would copy them there."""
+    return device.type == "cpu"
+
+
+def _frozen(values: Any) -> Any:
+    """``values`` as a key: sequences as tuples."""
+    if isinstance(values, tuple | list):
+        return tuple(map(_frozen, values))
+    return values
