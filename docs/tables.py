@@ -1,7 +1,7 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
-``compiled_env`` or ``kinematics_libraries``.
+``compiled_env``, ``kinematics_libraries`` or ``transfer``.
 """
 
 import json
@@ -152,12 +152,27 @@ def kinematics_table(folder: Path = RESULTS) -> str:
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
+def transfer_table(folder: Path = RESULTS) -> str:
+    """Returns of the policies of franka/reach_osc in each dynamics."""
+    table = [["policy", "dynamics", "kind", "return", "difference (%)"]]
+    records = read("transfer_franka", folder).values()
+    for record in records:
+        results = record["results"]
+        for row in results["returns"]:
+            line = results["policy"].removeprefix("runs/"), row["dynamics"], row["kind"]
+            share = f"{100.0 * row['difference']:.1f}"
+            table.append([*line, f"{row['mean']:.1f}", share])
+    lines = [f"{made_by(record)}" for record in records]
+    return "\n\n".join((rows(table), *lines)) if lines else ""
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
     "stability": stability_tables,
     "compiled_env": env_table,
     "kinematics_libraries": kinematics_table,
+    "transfer": transfer_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}

@@ -368,6 +368,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
         "machine": machine,
     }
     rate = {"name": "a", "batch": 512, "steps_per_s": 12345.6}
+    earned = {"dynamics": "nerd", "kind": "learned", "mean": 9.96, "difference": -0.02}
     chain = {"scene": "ant", "library": "own", "compiled": True}
     chain |= {"positions_ms": 0.123, "with_velocities_ms": 1.5}
     for name, results in (
@@ -375,6 +376,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
         ("bench_robot", {"errors": errors, "rates": [rate], "steps": 100}),
         ("stability_robot", {"drop": {"passes": False}}),
         ("kinematics_libraries", [chain]),
+        ("transfer_franka_x", {"policy": "runs/p", "returns": [earned]}),
     ):
         path = tmp_path / f"{name}.json"
         path.write_text(json.dumps({**record, "results": results}))
@@ -384,6 +386,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "| b | learned | diverges | diverges | diverges |" in shown
     assert "| a | learned | 0.12 | 0.12 | 0.12 | 12,346 |" in shown
     assert "| drop | **fail** |" in shown
+    assert "| p | nerd | learned | 10.0 | -2.0 |" in shown
     assert "| ant | own | compiled | 0.12 | 1.5 |" in shown
     assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
 

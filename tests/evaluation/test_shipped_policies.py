@@ -23,26 +23,31 @@ PAPER = {
     "anymal/sideways": 1360.0,
 }
 """Returns in ground truth, tables 1 and 2 of the paper."""
-OURS = {"franka/reach_osc"}
-"""Tasks with a goal that the paper does not have."""
+OURS = {"franka/reach_osc": 40.0}
+"""Returns in ground truth of tasks that the paper does not have, rounded down."""
 
 
 def test_they_are_of_tasks_that_have_a_goal() -> None:
-    assert shipped_policies().keys() <= PPO_CONFIGS.keys() == PAPER.keys() | OURS
+    assert shipped_policies().keys() <= PPO_CONFIGS.keys() == PAPER.keys() | OURS.keys()
 
 
-LOST = {"cartpole/swingup": 0.01, "ant/run": 0.2, "franka/reach": 0.4}
+LOST = {
+    "cartpole/swingup": 0.01,
+    "ant/run": 0.2,
+    "franka/reach": 0.4,
+    "franka/reach_osc": 0.1,
+}
 """Largest part of MuJoCo's return that the network's own error may cost or add."""
 
 
 @pytest.mark.parametrize("task", shipped_policies())
-def test_it_earns_in_mujoco_what_the_paper_does(task, seed) -> None:
+def test_it_earns_in_mujoco_what_is_told(task, seed) -> None:
     """To within what 32 starts leave open: a few arms and poles begin far from a goal."""
     actor = make_actor(load_policy(shipped_policy(task), make_task(task)))
     kinds = ("nerd", "analytic", "mujoco")
     earned = transfer(task, actor, kinds, episodes=32, seed=seed)
     real = earned["mujoco"]
-    assert real.mean + 2.0 * real.interval > PAPER[task]
+    assert real.mean + 2.0 * real.interval > (PAPER | OURS)[task]
     for kind, lost in (("nerd", LOST[task]), ("analytic", 0.01)):
         found = earned[kind]
         assert abs(found.difference) < lost + 2.0 * found.difference_interval
