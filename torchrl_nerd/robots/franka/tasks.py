@@ -11,9 +11,7 @@ from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
 from torchrl_nerd.robots.franka.scene import (
     GAIN,
-    HIGH,
     HOME,
-    LOW,
     franka,
     franka_gravity,
 )
@@ -116,8 +114,6 @@ class FrankaReachOSC(FrankaReachTorque):
         """At rest near home; the goal is the hand of another pose near home."""
         start = super().initial_state(u[..., :10])
         pose = constant(u, HOME) + symmetric(u[..., 7:], GOAL_SPREAD)
-        low, high = constant(u, LOW), constant(u, HIGH)
-        pose = torch.minimum(torch.maximum(pose, low), high)
         return start | {GOAL: self.controller.site(pose).position}
 
     def observation(self, state: State) -> Tensor:
