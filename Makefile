@@ -19,9 +19,11 @@ DM_CONTROL := $(or $(shell grep '^dm_control==' $(CONSTRAINTS)),dm-control)
 MADE_FROM := $(shell { pwd; cat pyproject.toml $(CONSTRAINTS); } | cksum | cut -d' ' -f1)
 STAMP := $(VENV)/.installed-$(MADE_FROM)
 NERD := $(PY) -m torchrl_nerd.cli
+# A machine that is lent for minutes has torch, and no network to make .venv with.
+GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu bench-check results model-ant model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results model-ant model-ant-mlp model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -70,6 +72,12 @@ test-slow: $(STAMP) ## the tests that take minutes and all products of parameter
 
 test-gpu: $(STAMP) ## the tests that need a CUDA device
 	$(PYTEST) -m gpu $(ARGS)
+
+gpu: ## all that needs a GPU, in order of worth, to results/gpu/; docs/howto/gpu.md
+	PYTHONPATH=.:benchmarks $(GPU_PY) -m gpu $(ARGS)
+
+gpu-wheels: ## download to DIR the wheels that a machine with torch and JAX lacks
+	PYTHONPATH=.:benchmarks $(GPU_PY) -m gpu --wheels $(or $(DIR),$(error name the folder, as in make gpu-wheels DIR=wheels))
 
 bench-check: $(STAMP) ## whether anything got slower, against a baseline of ratios
 	$(PY) benchmarks/bench_check.py $(ARGS)

@@ -82,7 +82,9 @@ def update(
     keys = ("observation", "action", "action_log_prob", "advantage", "value_target")
     steps = advantage(batch).select(*keys).reshape(-1)
     for _ in range(cfg.epochs):
-        for rows in torch.randperm(len(steps)).split(cfg.minibatch):
+        for rows in torch.randperm(len(steps), device=steps.device).split(
+            cfg.minibatch
+        ):
             losses = loss(steps[rows])
             optimizer.zero_grad()
             (losses["loss_objective"] + losses["loss_critic"]).backward()

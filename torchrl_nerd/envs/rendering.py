@@ -18,7 +18,6 @@ from weakref import WeakSet
 
 import mujoco
 import numpy as np
-from mujoco.rendering.classic import gl_context
 
 from torchrl_nerd.dynamics.base import as_numpy, ground_pose
 from torchrl_nerd.keys import GOAL, QPOS, TERRAIN
@@ -159,7 +158,7 @@ class Renderer:
     def _draw(
         self,
         row: State,
-        renderer: mujoco.Renderer,
+        renderer: "mujoco.Renderer",
         camera: mujoco.MjvCamera | int | str,
     ) -> None:
         model, data, scene = self._model, self._data, self.task.scene
@@ -198,7 +197,7 @@ class Renderer:
             camera.distance *= MARGIN
         return camera
 
-    def _make_gl(self, height: int, width: int) -> mujoco.Renderer:
+    def _make_gl(self, height: int, width: int) -> "mujoco.Renderer":
         if _DREW and _DREW[0] != os.getpid():  # drivers hang in it
             raise ValueError(
                 "expected a process started with 'spawn': no image can be drawn in one "
@@ -212,7 +211,11 @@ class Renderer:
         # in a small scene the ground would cast shadows on itself
         self._model.stat.extent = max(self._model.stat.extent, 1.0)
         # MuJoCo made its own choice when it was imported, see above
-        gl_context.GLContext = import_module(f"mujoco.{require_gl()}").GLContext
+        # needs an OpenGL library, which envs that are not drawn do without
+        gl_context = import_module("mujoco.rendering.classic.gl_context")
+        vars(gl_context)["GLContext"] = import_module(
+            f"mujoco.{require_gl()}"
+        ).GLContext
         renderer = mujoco.Renderer(self._model, height, width)
         _DREW[:] = [os.getpid()]
         atexit.unregister(_close_all)  # before MuJoCo gives the display back
@@ -224,7 +227,7 @@ class Renderer:
 
 _ALL: WeakSet[Renderer] = WeakSet()
 _DREW: list[int] = []  # the process that drew
-_OF_PARENT: list[mujoco.Renderer] = []
+_OF_PARENT: "list[mujoco.Renderer]" = []
 """What a forked process got from its parent: it must neither draw with it nor free it."""
 
 

@@ -1,0 +1,139 @@
+"""Stage d: training throughput, resuming, and time to the paper's error."""
+
+import shutil
+import time
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Generator
+
+from gpu.stages import Item, Setup, ceilings, rate
+from torchrl_nerd import load_scene
+from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.data.simulate import is_sound, simulate
+from torchrl_nerd.modules.networks import network_config
+from torchrl_nerd.robots import preset_of, source_of
+from torchrl_nerd.training.trainer import Trainer
+
+BATCH, LENGTH = 4096, 10  # sequences of an update, tokens of a sequence
+
+
+def items(setup: Setup) -> dict[str, Item]:
+    """Throughput first: it says what minutes can train."""
+    found: dict[str, Item] = {"ceilings": lambda: ceilings(setup)}
+    for network in setup.pick(("paper-large", "transformer-4x128"), ("mlp-2x32",)):
+        found[f"throughput {network}"] = lambda n=network: throughput(n, setup)
+    found["resume"] = lambda: resume(setup)
+    for name in setup.pick(("cartpole", "ant"), ("cartpole",)):
+        found[f"time to error {name}"] = lambda n=name: to_error(n, setup)
+    return found
+
+
+def make_data(name: str, setup: Setup) -> TensorDict:
+    """Trajectories of random torques, made on the host; sound ones."""
+    count, steps = setup.pick((4000, 100), (40, 12))
+    generator = Generator().manual_seed(setup.seed)
+    data = simulate(load_scene(name), count, steps, generator)
+    return data[is_sound(data)]
+
+
+def make_trainer(
+    name: str, config: TrainConfig, setup: Setup, folder: str, data: TensorDict
+) -> Trainer:
+    """A run of its own folder, without a progress bar."""
+    scene, horizons = load_scene(name), setup.pick((100, 500), (2,))
+    where = setup.folder / folder
+    given = scene, data, source_of(scene), config, where, setup.device
+    return Trainer(*given, horizons=horizons, quiet=True, logger="csv")
+
+
+def config_of(network: str, setup: Setup, **changes: Any) -> TrainConfig:
+    """Large batches of sequences alone."""
+    batch, length = setup.pick((BATCH, LENGTH), (4, 2))
+    how = {"network": network, "batch_size": batch, "sequence_length": length}
+    how |= {
+        "rollout_length": setup.pick(8, 2),
+        "rollout_batch_size": setup.pick(256, 2),
+    }
+    how |= {"single_step_fraction": 0.0, "seed": setup.seed}
+    return replace(TrainConfig(), **(how | changes))
+
+
+def throughput(network: str, setup: Setup) -> dict[str, Any]:
+    """Updates per second, and the share of the bf16 products that the device reaches.
+
+    Six operations for every weight and token: two forward, four backward.
+    """
+    name = setup.pick("ant", "cartpole")
+    _fresh("throughput", setup)
+    data = make_data(name, setup)
+    config = config_of(network, setup)
+    trainer = make_trainer(name, config, setup, "throughput", data)
+    found = rate(trainer.update, setup, warmup=2)
+    weights = sum(x.numel() for x in trainer.model.network.parameters())
+    tokens = config.batch_size * config.sequence_length
+    flop = 6.0 * weights * tokens * found["per_s"]
+    return {
+        "updates_per_s": found["per_s"],
+        "tokens_per_s": tokens * found["per_s"],
+        "flop_per_s": flop,
+        "share_of_bf16": flop / ceilings(setup)["bf16_flop_per_s"],
+        "weights": weights,
+        "layers": getattr(network_config(network), "layers", 0),
+    }
+
+
+def resume(setup: Setup) -> dict[str, Any]:
+    """Seconds to save a run, and to make it again until its next update."""
+    name, data = "cartpole", make_data("cartpole", setup)
+    _fresh("resume", setup)
+    network = setup.pick("paper-large", "mlp-2x32")
+    config = config_of(network, setup, steps=10, rollout_steps=0)
+    trainer = make_trainer(name, config, setup, "resume", data)
+    for _ in range(2):
+        trainer.update()
+        trainer.step += 1
+    setup.wait()
+    began = time.perf_counter()
+    trainer.save()
+    saved = time.perf_counter() - began
+    began = time.perf_counter()
+    again = make_trainer(name, config, setup, "resume", data)
+    again.update()
+    setup.wait()
+    return {
+        "save_s": saved,
+        "resume_s": time.perf_counter() - began,
+        "resumed_at": again.step,
+    }
+
+
+def to_error(name: str, setup: Setup) -> dict[str, Any]:
+    """Validation errors over time, with the robot's own training preset, cut short."""
+    began, data = time.perf_counter(), make_data(name, setup)
+    _fresh(f"error-{name}", setup)
+    steps = setup.pick(4000, 2)
+    short = {"steps": steps, "rollout_steps": steps // 10, "warmup": setup.pick(200, 1)}
+    if setup.is_tiny:
+        config = config_of("mlp-2x32", setup, **short)
+    else:
+        config = replace(preset_of(name).train, **short)
+    trainer = make_trainer(name, config, setup, f"error-{name}", data)
+    curve, rounds = [], setup.pick(5, 1)
+    for number in range(1, rounds + 1):
+        while trainer.step < number * config.total_steps // rounds:
+            trainer.update()
+            trainer.step += 1
+        found = trainer.validate()
+        setup.wait()
+        now = {"seconds": time.perf_counter() - began, "step": trainer.step}
+        curve.append(now | found)
+    return {"trajectories": len(data), "network": config.network, "curve": curve}
+
+
+def _fresh(folder: str, setup: Setup) -> None:
+    """No earlier run there, and the same random numbers."""
+    shutil.rmtree(setup.folder / folder, ignore_errors=True)
+    torch.manual_seed(setup.seed)
