@@ -440,9 +440,9 @@ def test_the_shipped_cartpole_is_as_good_as_the_paper(seed):
 def test_a_model_has_the_same_names_in_all_commands(name, capsys):
     quick = ["--scale", "0.01", "--cases", next(iter(CASES)), "--quiet"]
     for argv in (
-        ["eval", "cartpole", "--num-trajectories", "2", "--model", name, "--quiet"],
-        ["stability", "cartpole", "--model", name, *quick],
+        ["eval", "cube", "--num-trajectories", "2", "--model", name, "--quiet"],
+        ["stability", "cube", "--model", name, *quick],
     ):
         assert main(argv) == 0
-        kind = from_pretrained(name, load_scene("cartpole")).kind
+        kind = from_pretrained(name, load_scene("cube")).kind
         assert kind in capsys.readouterr().out

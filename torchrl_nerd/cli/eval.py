@@ -125,7 +125,7 @@ class Eval(MeasuringCommand):
         about = self.num_trajectories, max(protocol.horizons), self.seed, self.device
         for case, source, is_driven in cases_of(protocol):
             chosen = evaluation_set(case, source, is_driven, self.ground_truth, *about)
-            errors = measure([chosen], candidates, case, self.quiet)
+            errors = measure([chosen], candidates, f"{self.scene}: {case}", self.quiet)
             for horizon in protocol.horizons:
                 published = protocol.published
                 yield error_rows(chosen.scene, case, horizon, errors, published)
