@@ -33,20 +33,20 @@ def test_there_are_some():
 def test_without_its_network_the_error_rises_by_a_fifth(name, drive):
     """Over all cases of the protocol, and outside the interval of the difference."""
     model = cast(HybridNeRD, from_pretrained(name))
-    found: dict[str, list[torch.Tensor]] = {}
-    protocol = protocol_of(model.scene)
-    for source in protocol.cases.values():
-        steps = max(protocol.horizons)
-        start = initial_states(source, TRAJECTORIES, SEED)
-        actions = action_drive(source, len(start), steps, SEED, drive == "driven")
-        ground_truth = open_loop(MujocoDynamics(model.scene), start, steps, actions)
-        for each in (model, without_network(model)):
-            path = open_loop(NeRDDynamics(each), start, steps, actions)
-            errors = position_errors(model.scene, ground_truth, path)
-            for quantity, error in errors.items():
-                found.setdefault(quantity, []).append(error.mean(1))
-    for quantity, parts in found.items():
-        with_it, without = torch.cat(parts[::2]), torch.cat(parts[1::2])
+    protocol, dynamics = protocol_of(model.scene), MujocoDynamics(model.scene)
+    sources, steps = list(protocol.cases.values()), max(protocol.horizons)
+    start = cast(
+        TensorDict,
+        torch.cat([initial_states(each, TRAJECTORIES, SEED) for each in sources]),
+    )
+    actions = action_drive(sources[0], len(start), steps, SEED, drive == "driven")
+    ground_truth = open_loop(dynamics, start, steps, actions)
+    found: list[dict[str, torch.Tensor]] = []
+    for each in (model, without_network(model)):
+        path = open_loop(NeRDDynamics(each), start, steps, actions)
+        found.append(position_errors(model.scene, ground_truth, path))
+    for quantity in found[0]:
+        with_it, without = (errors[quantity].mean(1) for errors in found)
         assert without.mean() > LEAST_GAIN * with_it.mean(), quantity
         difference = without - with_it
         interval = 1.96 * difference.std() / len(difference) ** 0.5
