@@ -18,6 +18,7 @@ from torchrl_nerd.robots import preset_of, source_of
 from torchrl_nerd.training.trainer import Trainer
 
 BATCH, LENGTH = 4096, 10  # sequences of an update, tokens of a sequence
+LIMIT = 12.0  # s of one-step updates
 
 
 def items(setup: Setup) -> dict[str, Item]:
@@ -111,25 +112,31 @@ def resume(setup: Setup) -> dict[str, Any]:
 
 
 def to_error(name: str, setup: Setup) -> dict[str, Any]:
-    """Validation errors over time, with the robot's own training preset, cut short."""
-    began, data = time.perf_counter(), make_data(name, setup)
-    _fresh(f"error-{name}", setup)
-    steps = setup.pick(4000, 2)
-    short = {"steps": steps, "rollout_steps": steps // 10, "warmup": setup.pick(200, 1)}
-    if setup.is_tiny:
-        config = config_of("mlp-2x32", setup, **short)
-    else:
-        config = replace(preset_of(name).train, **short)
-    trainer = make_trainer(name, config, setup, f"error-{name}", data)
-    curve, rounds = [], setup.pick(5, 1)
+    """Validation errors over time: the robot's training preset, in `LIMIT` seconds.
+
+    As many updates as fit, so that the learning rate falls to zero within them.
+    """
+    data, folder = make_data(name, setup), f"error-{name}"
+    tiny = config_of("mlp-2x32", setup, warmup=1)
+    config = tiny if setup.is_tiny else preset_of(name).train
+    _fresh(folder, setup)
+    found = rate(make_trainer(name, config, setup, folder, data).update, setup)
+    steps = setup.pick(max(100, round(LIMIT * found["per_s"])), 2)
+    rollout_steps = steps // 20  # an update of rollouts takes several times as long
+    warmup = min(config.warmup, max(1, steps // 10))
+    short = {"steps": steps, "rollout_steps": rollout_steps, "warmup": warmup}
+    _fresh(folder, setup)
+    began = time.perf_counter()
+    trainer = make_trainer(name, replace(config, **short), setup, folder, data)
+    curve, rounds, total = [], setup.pick(4, 1), trainer.config.total_steps
     for number in range(1, rounds + 1):
-        while trainer.step < number * config.total_steps // rounds:
+        while trainer.step < number * total // rounds:
             trainer.update()
             trainer.step += 1
-        found = trainer.validate()
+        errors = trainer.validate()
         setup.wait()
         now = {"seconds": time.perf_counter() - began, "step": trainer.step}
-        curve.append(now | found)
+        curve.append(now | errors)
     return {"trajectories": len(data), "network": config.network, "curve": curve}
 
 

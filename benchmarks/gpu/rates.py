@@ -102,6 +102,8 @@ def env_rate(task: str, mode: str, size: int, setup: Setup) -> dict[str, Any]:
 def _steps_per_s(
     step: Callable[[], None], mode: str, size: int, setup: Setup
 ) -> dict[str, Any]:
+    if setup.is_gpu:
+        torch.cuda.reset_peak_memory_stats()
     if "compiled" in mode:
         step()  # eager once, as `Compiled` does
         step()
