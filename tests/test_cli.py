@@ -446,3 +446,28 @@ def test_a_model_has_the_same_names_in_all_commands(name, capsys):
         assert main(argv) == 0
         kind = from_pretrained(name, load_scene("cube")).kind
         assert kind in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "eval cartpole --num-trajectories 4 --json {}",
+        "transfer cartpole/swingup --episodes 4 --json {}",
+        "explain cartpole --json {}",
+        "play cartpole/swingup --steps 2 --json out.json --out {}.gif",
+        "train cartpole --steps 0 --rollout-steps 2 --export {}",
+    ],
+)
+def test_where_results_cannot_go_is_said_before_any_work(
+    line, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    said = refusal(capsys, *line.format("file/results").split())
+    assert "file/results" in said and "Not a directory" in said
+    assert not (tmp_path / "datasets").exists()  # train would draw them first
+
+
+def test_results_do_not_replace_a_folder(tmp_path, capsys):
+    said = refusal(capsys, "explain", "cartpole", "--json", str(tmp_path))
+    assert f"{tmp_path} cannot be written: Is a directory" in said

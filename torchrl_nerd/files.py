@@ -6,6 +6,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable
+from errno import EISDIR
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,21 @@ def read_json(path: Path) -> dict[str, Any]:
         kind = type(content).__name__
         raise ValueError(f"expected a JSON object in {path}, got a {kind}")
     return content
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a file that cannot be written; nothing is made or changed.
+
+    Raises:
+        ValueError: in one sentence, why it cannot be written.
+    """
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
+        there = next(folder for folder in path.absolute().parents if folder.exists())
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def writable_folder(path: Path) -> Path:

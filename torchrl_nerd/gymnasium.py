@@ -26,7 +26,7 @@ from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
 from torchrl_nerd.robots import TASKS, make_task
 from torchrl_nerd.robots.registry import for_each_task
-from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.settings import expect_count
 from torchrl_nerd.tasks import Task
 
 Info = dict[str, Any]
@@ -126,7 +126,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(
                 f"expected a reset_mask of bool, shape ({self.num_envs},), with an env to "
-                f"reset, got {mask.dtype}, shape {mask.shape}, {mask.sum()} envs"
+                f"reset, got {mask.dtype}, shape {mask.shape}, {np.sum(mask != 0)} envs"
             )
         if seed is not None or self._shown is None:
             got = "a seed" if seed is not None else "no reset before"
@@ -181,6 +181,10 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         dynamics: as for `make_env`.
         render_mode: ``"rgb_array"`` or None.
         settings: other arguments of `GymnasiumVectorEnv`, but ``num_envs``.
+
+    Raises:
+        TypeError: ``num_envs``, or an unknown argument.
+        ValueError: see `GymnasiumVectorEnv`.
     """
 
     metadata: Info = {"render_modes": ["rgb_array"]}
@@ -192,8 +196,8 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        settings |= {"render_mode": render_mode, "num_envs": 1}
-        self.vector = GymnasiumVectorEnv(task, dynamics, **settings)
+        settings |= {"render_mode": render_mode}
+        self.vector = GymnasiumVectorEnv(task, dynamics, 1, **settings)
         self.metadata = {
             **self.metadata,
             "render_fps": self.vector.metadata["render_fps"],
@@ -236,7 +240,7 @@ def _shortened(task: str | Task, steps: int | None) -> Task:
     """The task, or a copy of it with that horizon where its own is longer."""
     task = task if isinstance(task, Task) else make_task(task)
     if steps is not None:
-        expect_at_least(1, max_episode_steps=steps)
+        expect_count(1, max_episode_steps=steps)
     if steps is None or steps >= task.horizon:
         return task
     task = copy.copy(task)

@@ -121,6 +121,25 @@ def test_a_copy_moves_like_the_original_and_apart_from_it(
 
 
 @warp_too
+def test_a_history_is_restored_as_often_as_asked(scene, dynamics, generator):
+    make = DynamicsMaker(scene, dynamics, generator)
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    moving, every = make(), torch.ones(ROWS, dtype=torch.bool)
+    state = roll(moving, start, torques, terrain)[:, -1]
+    past, paths = moving.history(), []
+    for _ in range(3):
+        now, path = state, []
+        for torque in torques:
+            now = moving.step(now, torque, terrain)
+            path.append(now)
+        paths.append(torch.stack(path, 1))
+        moving.restore(past, every)
+    tolerance = 1e-6 if dynamics == "streaming" else 0.0  # of another place in the ring
+    for path in paths[1:]:
+        assert_same_motion(path, paths[0], tolerance)
+
+
+@warp_too
 @pytest.mark.parametrize("is_reset", [True, False], ids=["reset", "no reset"])
 def test_another_number_of_rows_starts_anew(scene, dynamics, is_reset, generator):
     make = DynamicsMaker(scene, dynamics, generator)

@@ -53,3 +53,14 @@ def test_a_state_written_from_outside_is_where_a_row_goes_on(scene, generator):
         used.reset(start)
         fresh.reset(start)
         assert torch.equal(moved, expected)
+
+
+def test_a_history_that_was_restored_stays_as_it_was(scene, generator):
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    dynamics = DMControlDynamics(scene)
+    after = roll(dynamics, start, torques, terrain)[:, -1]
+    past = dynamics.history()
+    kept = np.stack([physics.data.qpos for physics in past])
+    dynamics.restore(past, torch.ones(ROWS, dtype=torch.bool))
+    dynamics.step(after, torques[0], terrain)
+    np.testing.assert_array_equal([physics.data.qpos for physics in past], kept)

@@ -95,6 +95,16 @@ def test_a_row_that_breaks_on_the_way_is_sound_until_then(scene, generator):
         assert broken[key][3, 4:].isnan().all()
 
 
+def test_numbers_that_do_not_fit_are_refused(scene, generator):
+    start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
+    torques = torques.transpose(0, 1)
+    some = None if terrain is None else terrain[:1]
+    with pytest.raises(ValueError, match="expected joint_torque of shape"):
+        MujocoDynamics(scene).rollout(start[:1], torques, some)  # not for all rows
+    with pytest.raises(ValueError, match="num_threads, a whole number of at least 1"):
+        MujocoDynamics(scene, num_threads=0)
+
+
 def test_no_rows_at_all_stay_none(scene, generator):
     start, torques, terrain = random_drive(scene, 2, 3, generator)
     start, torque = start[:0], torques.transpose(0, 1)[:0]

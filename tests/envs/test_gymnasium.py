@@ -279,8 +279,13 @@ def test_workers_that_are_spawned_know_the_ids(seed):
         ),
         (
             lambda env: GymnasiumVectorEnv(TASK, "mujoco", max_episode_steps=0),
-            "max_episode_steps of at least 1, got 0",
+            "max_episode_steps, a whole number of at least 1, got 0",
         ),
+        (
+            lambda env: GymnasiumVectorEnv(TASK, "mujoco", max_episode_steps=1.5),
+            "max_episode_steps, a whole number of at least 1, got 1.5",
+        ),
+        (lambda env: env.reset(options={"reset_mask": "all"}), "reset_mask of bool"),
     ],
 )
 def test_what_is_unknown_is_refused(call, words):
@@ -307,3 +312,5 @@ def test_bad_arguments_are_refused_in_one_sentence():
     env.reset()
     with pytest.raises(ValueError, match=r"expected an action of shape \(1, 1\)"):
         env.step(np.zeros(2))
+    with pytest.raises(TypeError, match="num_envs"):
+        gymnasium.make(ID, num_envs=3)  # one env is not three

@@ -243,6 +243,17 @@ def test_threads_draw_the_same(seed):
         np.testing.assert_array_equal(image, expected)
 
 
+def test_threads_share_an_env_that_they_draw(seed):
+    env = make_env("cartpole/swingup", "mujoco", render_size=SIZE, seed=seed)
+    env.reset()
+    expected = env.render()
+    with pytest.raises(ValueError, match="nose"):
+        env.render(camera_id="nose")  # which must leave no context to this thread
+    with ThreadPoolExecutor(4) as pool:
+        for found in [pool.submit(env.render) for _ in range(32)]:
+            np.testing.assert_array_equal(found.result(), expected)
+
+
 def test_what_images_need_is_made_late_and_freed():
     env, other = (
         make_env("cartpole/swingup", "mujoco", render_size=SIZE, seed=0)
@@ -263,8 +274,10 @@ def test_what_images_need_is_made_late_and_freed():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"num_envs": 0}, "num_envs of at least 1, got 0"),
-        ({"height": 0}, "height of at least 1, got 0"),
+        ({"num_envs": 0}, "num_envs, a whole number of at least 1, got 0"),
+        ({"num_envs": 1.5}, "num_envs, a whole number of at least 1, got 1.5"),
+        ({"height": 0}, "height, a whole number of at least 1, got 0"),
+        ({"width": 2.5}, "width, a whole number of at least 1, got 2.5"),
         ({"camera_id": "nose"}, "nose"),
         ({"camera_id": 5}, "5"),
     ],
@@ -274,8 +287,9 @@ def test_bad_input_is_refused(given, words):
     env.reset()
     with pytest.raises(ValueError, match=words):
         env.render(**given)
-    with pytest.raises(ValueError, match="width of at least 1, got 0"):
-        make_env("ant/run", "mujoco", render_size=(4, 0))
+    for size in ((4, 0), (4.0, 4), 2.5, "4", (4,), (4, 4, 3)):
+        with pytest.raises(ValueError, match=r"a whole number of|height and width"):
+            make_env("ant/run", "mujoco", render_size=size)
     with pytest.raises(ValueError, match="expected from_pixels=True"):
         make_env("ant/run", "mujoco", pixels_only=True)
 

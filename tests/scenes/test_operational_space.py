@@ -1,6 +1,6 @@
 """The law of operational-space control against MuJoCo's own accelerations."""
 
-from math import inf
+from math import inf, nan
 
 import mujoco
 import numpy as np
@@ -209,6 +209,13 @@ BAD = {
     "3 actions and center": {"center": (0.0,) * 3},
     "relative_to current or absolute, got 'home'": {"relative_to": "home"},
     "max_mass above 0, got 0": {"max_mass": 0.0},
+    "kp of at least 0.0, got nan": {"kp": (1.0, nan, 1.0)},
+    "kd of at least 0.0, got -1": {"kd": (1.0, -1.0, 1.0)},
+    "limit of at least 0.0, got -2": {"limit": (-2.0,) * 7},
+    "home_kp of at least 0.0, got -1": {"home_kp": -1.0},
+    "home_kd of at least 0.0, got nan": {"home_kd": nan},
+    "finite numbers as scale, home and center": {"scale": (nan,) * 3},
+    "finite numbers as scale, home and center, ": {"home": (inf,) * 7},
 }
 
 

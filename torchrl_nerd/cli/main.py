@@ -62,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.dry_run:
             print("\n".join((*command.plan(), *command.settings())))
             return 0
+        command.check_record()
         command.keep(command.run())
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail((str(error) or repr(error)).splitlines()[0])

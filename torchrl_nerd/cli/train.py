@@ -121,7 +121,8 @@ class Train(DeviceCommand):
         scene = scene_of(self.scene, self.reference)
         preset, (out, folders) = preset_of(self.scene), self.folders
         initial = self.initial(scene)
-        writable_folder(out)
+        for folder in filter(None, (out, self.export)):
+            writable_folder(folder)
         if _is_missing(folders):
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads:

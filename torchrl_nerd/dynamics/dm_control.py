@@ -67,7 +67,10 @@ class DMControlDynamics:
     def restore(self, history: list["Physics"], rows: Tensor) -> None:
         """See `Dynamics.restore`."""
         for row in rows.nonzero()[:, 0].tolist():
-            self._rows[row] = history[row] if history else make_physics(self.scene)
+            if history:  # which may be restored again
+                self._rows[row] = history[row].copy(share_model=True)
+            else:
+                self._rows[row] = make_physics(self.scene)
 
     @uncompiled
     def step(

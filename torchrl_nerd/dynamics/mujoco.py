@@ -17,6 +17,7 @@ from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import silence_mujoco
+from torchrl_nerd.settings import expect_count
 
 
 def torque_model(scene: Scene) -> mujoco.MjModel:
@@ -63,13 +64,17 @@ class MujocoDynamics:
         scene: robot, ground and substeps.
         num_threads: that step; by default as many as the environment variable
             ``NERD_THREADS`` says, or all processors that the process may use.
+
+    Raises:
+        ValueError: a number of threads below 1.
     """
 
     kind = "ground truth"
 
     def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
         self.scene = scene
-        self.num_threads = num_threads or default_threads()
+        self.num_threads = default_threads() if num_threads is None else num_threads
+        expect_count(1, num_threads=self.num_threads)
         self._start(np.zeros((0, scene.model.nv)))
 
     def _start(self, warmstart: np.ndarray) -> None:
@@ -114,7 +119,6 @@ class MujocoDynamics:
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
-        check_step(self.scene, state, joint_torque, terrain)
         states = self.rollout(state, joint_torque[:, None], terrain)
         last = TensorDict(
             {key: x[:, 0] for key, x in states.items()}, len(joint_torque)
@@ -139,8 +143,13 @@ class MujocoDynamics:
         Returns:
             ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo
             gave up on.
+
+        Raises:
+            ValueError: a shape that is not the scene's, or a ground that is not finite.
         """
         rows, length = joint_torque.shape[:2]
+        if length:
+            check_step(self.scene, state, joint_torque[:, 0], terrain)
         if len(self._warmstart) != rows:
             self.reset(state)
         qpos = np.empty((rows, length, self._model.nq))

@@ -12,15 +12,18 @@ from torchrl.envs import EnvBase
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.keys import PIXELS
-from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.settings import expect_count
 
 Env = TypeVar("Env", bound="RenderedEnv")
 
 
 def image_size(given: int | tuple[int, int]) -> tuple[int, int]:
-    """Height and width, from both or from one number; ValueError where one is below 1."""
-    height, width = (given, given) if isinstance(given, int) else given
-    expect_at_least(1, height=height, width=width)
+    """Height and width, from both or from one number; ValueError for anything else."""
+    both = given if isinstance(given, tuple | list) else (given, given)
+    if len(both) != 2:
+        raise ValueError(f"expected height and width, or one number, got {given}")
+    height, width = both
+    expect_count(1, height=height, width=width)
     return height, width
 
 
@@ -72,7 +75,7 @@ class RenderedEnv(EnvBase):
             (2, 64, 96, 3)
         """
         if num_envs is not None:
-            expect_at_least(1, num_envs=num_envs)
+            expect_count(1, num_envs=num_envs)
         state = {key: value[:num_envs] for key, value in self._state().items()}
         height = self.render_size[0] if height is None else height
         width = self.render_size[1] if width is None else width

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from functools import cache, cached_property
 from importlib import import_module
+from threading import RLock
 from typing import Any
 from weakref import WeakSet
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from torchrl_nerd.dynamics.base import as_numpy, ground_pose
 from torchrl_nerd.keys import GOAL, QPOS, TERRAIN
-from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.settings import expect_count
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.tasks.task import State
 
@@ -80,7 +81,7 @@ class Renderer:
     """Images of a task's robot on its terrain, with the goals of its state.
 
     What OpenGL needs is made at the first image and freed by `close`; a copy, or one in
-    another process, makes its own.
+    another process, makes its own. Threads may share a renderer: they take turns.
 
     The camera is the model's first one that stands in the world or tracks the robot.
     Without such a camera it is MuJoCo's default free camera, whose direction and distance
@@ -94,6 +95,7 @@ class Renderer:
     def __init__(self, task: Task) -> None:
         self.task = task
         self._gl: dict[tuple[int, int], mujoco.Renderer] = {}  # by height and width
+        self._lock = RLock()  # a context is current in one thread at a time
         _ALL.add(self)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -113,12 +115,13 @@ class Renderer:
 
     def close(self) -> None:
         """Free the OpenGL contexts; the next image makes new ones."""
-        while self._gl:
-            _, renderer = self._gl.popitem()
-            if renderer._gl_context:  # or nothing of it would be freed
-                renderer._gl_context.make_current()
-            renderer.close()
-            _release()
+        with self._lock:
+            while self._gl:
+                _, renderer = self._gl.popitem()
+                if renderer._gl_context:  # or nothing of it would be freed
+                    renderer._gl_context.make_current()
+                renderer.close()
+                _release()
 
     def __del__(self) -> None:
         self.close()
@@ -142,7 +145,16 @@ class Renderer:
         Raises:
             ValueError: no such camera, or no OpenGL library works on this machine.
         """
-        expect_at_least(1, height=height, width=width)
+        expect_count(1, height=height, width=width)
+        with self._lock:
+            try:
+                return self._images(state, height, width, camera_id)
+            finally:
+                _release()
+
+    def _images(
+        self, state: State, height: int, width: int, camera_id: int | str | None
+    ) -> np.ndarray:
         camera = self._camera(camera_id)
         if (height, width) not in self._gl:
             self._gl[height, width] = self._make_gl(height, width)
@@ -152,7 +164,6 @@ class Renderer:
             row = {key: value[i : i + 1] for key, value in state.items()}
             self._draw(row, renderer, camera)
             renderer.render(out=images[i])
-        _release()
         return images
 
     def _draw(
@@ -246,7 +257,7 @@ def _close_all() -> None:
 def _disown() -> None:
     for renderer in _ALL:
         _OF_PARENT.extend(renderer._gl.values())
-        renderer._gl = {}
+        renderer._gl, renderer._lock = {}, RLock()
 
 
 if hasattr(os, "register_at_fork"):

@@ -15,7 +15,7 @@ from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
 from torchrl_nerd.evaluation.policy_transfer import model_title
-from torchrl_nerd.files import write_atomically
+from torchrl_nerd.files import check_writable, write_atomically
 from torchrl_nerd.keys import ACTION
 
 FixedActions = Literal["random", "zero"]
@@ -118,7 +118,7 @@ def check_video(path: Path) -> None:
     """Check before any work that such a file can be written here.
 
     Raises:
-        ValueError: another suffix than .gif or .mp4.
+        ValueError: another suffix than .gif or .mp4, or a file that cannot be written.
         ModuleNotFoundError: imageio or its ffmpeg is not installed.
     """
     if path.suffix not in FORMATS:
@@ -127,6 +127,7 @@ def check_video(path: Path) -> None:
         raise ModuleNotFoundError(
             "videos need imageio and imageio-ffmpeg: pip install 'torchrl-nerd[examples]'"
         )
+    check_writable(path)
 
 
 def write_video(

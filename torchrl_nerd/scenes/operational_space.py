@@ -17,6 +17,7 @@ from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.geometry.serial_chain import SiteKinematics, bias_acceleration
 from torchrl_nerd.scenes.controllers import Row, driven_dofs
+from torchrl_nerd.settings import expect_at_least
 
 AXES = 3, 6  # position alone, or position and orientation
 
@@ -121,6 +122,15 @@ class OperationalSpaceController:
                 raise ValueError(
                     f"expected {length} numbers as {name}, got {len(value)}"
                 )
+        for name in ("kp", "kd", "limit", "home_kp", "home_kd"):
+            value = getattr(self, name)
+            if value is not None:
+                expect_at_least(0.0, **{name: float(np.min(value))})  # NaN is not
+        if not np.isfinite((*self.scale, *self.home, *(self.center or ()))).all():
+            raise ValueError(
+                "expected finite numbers as scale, home and center, got "
+                f"{self.scale}, {self.home}, {self.center}"
+            )
         if not self.max_mass > 0.0:
             raise ValueError(f"expected max_mass above 0, got {self.max_mass}")
 
