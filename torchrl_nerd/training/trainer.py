@@ -181,18 +181,13 @@ class Trainer:
         loss.backward()
         parameters = list(self.model.network.parameters())
         norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
-        if (
-            self.device.type != "cpu"
-        ):  # it is not waited for: such a batch counts nothing
-            for weight in parameters:
-                grad = weight.grad
-                if grad is not None:
-                    grad.copy_(torch.where(norm.isfinite(), grad, 0.0))
-        elif not norm.isfinite():
-            self._update_average()
-            return loss.detach()
-        for optimizer in self.optimizers.values():
-            optimizer.step()
+        is_host = self.device.type == "cpu"
+        if not is_host:  # nobody waits to see it: such a batch has a gradient of zero
+            for grad in (x.grad for x in parameters if x.grad is not None):
+                grad.copy_(torch.where(norm.isfinite(), grad, 0.0))
+        if not is_host or norm.isfinite():
+            for optimizer in self.optimizers.values():
+                optimizer.step()
         self._update_average()
         return loss.detach()
 
