@@ -117,6 +117,13 @@ def test_what_is_no_robot_is_refused_in_a_sentence(error, message, changes):
     assert before == TABLES
 
 
+def test_a_scene_with_a_dash_in_its_name_has_tasks_and_models(tmp_path):
+    name, models = "my-cart", {"my-cart": tmp_path, "my-cart-mlp": tmp_path}
+    scene = replace(CART, name=name)
+    register(Robot({name: lambda: scene}, {f"{name}/stay": Stay}, models=models))
+    assert load_scene(name) is scene and model_folder("my-cart-mlp") == tmp_path
+
+
 def test_what_builds_something_else_is_refused_when_it_is_asked_for():
     scenes = {"cart": lambda: CART, "pole": lambda: CART, "empty": dict}
     register(Robot(scenes=scenes, tasks={"cart/no": dict}))

@@ -118,14 +118,21 @@ def _check_names(robot: Robot) -> None:
     if bad or not scenes:
         found = repr(bad[0]) if bad else "none"
         raise ValueError(f"expected names of scenes without / or .xml, got {found}")
+
+    def is_of(name: str, mark: str) -> bool:  # a scene's name may hold a dash
+        return any(name.startswith(scene + mark) for scene in scenes)
+
     of_scenes = {
-        "tasks": ("SCENE/TASK", lambda name: name.partition("/")[0]),
-        "presets": ("SCENE", lambda name: name),
-        "models": ("SCENE or SCENE-KIND", lambda name: name.partition("-")[0]),
+        "tasks": ("SCENE/TASK", lambda name: is_of(name, "/")),
+        "presets": ("SCENE", lambda name: name in scenes),
+        "models": (
+            "SCENE or SCENE-KIND",
+            lambda name: name in scenes or is_of(name, "-"),
+        ),
     }
-    for field, (form, scene_in) in of_scenes.items():
+    for field, (form, fits) in of_scenes.items():
         for name in getattr(robot, field):
-            if scene_in(name) not in scenes or name.endswith("/"):
+            if not fits(name) or name.endswith("/"):
                 raise ValueError(
                     f"expected {form} of its scenes ({', '.join(scenes)}) as {field}, got "
                     f"'{name}'"
