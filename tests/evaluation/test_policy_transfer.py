@@ -166,3 +166,11 @@ def test_broken_policies_are_named(damage: str, policy: Policy, tmp_path) -> Non
     task = make_task("double_pendulum/passive") if damage == "task" else None
     with pytest.raises(ValueError, match=str(tmp_path)):
         load_policy(tmp_path, task)
+
+
+def test_an_unknown_dynamics_is_refused_before_any_episode():
+    def actor(tensordict):
+        raise AssertionError("an episode began")
+
+    with pytest.raises(ValueError, match="unknown dynamics 'newton'"):
+        transfer("cartpole/swingup", actor, ("mujoco", "newton"), episodes=2)

@@ -144,9 +144,12 @@ def transfer(
     """
     returns, about = {}, {}
     names = dict.fromkeys((*map(str, dynamics), GROUND_TRUTH))
-    for name in tqdm(names, "dynamics", disable=quiet):
-        count = min(episodes, slow_episodes) if name == "dm_control" else episodes
-        env = make_env(task, dynamics=name, num_envs=count, seed=seed, device=device)
+    counts = {"dm_control": min(episodes, slow_episodes)}
+    envs = {  # all at first: an unknown name is refused before any episode
+        name: make_env(task, name, counts.get(name, episodes), seed, device)
+        for name in names
+    }
+    for name, env in tqdm(envs.items(), "dynamics", disable=quiet):
         returns[name] = policy_returns(env, actor)
         about[name] = env.dynamics.kind, env.model_name or name
     return {
