@@ -146,6 +146,7 @@ def main(cfg: Run, collect: Callable = collect) -> None:
     write_json(cfg.out / "learning_curve.json", {"curve": curve})
     where = cfg.task, make_actor(policy), cfg.dynamics
     report_transfer(*where, cfg.episodes, cfg.seed + 2, cfg.out)
+    print(f"Policy: {cfg.out}. Video: nerd play {cfg.task} --policy {cfg.out}")
 
 
 if __name__ == "__main__":

@@ -97,6 +97,7 @@ def check_supported(scene: Scene) -> None:
     found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:
         raise ValueError(
-            "expected a robot moved by actuators, gravity, springs, damping, limits and "
-            f"contact with the ground alone, got scene '{scene.name}' with {found}"
+            "expected, for an analytic step, a robot moved by actuators, gravity, springs, "
+            f"damping, limits and contact with the ground alone, got scene '{scene.name}' "
+            f"with {found}"
         )

@@ -28,9 +28,9 @@ from torchrl_nerd.tasks import Task
 
 GROUND_TRUTH = "mujoco"
 TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
-PAPER_NOTE = (
-    "The paper's returns are of another simulator (Warp) as ground truth: compare with "
-    "them only the return difference."
+NOTE = (
+    "Return difference: to MuJoCo, over the initial states that both ran. "
+    "Behind ±: half of the 95% interval."
 )
 
 
@@ -173,7 +173,7 @@ def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
         difference = f"{s.difference:+.3%} ± {s.difference_interval:.3%}"
         about = [name, s.kind, s.model, str(s.episodes)]
         body.append([*about, mean, f"{s.std:.1f}", difference])
-    return f"{text_table(head, body)}\n{PAPER_NOTE}"
+    return f"{text_table(head, body)}\n{NOTE}"
 
 
 def report_transfer(
