@@ -62,7 +62,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str | Task,
+        task: str | Path | Task,
         dynamics: str | Path = "nerd",
         num_envs: int = 1,
         seed: int | None = None,
@@ -191,7 +191,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str | Task,
+        task: str | Path | Task,
         dynamics: str | Path = "nerd",
         render_mode: str | None = None,
         **settings: Any,
@@ -236,7 +236,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.vector.close()
 
 
-def _shortened(task: str | Task, steps: int | None) -> Task:
+def _shortened(task: str | Path | Task, steps: int | None) -> Task:
     """The task, or a copy of it with that horizon where its own is longer."""
     task = task if isinstance(task, Task) else make_task(task)
     if steps is not None:

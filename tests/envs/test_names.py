@@ -10,6 +10,9 @@ from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.robots import TASKS, make_task
 
 TASK = "ant/run"
+HANGING = """<mujoco><worldbody><body><joint axis="0 1 0" range="-90 90" limited="true"/>
+<geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05" contype="0" conaffinity="0"/>
+</body></worldbody></mujoco>"""
 
 
 def refusal(make) -> str:
@@ -144,3 +147,10 @@ def test_a_task_says_one_thing_of_each_env(what):
     env = make_env(task, "analytic", num_envs=3)
     said = refusal(lambda: env.rollout(1))
     assert said == f"expected {what} of shape (3,) from Mine, got (3, 1)"
+
+
+def test_a_robot_is_named_by_a_path_as_by_its_text(tmp_path):
+    path = tmp_path / "rod.xml"
+    path.write_text(HANGING)
+    for name in (path, str(path)):
+        assert load_scene(name).model.nq == make_env(name, "mujoco").scene.model.nq == 1

@@ -34,7 +34,7 @@ class DmEnvironment(dm_env.Environment):
 
     def __init__(
         self,
-        task: str | Task,
+        task: str | Path | Task,
         dynamics: str | Path = "nerd",
         seed: int | None = None,
         device: torch.device | str = "cpu",

@@ -42,7 +42,7 @@ class GroundTruthEnv(SceneEnv):
 
     def __init__(
         self,
-        task: str | Task,
+        task: str | Path | Task,
         engine: str = "mujoco",
         num_envs: int = 1,
         seed: int | None = None,
@@ -85,7 +85,7 @@ class NeRDEnv(SceneEnv):
 
     def __init__(
         self,
-        task: str | Task,
+        task: str | Path | Task,
         model: Model | str | Path = "nerd",
         num_envs: int = 1,
         seed: int | None = None,
@@ -113,7 +113,7 @@ class NeRDEnv(SceneEnv):
 
 
 def make_env(
-    task: str | Task,
+    task: str | Path | Task,
     dynamics: str | Path = "nerd",
     num_envs: int = 1,
     seed: int | None = None,

@@ -6,6 +6,7 @@ Robots of users are registered by `register`.
 from collections.abc import Collection
 from difflib import get_close_matches
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 
 from torchrl_nerd.configs import DataConfig, TrainConfig
@@ -48,7 +49,7 @@ THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
 )
 
 
-def load_scene(name: str) -> Scene:
+def load_scene(name: str | Path) -> Scene:
     """The scene of that name; the same object at every call.
 
     Args:
@@ -59,6 +60,7 @@ def load_scene(name: str) -> Scene:
         ValueError: no such scene, one registered as something else, or a robot with
             something not supported (named).
     """
+    name = str(name) if isinstance(name, Path) else name
     if isinstance(name, str) and name in SCENES:
         scene = SCENES[name]()
         if not isinstance(scene, Scene) or scene.name != name:
@@ -74,7 +76,7 @@ def load_scene(name: str) -> Scene:
     )
 
 
-def make_task(name: str) -> Task:
+def make_task(name: str | Path) -> Task:
     """The task of that id: a registered one or ``dm_control/DOMAIN-TASK``.
 
     An MJCF file and ``gymnasium/ID`` name a robot alone, which becomes a `SceneTask`.
@@ -83,6 +85,7 @@ def make_task(name: str) -> Task:
         ValueError: no such task, one registered as something else, or a robot with
             something not supported (named).
     """
+    name = str(name) if isinstance(name, Path) else name
     if isinstance(name, str) and name in TASKS:
         task = TASKS[name]()
         if not isinstance(task, Task):
