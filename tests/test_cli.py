@@ -104,6 +104,10 @@ def test_help_explains_every_flag(command, capsys):
         assert len(told) >= 2, words
 
 
+def test_a_misspelt_command_is_told_the_nearest(capsys):
+    assert "did you mean 'train'?" in refusal(capsys, "trian", "ant")
+
+
 def test_a_hybrid_is_trained_where_the_preset_has_one(capsys):
     for name, preset in PRESETS.items():
         argv = ["train", name, "--kind", "hybrid", "--dry-run"]

@@ -1,6 +1,12 @@
 """Neural Robot Dynamics as composable TorchRL parts."""
 
+import os
+
 __version__ = "0.1.0"
+
+# GNU's OpenMP reads it when torch is first imported. Its threads else wait in a loop for
+# long: beside other work a training took up to ten times as long (docs/howto/machine.md).
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.envs import GroundTruthEnv, NeRDEnv, make_env

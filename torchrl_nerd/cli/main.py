@@ -4,6 +4,7 @@ import io
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
+from difflib import get_close_matches
 from itertools import pairwise
 from typing import Any
 
@@ -55,7 +56,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"  {name:<10}{(command.__doc__ or '').splitlines()[0]}")
         return 0
     if argv[0] not in COMMANDS:
-        return _fail(f"unknown command '{argv[0]}', expected {', '.join(COMMANDS)}")
+        near = get_close_matches(argv[0], COMMANDS, 1)
+        meant = f" (did you mean '{near[0]}'?)" if near else ""
+        known = ", ".join(COMMANDS)
+        return _fail(f"unknown command '{argv[0]}'{meant}, expected {known}")
     kind = COMMANDS[argv[0]]
     try:
         command = _parse(kind, argv)
