@@ -1,8 +1,7 @@
 """Learn a task in learned dynamics, then measure the policy in MuJoCo.
 
-    python examples/ppo.py                       # swing up a cart-pole in NeRD
-    python examples/ppo.py --dynamics mujoco     # the same in MuJoCo: nothing else changes
-    python examples/ppo.py --task ant/run        # any task; its settings: tasks/ppo.py
+    python examples/ppo.py                     # swing up a cart-pole in learned dynamics
+    python examples/ppo.py --dynamics mujoco   # the same in MuJoCo; --task for another task
 
 MuJoCo only measures. Policy, learning curve and returns are written to `--out`.
 """
@@ -82,9 +81,8 @@ def update(
     keys = ("observation", "action", "action_log_prob", "advantage", "value_target")
     steps = advantage(batch).select(*keys).reshape(-1)
     for _ in range(cfg.epochs):
-        for rows in torch.randperm(len(steps), device=steps.device).split(
-            cfg.minibatch
-        ):
+        order = torch.randperm(len(steps), device=steps.device)
+        for rows in order.split(cfg.minibatch):
             losses = loss(steps[rows])
             optimizer.zero_grad()
             (losses["loss_objective"] + losses["loss_critic"]).backward()
@@ -94,8 +92,7 @@ def update(
 
 def num_frames(cfg: Run) -> tuple[int, int]:
     """Actions in a batch, and in all batches."""
-    frames = cfg.num_envs * cfg.horizon
-    return frames, cfg.total_frames // frames * frames
+    return (n := cfg.num_envs * cfg.horizon), cfg.total_frames // n * n
 
 
 def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:
@@ -116,7 +113,7 @@ def train(
 ) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that learned in ``cfg.dynamics`` alone, its returns there and in MuJoCo."""
     task = task or cfg.task
-    env = make_env(task, cfg.dynamics, cfg.num_envs, seed=cfg.seed, compile=cfg.compile)
+    env = make_env(task, cfg.dynamics, cfg.num_envs, cfg.seed, compile=cfg.compile)
     env = stack_frames(env, cfg.frame_stack)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)
@@ -144,8 +141,8 @@ def main(cfg: Run, collect: Callable = collect) -> None:
     policy, curve = train(cfg, collect=collect)
     save_policy(policy, cfg.out, asdict(cfg))
     write_json(cfg.out / "learning_curve.json", {"curve": curve})
-    where = cfg.task, make_actor(policy), cfg.dynamics
-    report_transfer(*where, cfg.episodes, cfg.seed + 2, cfg.out)
+    how = cfg.dynamics, cfg.episodes, cfg.seed + 2, cfg.out
+    report_transfer(cfg.task, make_actor(policy), *how)
     print(f"Policy: {cfg.out}. Video: nerd play {cfg.task} --policy {cfg.out}")
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers import EXCERPT
+from tensordict import TensorDict
 
 from torchrl_nerd.cli import COMMANDS, main
 from torchrl_nerd.cli.command import DeviceCommand
@@ -33,7 +34,7 @@ class SentAwayError(Exception):
 def one_gpu(monkeypatch):
     """As with one CUDA device, up to the first thing that is sent there."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    for kind in (torch.Tensor, torch.nn.Module):
+    for kind in (torch.Tensor, torch.nn.Module, TensorDict):
 
         def to(self, *args, real=kind.to, **kwargs):
             if any(str(x).startswith("cuda") for x in (*args, *kwargs.values())):

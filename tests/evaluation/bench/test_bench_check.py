@@ -79,9 +79,13 @@ def small(tmp_path) -> Options:
     )
 
 
-def test_a_small_benchmark_writes_its_baseline(small):
+def test_without_a_baseline_it_says_so_before_it_measures(small):
     with pytest.raises(ValueError, match="found no file"):
         main(small)
+
+
+@pytest.mark.slow
+def test_a_small_benchmark_writes_its_baseline(small):
     small.write = True
     assert main(small) == []
     written = read_json(small.baseline)
