@@ -5,7 +5,7 @@ import os
 __version__ = "0.1.0"
 
 # GNU's OpenMP reads it when torch is first imported. Its threads else wait in a loop for
-# long: beside other work a training took up to ten times as long (docs/howto/machine.md).
+# long: on a loaded machine training takes a multiple of the time (docs/howto/machine.md).
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 from torchrl_nerd.checkpoint import from_pretrained
