@@ -103,7 +103,8 @@ def test_an_env_of_ones_own_says_what_it_is(generator):
 @pytest.mark.parametrize("dynamics", ["analytic", "mujoco"])
 def test_what_is_no_task_is_refused(task, dynamics):
     said = refusal(lambda: make_env(task, dynamics))
-    assert f"unknown task {task!r}, expected one of" in said
+    shown = str(task) if isinstance(task, Path) else task
+    assert f"unknown task {shown!r}, expected one of" in said
 
 
 @pytest.mark.parametrize("name", TASKS)
