@@ -2,7 +2,7 @@
 
 import pytest
 from tools.check_words import hits
-from tools.size import count_comments, measure
+from tools.size import LONGEST, ROOT, count_comments, measure
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,8 @@ def test_lines_and_comments_are_counted(tmp_path):
     (tmp_path / "a.py").write_text(text)
     assert count_comments(text) == 2
     assert measure(tmp_path) == ({"a.py": 4}, 2)
+
+
+def test_no_file_of_the_package_is_too_long():
+    lines, _ = measure(ROOT / "torchrl_nerd")
+    assert {path: count for path, count in lines.items() if count > LONGEST} == {}

@@ -14,7 +14,7 @@ from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD, Network
-from torchrl_nerd.modules.transformer import WindowNetwork
+from torchrl_nerd.modules.window import WindowNetwork
 
 Inference = Literal["streaming", "window"]
 

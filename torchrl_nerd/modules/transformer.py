@@ -4,7 +4,7 @@ NeRD section 3.4 recomputes its last ten tokens at every step, with absolute pos
 Here each layer sees a token and the ``band - 1`` before it, and positions are relative (a
 learned bias per head and offset). A token is written in its own base frame and never
 changes as time moves on, so its keys and values are kept in a ring. The output depends on
-``layers * (band - 1) + 1`` tokens. `WindowNetwork` is the paper's way.
+``layers * (band - 1) + 1`` tokens. `modules.window` is the paper's way.
 """
 
 from dataclasses import asdict, dataclass
@@ -256,60 +256,3 @@ class CausalTransformer(nn.Module):
             x = cast(Block, block).step(x, memory, layer)
         memory.advance()
         return self.head(x)
-
-
-class TokenWindow:
-    """The last ``size`` tokens of every row, left-aligned: a row's first is at index 0."""
-
-    def __init__(self, rows: int, size: int, width: int, like: Tensor) -> None:
-        self.tokens = like.new_zeros(rows, size, width)
-        self.age = torch.zeros(rows, dtype=torch.long, device=like.device)
-
-    def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
-        tokens = torch.where(rows[:, None, None], 0.0, self.tokens)
-        self.tokens = stored(self.tokens, tokens)
-        self.age.masked_fill_(rows, 0)
-
-    def __copy__(self) -> "TokenWindow":
-        """Apart from the original, which is written to in place."""
-        twin = object.__new__(TokenWindow)
-        twin.tokens, twin.age = self.tokens.clone(), self.age.clone()
-        return twin
-
-    def restore(self, past: "TokenWindow", rows: Tensor) -> None:
-        """See `History.restore`."""
-        tokens = torch.where(rows[:, None, None], past.tokens, self.tokens)
-        self.tokens = stored(self.tokens, tokens)
-        self.age.copy_(torch.where(rows, past.age, self.age))
-
-    def append(self, token: Tensor) -> Tensor:
-        """Add a token to every row; returns the index it got, ``(rows,)``."""
-        size = self.tokens.shape[1]
-        is_full = (self.age >= size)[:, None, None]
-        tokens = torch.where(is_full, self.tokens.roll(-1, 1), self.tokens)
-        index = self.age.clamp_max(size - 1)  # (rows,)
-        slots = torch.arange(size, device=token.device) == index[:, None]
-        tokens = torch.where(slots[..., None], token[:, None], tokens)
-        self.tokens = stored(self.tokens, tokens)
-        self.age.add_(1).clamp_(max=size)
-        return index
-
-
-class WindowNetwork(nn.Module):
-    """A network run in the paper's way; the same signature as the network itself."""
-
-    def __init__(self, network: nn.Module, size: int, width: int) -> None:
-        super().__init__()
-        self.network, self.size, self.width = network, size, width
-
-    def empty_memory(self, rows: int) -> TokenWindow:
-        """A window without tokens."""
-        weight = next(self.network.parameters())
-        return TokenWindow(rows, self.size, self.width, weight)
-
-    def step(self, token: Tensor, memory: TokenWindow) -> Tensor:
-        """``(rows, F) -> (rows, D)``; advances ``memory``."""
-        index = memory.append(token)  # (rows,)
-        outputs = self.network(memory.tokens)
-        return outputs[torch.arange(len(token), device=token.device), index]
