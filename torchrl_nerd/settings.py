@@ -1,6 +1,7 @@
 """Settings of a configuration class that are out of range."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from numbers import Integral
 from typing import TypeVar
 
@@ -35,6 +36,12 @@ def expect_count(least: int, **settings: object) -> None:
             raise SettingError(
                 f"expected {name}, a whole number of at least {least}, got {value!r}"
             )
+
+
+def did_you_mean(name: str, known: Iterable[str], first: Sequence[str] = ()) -> str:
+    """`` (did you mean 'ant'?)``: the first of ``first``, or the nearest; or nothing."""
+    near = [*first, *get_close_matches(name, known, 1)]
+    return f" (did you mean '{near[0]}'?)" if near else ""
 
 
 def look_up(what: str, name: str, known: Mapping[str, Value]) -> Value:

@@ -17,6 +17,7 @@ from gpu.rates import states
 from gpu.stages import Item, Setup, rate
 from torchrl_nerd import load_scene, make_env
 from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.dynamics.base import Memoryless
 from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.keys import QPOS, QVEL
@@ -54,7 +55,7 @@ def items(setup: Setup) -> dict[str, Item]:
     return found
 
 
-class MjxDynamics:
+class MjxDynamics(Memoryless):
     """MJX as dynamics, float32 as on its GPUs; states pass through the host.
 
     Args:
@@ -69,16 +70,8 @@ class MjxDynamics:
     def __init__(self, scene: Scene) -> None:
         if scene.terrain is not None and scene.terrain.is_per_row:
             raise ValueError(f"MJX: no ground per env, which '{scene.name}' has")
-        self.scene, self.advance = scene, _advance(scene)
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """There is no past."""
-
-    def history(self) -> None:
-        """There is none."""
-
-    def restore(self, history: object, rows: Tensor) -> None:
-        """There is no past."""
+        super().__init__(scene)
+        self.advance = _advance(scene)
 
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None

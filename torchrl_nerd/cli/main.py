@@ -4,7 +4,6 @@ import io
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from difflib import get_close_matches
 from itertools import pairwise
 from typing import Any
 
@@ -25,7 +24,7 @@ from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
 from torchrl_nerd.robots import PRESETS, preset_of
 from torchrl_nerd.scenes import is_import
-from torchrl_nerd.settings import SettingError
+from torchrl_nerd.settings import SettingError, did_you_mean
 
 COMMANDS: dict[str, type[Command]] = {
     "data": Data,
@@ -56,9 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"  {name:<10}{(command.__doc__ or '').splitlines()[0]}")
         return 0
     if argv[0] not in COMMANDS:
-        near = get_close_matches(argv[0], COMMANDS, 1)
-        meant = f" (did you mean '{near[0]}'?)" if near else ""
-        known = ", ".join(COMMANDS)
+        meant, known = did_you_mean(argv[0], COMMANDS), ", ".join(COMMANDS)
         return _fail(f"unknown command '{argv[0]}'{meant}, expected {known}")
     kind = COMMANDS[argv[0]]
     try:

@@ -49,6 +49,22 @@ class Dynamics(Protocol):
         ...
 
 
+class Memoryless:
+    """`Dynamics` that keeps no past: what is left to give is ``step``."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """See `Dynamics.reset`; there is no past."""
+
+    def history(self) -> None:
+        """See `Dynamics.history`; there is none."""
+
+    def restore(self, history: object, rows: Tensor) -> None:
+        """See `Dynamics.restore`; there is no past."""
+
+
 def as_numpy(x: Tensor) -> np.ndarray:
     """The numbers of a tensor on any device, float64, without its gradients."""
     return x.detach().cpu().double().numpy()

@@ -75,11 +75,11 @@ class MujocoDynamics:
         self.scene = scene
         self.num_threads = default_threads() if num_threads is None else num_threads
         expect_count(1, num_threads=self.num_threads)
+        self._model = torque_model(scene)
         self._start(np.zeros((0, scene.model.nv)))
 
     def _start(self, warmstart: np.ndarray) -> None:
         """Simulations, one for each row of the warm start ``(rows, nv)``."""
-        self._model = torque_model(self.scene)
         self._batch: Batch | None = None
         self._warmstart = warmstart
         if len(warmstart):
@@ -95,7 +95,7 @@ class MujocoDynamics:
         return {**state, "warmstart": self._warmstart.copy()}
 
     def __setstate__(self, state: dict) -> None:
-        self.scene, self.num_threads = state["scene"], state["num_threads"]
+        self.__init__(state["scene"], state["num_threads"])
         self._start(state["warmstart"])
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:

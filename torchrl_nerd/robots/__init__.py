@@ -4,7 +4,6 @@ Robots of users are registered by `register`.
 """
 
 from collections.abc import Collection
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -26,6 +25,7 @@ from torchrl_nerd.robots.robot import (
     Source,
 )
 from torchrl_nerd.scenes import Scene, import_scene, is_import
+from torchrl_nerd.settings import did_you_mean
 from torchrl_nerd.tasks import SceneTask, Task
 from torchrl_nerd.tasks.suite import SuiteTask
 
@@ -111,8 +111,7 @@ def _meant(name: object, known: Collection[str]) -> str:
     given = str(name)
     of_scene = [other for other in known if other.startswith(f"{given}/")]
     of_task = [other for other in known if given.startswith(f"{other}/")]
-    near = [*of_scene, *of_task, *get_close_matches(given, known, 1)]
-    return f" (did you mean '{near[0]}'?)" if near else ""
+    return did_you_mean(given, known, (*of_scene, *of_task))
 
 
 def task_id(task: Task) -> str:

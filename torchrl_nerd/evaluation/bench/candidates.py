@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_nerd.analytic import make_step
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
+from torchrl_nerd.dynamics.base import Memoryless
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.transformer import CausalTransformer
@@ -47,22 +48,10 @@ class Candidate:
     make: Callable[[Scene], Dynamics]
 
 
-class NoMotion:
+class NoMotion(Memoryless):
     """Dynamics in which every state stays as it is: the error of predicting nothing."""
 
     kind = "baseline"
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """See `Dynamics.reset`; there is no past."""
-
-    def history(self) -> None:
-        """See `Dynamics.history`."""
-
-    def restore(self, history: object, rows: Tensor) -> None:
-        """See `Dynamics.restore`."""
 
     def step(
         self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
