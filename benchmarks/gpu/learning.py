@@ -3,6 +3,7 @@
 import shutil
 import time
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -32,6 +33,7 @@ def items(setup: Setup) -> dict[str, Item]:
     return found
 
 
+@cache
 def make_data(name: str, setup: Setup) -> TensorDict:
     """Trajectories of random torques, made on the host; sound ones."""
     count, steps = setup.pick((4000, 100), (40, 12))
@@ -59,6 +61,7 @@ def config_of(network: str, setup: Setup, **changes: Any) -> TrainConfig:
         "rollout_batch_size": setup.pick(256, 2),
     }
     how |= {"single_step_fraction": 0.0, "seed": setup.seed}
+    how |= {"bf16_fraction": 1.0}
     return replace(TrainConfig(), **(how | changes))
 
 

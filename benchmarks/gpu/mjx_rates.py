@@ -3,6 +3,7 @@
 import copy
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
@@ -36,8 +37,8 @@ def is_installed() -> bool:
 
 def items(setup: Setup) -> dict[str, Item]:
     """Rates at the scene's substeps, then errors and rates at fewer ones."""
-    found: dict[str, Item] = {}
     names, sizes = setup.pick((SCENES, SIZES), (("cartpole",), (4,)))
+    found: dict[str, Item] = {"compile": lambda: compile_all(names, sizes[:1])}
     for size in sizes[:2]:
         for name in names:
             found[f"MJX {name}, {size}"] = lambda n=name, s=size: mjx_rate(n, s, setup)
@@ -53,6 +54,16 @@ def items(setup: Setup) -> dict[str, Item]:
     if is_warp_installed() and setup.is_gpu:
         found["MuJoCo Warp ant, 4096"] = lambda: warp_rate("ant/run", 4096, setup)
     return found
+
+
+def compile_all(names: tuple[str, ...], sizes: tuple[int, ...]) -> dict[str, float]:
+    """Seconds to compile each robot and size; side by side, as they need the host alone."""
+    given = [(name, size) for size in sizes for name in names]
+    with ThreadPoolExecutor(len(given)) as pool:
+        seconds = pool.map(lambda x: _compiled(load_scene(x[0]), x[1])[1], given)
+    return {
+        f"{name}, {size}": s for (name, size), s in zip(given, seconds, strict=True)
+    }
 
 
 class MjxDynamics(Memoryless):
@@ -113,6 +124,19 @@ def _advance(scene: Scene) -> Any:
     return jax.jit(jax.vmap(one))
 
 
+@cache
+def _compiled(scene: Scene, size: int) -> tuple[Any, float]:
+    """`_advance` for so many envs, and the seconds that compiling it took."""
+    import jax
+
+    layout = scene.layout
+    widths = layout.nq, layout.nv, len(scene.actuated)
+    given = [jax.ShapeDtypeStruct((size, width), "float32") for width in widths]
+    began = time.perf_counter()
+    advance = MjxDynamics(scene).advance.lower(*given).compile()
+    return advance, time.perf_counter() - began
+
+
 def mjx_rate(
     name: str, size: int, setup: Setup, substeps: int | None = None
 ) -> dict[str, Any]:
@@ -121,24 +145,21 @@ def mjx_rate(
 
     scene = load_scene(name)
     scene = scene if substeps is None else scene.with_substeps(substeps)
-    dynamics = MjxDynamics(scene)
+    advance, seconds = _compiled(scene, size)
     state = states(load_scene(name), size, setup).cpu()
     given = [jax.numpy.asarray(state[k].numpy(), "float32") for k in (QPOS, QVEL)]
     torque = jax.numpy.zeros((size, len(scene.actuated)), "float32")
-    began = time.perf_counter()
-    now = jax.block_until_ready(dynamics.advance(*given, torque))
-    compiled = time.perf_counter() - began
-    last = {"now": now}
+    last = {"now": jax.block_until_ready(advance(*given, torque))}
 
     def step() -> None:
-        last["now"] = jax.block_until_ready(dynamics.advance(*last["now"], torque))
+        last["now"] = jax.block_until_ready(advance(*last["now"], torque))
 
     found = rate(step, setup, warmup=1)
     return {
         "steps_per_s": size * found["per_s"],
         "spread": found["spread"],
         "substeps": scene.substeps,
-        "compile_s": compiled,
+        "compile_s": seconds,
         "platform": jax.devices()[0].platform,
     }
 

@@ -74,13 +74,14 @@ class TorchDynamics:
     @property
     def compile_options(self) -> Mapping[str, Any]:
         """Of `torch.compile`, for a step."""
-        is_single = self.is_single_threaded and self.device.type == "cpu"
-        return SINGLE_THREADED if is_single else {}
+        if self.device.type == "cuda":
+            return {"dynamic": False}
+        return SINGLE_THREADED if self.is_single_threaded else {}
 
     def parts(self, rows: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
         is_whole = self.differentiable or self._compiled.is_eager
-        if is_whole or not self.compile_options:
+        if is_whole or self.device.type != "cpu" or not self.is_single_threaded:
             return 1
         return parts_of(rows, max(1, MIN_WORK // self.scene.layout.nv))
 

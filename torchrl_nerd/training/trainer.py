@@ -57,7 +57,7 @@ class Trainer:
         source: task or scene whose resets or ranges start the validation rollouts.
         config: how to train.
         folder: of the run.
-        device: of model and data; CUDA multiplies matrices in bfloat16.
+        device: of model and data.
         horizons: control steps of the validation rollouts.
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
@@ -220,8 +220,7 @@ class Trainer:
         return rollout_loss(self.model, *batch, config.loss_eps)
 
     def _autocast(self) -> AbstractContextManager:
-        is_coarse = self.step < self.config.bf16_fraction * self.config.steps
-        if is_coarse or self.device.type == "cuda":
+        if self.step < self.config.bf16_fraction * self.config.steps:
             return torch.autocast(self.device.type, torch.bfloat16)
         return nullcontext()
 
