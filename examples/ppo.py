@@ -42,6 +42,7 @@ class Run(PPOConfig):
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # where: nerd, mujoco, dm_control, a checkpoint folder
+    device: str = "cpu"  # of env, policy and learning
     compile: bool = False  # steps in NeRD, see SceneEnv.compile
     seed: int = 0  # of weights, exploration and starts
     evaluate_every: int = 20  # updates between two points of the learning curve
@@ -60,6 +61,7 @@ def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperato
     """Both see observations standardised by all seen so far, at first by random actions."""
     policy = Policy.for_env(env, cfg.horizon, cfg.widths, cfg.std, cfg.frame_stack)
     critic = nn.Sequential(policy.standardize, mlp((policy.sizes[0], *cfg.widths, 1)))
+    critic = critic.to(env.device)
     return policy, ValueOperator(critic)
 
 
@@ -67,7 +69,9 @@ def make_learning(
     actor: ProbabilisticActor, critic: ValueOperator, cfg: Run
 ) -> tuple[GAE, ClipPPOLoss, Adam]:
     """What `update` takes beside a batch."""
-    advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
+    device = next(critic.parameters()).device
+    how = {"value_network": critic, "device": device}
+    advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, **how)
     loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
     loss.normalize_advantage = True
     return advantage, loss, Adam(loss.parameters(), lr=cfg.lr)
@@ -113,7 +117,8 @@ def train(
 ) -> tuple[Policy, list[dict[str, float]]]:
     """A policy that learned in ``cfg.dynamics`` alone, its returns there and in MuJoCo."""
     task = task or cfg.task
-    env = make_env(task, cfg.dynamics, cfg.num_envs, cfg.seed, compile=cfg.compile)
+    how = {"device": cfg.device, "compile": cfg.compile}
+    env = make_env(task, cfg.dynamics, cfg.num_envs, cfg.seed, **how)
     env = stack_frames(env, cfg.frame_stack)
     policy, critic = make_policy_and_critic(env, cfg)
     actor = make_actor(policy)

@@ -119,7 +119,7 @@ class GramTrainer(Trainer):
         matrices, others = split_parameters(self.model.network)
         return {
             "muon": GramMuon(matrices, self.config.lr),
-            "adamw": make_adamw(others, self.config.adamw_lr),
+            "adamw": make_adamw(others, self.config.adamw_lr, self.device),
         }
 
 

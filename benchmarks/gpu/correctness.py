@@ -90,11 +90,11 @@ def check_model(name: str, setup: Setup) -> dict[str, Any]:
     model, here = (from_pretrained(name) for _ in range(2))
     if not isinstance(model, NeRD) or not isinstance(here, NeRD):
         return {"kind": model.kind}
-    scene, count = model.scene, setup.pick(256, 4)
+    scene, count = model.scene, setup.pick(64, 4)
     tasks = [x for x in TASKS if make_task(x).scene.hash == scene.hash]
     source = source_of(scene) if not tasks else make_task(tasks[0])
     here = here.to(setup.device)
-    horizon = setup.pick(100, 3)
+    horizon = setup.pick(50, 3)
 
     def error(dynamics: NeRDDynamics, device: Any) -> dict[str, float]:
         given = source, dynamics, MujocoDynamics(scene), [horizon], count, setup.seed

@@ -27,6 +27,8 @@ def items(setup: Setup) -> dict[str, Item]:
     found: dict[str, Item] = {"ceilings": lambda: ceilings(setup)}
     for network in setup.pick(("paper-large", "transformer-4x128"), ("mlp-2x32",)):
         found[f"throughput {network}"] = lambda n=network: throughput(n, setup)
+    network = setup.pick("paper-large", "mlp-2x32")
+    found[f"throughput {network}, compiled"] = lambda: throughput(network, setup, True)
     found["resume"] = lambda: resume(setup)
     for name in setup.pick(("cartpole", "ant"), ("cartpole",)):
         found[f"time to error {name}"] = lambda n=name: to_error(n, setup)
@@ -43,13 +45,19 @@ def make_data(name: str, setup: Setup) -> TensorDict:
 
 
 def make_trainer(
-    name: str, config: TrainConfig, setup: Setup, folder: str, data: TensorDict
+    name: str,
+    config: TrainConfig,
+    setup: Setup,
+    folder: str,
+    data: TensorDict,
+    compile: bool = False,
 ) -> Trainer:
     """A run of its own folder, without a progress bar."""
     scene, horizons = load_scene(name), setup.pick((100, 500), (2,))
     where = setup.folder / folder
     given = scene, data, source_of(scene), config, where, setup.device
-    return Trainer(*given, horizons=horizons, quiet=True, logger="csv")
+    how = {"horizons": horizons, "quiet": True, "logger": "csv"}
+    return Trainer(*given, **how, compile=compile)
 
 
 def config_of(network: str, setup: Setup, **changes: Any) -> TrainConfig:
@@ -65,7 +73,7 @@ def config_of(network: str, setup: Setup, **changes: Any) -> TrainConfig:
     return replace(TrainConfig(), **(how | changes))
 
 
-def throughput(network: str, setup: Setup) -> dict[str, Any]:
+def throughput(network: str, setup: Setup, compile: bool = False) -> dict[str, Any]:
     """Updates per second, and the share of the bf16 products that the device reaches.
 
     Six operations for every weight and token: two forward, four backward.
@@ -74,7 +82,7 @@ def throughput(network: str, setup: Setup) -> dict[str, Any]:
     _fresh("throughput", setup)
     data = make_data(name, setup)
     config = config_of(network, setup)
-    trainer = make_trainer(name, config, setup, "throughput", data)
+    trainer = make_trainer(name, config, setup, "throughput", data, compile)
     found = rate(trainer.update, setup, warmup=2)
     weights = sum(x.numel() for x in trainer.model.network.parameters())
     tokens = config.batch_size * config.sequence_length

@@ -15,7 +15,7 @@ from torchrl_nerd.evaluation.policy import make_actor
 from torchrl_nerd.robots import PPO_CONFIGS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-BUDGET = 40.0  # s of a task
+BUDGET = 15.0  # s of a task
 
 
 def items(setup: Setup) -> dict[str, Item]:

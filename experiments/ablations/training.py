@@ -71,7 +71,7 @@ class VariantTrainer(Trainer):
         if self.variant.has_muon:
             return super().make_optimizers()
         weights = list(self.model.network.parameters())
-        return {"adamw": make_adamw(weights, self.config.adamw_lr)}
+        return {"adamw": make_adamw(weights, self.config.adamw_lr, self.device)}
 
     def validate(self) -> dict[str, float]:
         """Nothing: no choice hangs on it."""

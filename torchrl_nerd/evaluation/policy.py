@@ -129,7 +129,7 @@ class Policy(nn.Module):
         """
         seen = env.rollout(steps, break_when_any_done=False)[OBSERVATION]
         sizes = (seen.shape[-1], *widths, env.action_spec.shape[-1])
-        policy = cls(sizes, std, frame_stack)
+        policy = cls(sizes, std, frame_stack).to(seen.device)
         policy.standardize.fit(seen)
         return policy
 

@@ -30,9 +30,37 @@ def make_muon(matrices: list[Tensor], lr: float) -> Muon:
     return Muon(matrices, lr, weight_decay=0.0, adjust_lr_fn="original")
 
 
-def make_adamw(weights: list[Tensor], lr: float) -> AdamW:
+def make_adamw(weights: list[Tensor], lr: float, device: torch.device) -> AdamW:
     """AdamW without weight decay that averages squared gradients over about 20 updates."""
-    return AdamW(weights, lr=lr, betas=(0.9, 0.95), weight_decay=0.0)
+    how = {"betas": (0.9, 0.95), "weight_decay": 0.0}
+    return AdamW(weights, lr=lr, capturable=device.type == "cuda", **how)
+
+
+def follow_gradient(
+    weights: list[nn.Parameter],
+    optimizers: Mapping[str, Optimizer],
+    norm: Tensor,
+    ratio: Tensor,
+) -> None:
+    """A step of every optimizer at its peak learning rate, of which ``ratio`` counts.
+
+    Both optimizers move weights in proportion to their learning rate. A ratio on the
+    device can change inside a CUDA graph, a learning rate cannot.
+
+    Args:
+        weights: with gradients; none moves where those are not finite.
+        optimizers: of the weights.
+        norm: of the gradient, ``()``.
+        ratio: share of the peak learning rates, ``()``.
+    """
+    is_finite = norm.isfinite()
+    for grad in (weight.grad for weight in weights if weight.grad is not None):
+        grad.copy_(torch.where(is_finite, grad, 0.0))
+    before = [weight.clone() for weight in weights]
+    for optimizer in optimizers.values():
+        optimizer.step()
+    for weight, old in zip(weights, before, strict=True):
+        weight.copy_(old.lerp(weight, ratio * is_finite))
 
 
 def learning_rate_ratio(config: TrainConfig, step: int) -> float:

@@ -2,14 +2,15 @@
 
 import copy
 import time
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
@@ -21,10 +22,12 @@ from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.training.augmentation import Symmetry
+from torchrl_nerd.training.capture import Captured
 from torchrl_nerd.training.log import LoggerName, TrainingLog, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
 from torchrl_nerd.training.optimizers import (
     RunState,
+    follow_gradient,
     learning_rate_ratio,
     make_adamw,
     make_muon,
@@ -64,7 +67,7 @@ class Trainer:
         logger: ``tensorboard``, ``wandb``, or ``csv`` for ``log.csv`` alone.
         init_from: a model whose weights and statistics the training continues, see
             `begin_from`. The training range covers its data and these.
-        compile: compile network and loss of one step; by default on CUDA alone.
+        compile: compile network and loss of one step.
 
     Raises:
         ValueError: a folder of another run, short trajectories, or a misfit ``init_from``.
@@ -83,7 +86,7 @@ class Trainer:
         quiet: bool = False,
         logger: LoggerName = "tensorboard",
         init_from: NeRD | None = None,
-        compile: bool | None = None,
+        compile: bool = False,
     ) -> None:
         if data.batch_size[1] < config.longest:
             raise ValueError(
@@ -101,9 +104,15 @@ class Trainer:
         weights = self.model.network.named_parameters()
         self.average = {name: weight.detach().clone() for name, weight in weights}
         self.state = RunState(self.model.network, self.average, self.optimizers)
-        self._loss_of_batch = self._batch_loss
-        if self.device.type == "cuda" if compile is None else compile:
-            self._loss_of_batch = Compiled(self._batch_loss, warmup=0, dynamic=False)
+        one = torch.ones((), device=self.device)
+        self.lr_ratio, self.ema_share = one, one.clone()
+        self.losses = self._make_losses(compile)
+        self._follow = {
+            name: partial(self.follow, x) for name, x in self.losses.items()
+        }
+        if self.device.type == "cuda":
+            written = lambda: self.state.tensors().values()
+            self._follow = {k: Captured(x, written) for k, x in self._follow.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
         self.errors: Errors = {}  # of the last validation
         if (self.folder / STATE).exists():
@@ -139,7 +148,7 @@ class Trainer:
         matrices, others = split_parameters(self.model.network)
         return {
             "muon": make_muon(matrices, self.config.lr),
-            "adamw": make_adamw(others, self.config.adamw_lr),
+            "adamw": make_adamw(others, self.config.adamw_lr, self.device),
         }
 
     def run(self, until: int | None = None) -> NeRD:
@@ -171,65 +180,57 @@ class Trainer:
 
     def update(self) -> Tensor:
         """One update; returns its loss ``()``. Seed and step alone decide the batch."""
-        generator = fold_in(self.config.seed, self.step)
-        self._set_learning_rates()
+        config, generator = self.config, fold_in(self.config.seed, self.step)
+        self.lr_ratio.fill_(learning_rate_ratio(config, self.step))
+        self.ema_share.fill_(1.0 - min(config.ema, self.step / (self.step + 10.0)))
         self.model.train()
-        is_rollout = self.step >= self.config.steps
-        loss_of = self._rollout_loss if is_rollout else self._one_step_loss
-        with torch.enable_grad(), self._autocast():
-            loss = loss_of(generator)
-        loss.backward()
-        parameters = list(self.model.network.parameters())
-        norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
-        is_host = self.device.type == "cpu"
-        if not is_host:  # nobody waits to see it: such a batch has a gradient of zero
-            for grad in (x.grad for x in parameters if x.grad is not None):
-                grad.copy_(torch.where(norm.isfinite(), grad, 0.0))
-        if not is_host or norm.isfinite():
-            for optimizer in self.optimizers.values():
-                optimizer.step()
-        self._update_average()
-        return loss.detach()
-
-    def _set_learning_rates(self) -> None:
-        ratio = learning_rate_ratio(self.config, self.step)
-        peaks = {"muon": self.config.lr, "adamw": self.config.adamw_lr}
-        for name, optimizer in self.optimizers.items():
-            for group in optimizer.param_groups:
-                group["lr"] = peaks[name] * ratio
-            optimizer.zero_grad()
-
-    def _one_step_loss(self, generator: Generator) -> Tensor:
-        """Loss of a batch of sequences, or of as many single states."""
-        config = self.config
+        if self.step >= config.steps:
+            sizes = config.rollout_batch_size, config.rollout_length
+            batch = self.sequences.rollout(*sizes, generator)
+            return self._follow["rollout"](*batch)
         count, length = config.batch_size, config.sequence_length
         if torch.rand((), generator=generator) < config.single_step_fraction:
             count, length = count * length, 1  # more diverse: neighbours are alike
-        return self._loss_of_batch(*self.sequences.one_step(count, length, generator))
+        inputs, targets = self.sequences.one_step(count, length, generator)
+        is_coarse = self.step < config.bf16_fraction * config.steps
+        return self._follow["bfloat16" if is_coarse else "one_step"](*inputs, targets)
 
-    def _batch_loss(self, inputs: Inputs, targets: Tensor) -> Tensor:
-        """Of network inputs and targets ``(*batch, D)``."""
-        changes = inputs.change(self.model.network(inputs.token).float())
-        return one_step_loss(changes, targets, self.config.loss_eps)
+    def _make_losses(self, compile: bool) -> dict[str, Callable[..., Tensor]]:
+        """Of a batch of sequences, in two precisions, and of the model's own rollouts."""
+        loss_eps = self.config.loss_eps
 
-    def _rollout_loss(self, generator: Generator) -> Tensor:
-        """Loss of the model's own rollouts."""
-        config = self.config
-        sizes = config.rollout_batch_size, config.rollout_length
-        batch = self.sequences.rollout(*sizes, generator)
-        return rollout_loss(self.model, *batch, config.loss_eps)
+        def one_step(*batch: Tensor) -> Tensor:
+            inputs, targets = Inputs(*batch[:-1]), batch[-1]
+            changes = inputs.change(self.model.network(inputs.token).float())
+            return one_step_loss(changes, targets, loss_eps)
 
-    def _autocast(self) -> AbstractContextManager:
-        if self.step < self.config.bf16_fraction * self.config.steps:
-            return torch.autocast(self.device.type, torch.bfloat16)
-        return nullcontext()
+        def coarse(*batch: Tensor) -> Tensor:
+            with torch.autocast(self.device.type, torch.bfloat16):
+                return one_step(*batch)
 
-    @torch.no_grad()
-    def _update_average(self) -> None:
-        """Exponential moving average of the weights, over fewer updates at the start."""
-        decay = min(self.config.ema, self.step / (self.step + 10.0))
-        for name, weight in self.model.network.named_parameters():
-            self.average[name].lerp_(weight, 1.0 - decay)
+        def rollout(*batch: Any) -> Tensor:
+            return rollout_loss(self.model, *batch, loss_eps=loss_eps)
+
+        losses = {"one_step": one_step, "bfloat16": coarse}
+        if compile:
+            how = {"warmup": 0, "dynamic": False}
+            losses = {name: Compiled(x, **how) for name, x in losses.items()}
+        return losses | {"rollout": rollout}
+
+    def follow(self, loss_of: Callable[..., Tensor], *batch: Tensor | None) -> Tensor:
+        """Follow the gradient of a batch's loss, and return the loss; asks for no number."""
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad()
+        with torch.enable_grad():
+            loss = loss_of(*batch)
+        loss.backward()
+        weights = list(self.model.network.parameters())
+        norm = nn.utils.clip_grad_norm_(weights, self.config.clip)
+        with torch.no_grad():
+            follow_gradient(weights, self.optimizers, norm, self.lr_ratio)
+            for name, weight in self.model.network.named_parameters():
+                self.average[name].lerp_(weight, self.ema_share)
+        return loss.detach()
 
     def averaged_model(self) -> NeRD:
         """A copy of the model with the averaged weights and its sleep threshold."""
