@@ -1,6 +1,6 @@
 """A function of tensors as a CUDA graph: its kernels start without a host in between."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ class Captured:
     """
 
     def __init__(
-        self, function: Callable[..., Tensor], state: Callable[[], Iterable[Tensor]]
+        self, function: Callable[..., Tensor], state: Callable[[], Mapping[str, Tensor]]
     ) -> None:
         self.function, self.state = function, state
         self._graphs: dict[Key, Graph] = {}
@@ -42,7 +42,7 @@ class Captured:
 
     def _capture(self, given: tuple[Tensor | None, ...]) -> Graph:
         inputs = [None if x is None else x.clone() for x in given]
-        before = [(x, x.clone()) for x in self.state()]
+        before = [(x, x.clone()) for x in self.state().values()]
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

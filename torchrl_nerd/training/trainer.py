@@ -111,7 +111,7 @@ class Trainer:
             name: partial(self.follow, x) for name, x in self.losses.items()
         }
         if self.device.type == "cuda":
-            written = lambda: self.state.tensors().values()
+            written = self.state.tensors
             self._follow = {k: Captured(x, written) for k, x in self._follow.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
         self.errors: Errors = {}  # of the last validation
@@ -218,7 +218,7 @@ class Trainer:
         return losses | {"rollout": rollout}
 
     def follow(self, loss_of: Callable[..., Tensor], *batch: Tensor | None) -> Tensor:
-        """Follow the gradient of a batch's loss, and return the loss; asks for no number."""
+        """Follow the gradient of a batch's loss ``()``, which is returned."""
         for optimizer in self.optimizers.values():
             optimizer.zero_grad()
         with torch.enable_grad():
