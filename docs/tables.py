@@ -1,7 +1,7 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
-``compiled_env``, ``kinematics_libraries`` or ``transfer``.
+``compiled_env``, ``kinematics_libraries``, ``transfer``, ``gpu_rates`` or ``gpu_errors``.
 """
 
 import json
@@ -39,9 +39,11 @@ def number(value: float | None) -> str:
 def made_by(record: dict[str, Any]) -> str:
     """The line under a table: how to make it again."""
     machine = record["machine"]
+    device = machine.get("device", "cpu")
+    where = machine["processor"] if device == "cpu" else device
     return (
         f"`{record['command']}`, commit {record['commit'][:7]}, seed {record['seed']}, "
-        f"{machine['processor']}, {machine['threads']} threads, MuJoCo {machine['mujoco']}."
+        f"{where}, {machine['threads']} threads, MuJoCo {machine['mujoco']}."
     )
 
 
@@ -166,6 +168,41 @@ def transfer_table(folder: Path = RESULTS) -> str:
     return "\n\n".join((rows(table), *lines)) if lines else ""
 
 
+def gpu_rates_table(folder: Path = RESULTS) -> str:
+    """Millions of control steps per second: a row per model and mode, a column per size."""
+    found: dict[tuple[str, str], dict[int, float]] = {}
+    records = {k: v for k, v in read("?", folder / "gpu").items() if k.endswith("rates")}
+    for name, record in records.items():
+        for item, values in record["results"]["items"].items():
+            *what, size = item.replace("MJX ", "MJX, ").split(", ")
+            if "steps_per_s" not in values or not size.isdigit():
+                continue
+            model, mode = what if name == "b_rates" else reversed(what)
+            row = found.setdefault((model, mode), {})
+            row[int(size)] = values["steps_per_s"] / 1e6
+    sizes = sorted({size for row in found.values() for size in row})
+    table = [["model or task", "run as", *(f"{size:,}" for size in sizes)]]
+    for (model, mode), row in sorted(found.items()):
+        cells = (number(row[x]) if x in row else "-" for x in sizes)
+        table.append([model.removesuffix(" streaming"), mode, *cells])
+    lines = [made_by(record) for record in records.values()]
+    return "\n\n".join((rows(table), *lines)) if lines else ""
+
+
+def gpu_errors_table(folder: Path = RESULTS) -> str:
+    """Mean errors of shipped models on CPU and GPU, in float32 and with bf16 inside."""
+    table = [["model", "quantity", "CPU", "GPU", "GPU, bf16 inside"]]
+    records = [v for k, v in read("?", folder / "gpu").items() if k == "a_correctness"]
+    for record in records:
+        for name, found in record["results"]["items"].items():
+            for quantity in found.get("float32", {}):
+                keys = ("cpu_float32", "float32", "bf16_inside")
+                cells = (f"{found[key][quantity]:.3g}" for key in keys)
+                table.append([name.removeprefix("model "), quantity, *cells])
+    lines = [made_by(record) for record in records]
+    return "\n\n".join((rows(table), *lines)) if lines else ""
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
@@ -173,9 +210,12 @@ TABLES = {
     "compiled_env": env_table,
     "kinematics_libraries": kinematics_table,
     "transfer": transfer_table,
+    "gpu_rates": gpu_rates_table,
+    "gpu_errors": gpu_errors_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
+COMMANDS |= {"gpu_rates": "make gpu", "gpu_errors": "make gpu"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Generator
+from torch import Generator, nn
 
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
@@ -21,7 +21,13 @@ from torchrl_nerd.robots import PRESETS, SCENES, load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss
-from torchrl_nerd.training.optimizers import learning_rate_ratio, split_parameters
+from torchrl_nerd.training.optimizers import (
+    follow_gradient,
+    learning_rate_ratio,
+    make_adamw,
+    make_muon,
+    split_parameters,
+)
 from torchrl_nerd.training.trainer import Trainer
 
 SCENE, OTHER = (load_scene(name) for name in ("cartpole", "double_pendulum"))
@@ -235,15 +241,39 @@ def test_step_sizes_rise_and_fall_to_zero_in_both_phases(tmp_path):
     sizes = []
     for trainer.step in range(config.total_steps):
         trainer.update()
-        rates = [trainer.optimizers[n].param_groups[0]["lr"] for n in ("muon", "adamw")]
-        assert rates[0] / config.lr == pytest.approx(rates[1] / config.adamw_lr)
-        sizes.append(rates[0] / config.lr)
+        sizes.append(float(trainer.lr_ratio))
     first, second = sizes[:30], sizes[30:]
     top = first.index(max(first))
     assert first[: top + 1] == sorted(first[: top + 1]) and 7 <= top <= 10
     assert first[top:] == sorted(first[top:], reverse=True) and first[-1] < 0.05
     assert second[0] == pytest.approx(config.rollout_lr_ratio)
     assert second == sorted(second, reverse=True) and second[-1] < 0.02
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0])
+def test_a_share_of_an_update_is_one_at_that_share_of_the_learning_rate(
+    ratio, generator
+):
+    """In both optimizers, and with what they remember of earlier gradients."""
+    start = torch.randn(6, 4, generator=generator)
+    grads = torch.randn(3, 6, 4, generator=generator)
+    ends = []
+    for is_shared in (True, False):
+        weights = [nn.Parameter(start.clone()) for _ in range(2)]
+        lr = 0.1 if is_shared else 0.1 * ratio
+        optimizers = {
+            "muon": make_muon(weights[:1], lr),
+            "adamw": make_adamw(weights[1:], lr, torch.device("cpu")),
+        }
+        for grad in grads:
+            for weight in weights:
+                weight.grad = grad.clone()
+            share = torch.tensor(ratio if is_shared else 1.0)
+            with torch.no_grad():
+                follow_gradient(weights, optimizers, torch.tensor(1.0), share)
+        ends.append(torch.stack(weights).detach())
+    torch.testing.assert_close(*ends)
+    assert torch.equal(ends[0][0], start) == (ratio == 0.0)
 
 
 def test_rollouts_begin_anew_in_every_round():
