@@ -148,7 +148,19 @@ def to_error(name: str, setup: Setup) -> dict[str, Any]:
         setup.wait()
         now = {"seconds": time.perf_counter() - began, "step": trainer.step}
         curve.append(now | errors)
-    return {"trajectories": len(data), "network": config.network, "curve": curve}
+    reached = _reached(name, curve)
+    about = {"trajectories": len(data), "network": config.network}
+    return about | {"curve": curve, "paper_reached_after_s": reached}
+
+
+def _reached(name: str, curve: list[dict[str, float]]) -> dict[str, float | None]:
+    """Seconds until the paper's error of each quantity; None where it was not reached."""
+    protocol, found = preset_of(name).protocol, {}
+    for (_, steps, quantity), paper in (protocol.published if protocol else {}).items():
+        key = f"{quantity}_{steps}"
+        times = [x["seconds"] for x in curve if x.get(key, paper + 1.0) <= paper]
+        found[f"{key}: {paper}"] = times[0] if times else None
+    return found
 
 
 def _fresh(folder: str, setup: Setup) -> None:

@@ -90,3 +90,17 @@ def test_a_batch_that_is_not_finite_counts_nothing(tmp_path, monkeypatch):
     trainer.update()
     after = trainer.model.network.state_dict()
     assert all(torch.equal(after[k], v) for k, v in before.items())
+
+
+@pytest.mark.gpu
+def test_captured_updates_are_the_eager_ones(tmp_path):
+    """In both precisions and over rollouts: as a CUDA graph and kernel by kernel."""
+    config = replace(CONFIG, steps=3, rollout_steps=2, bf16_fraction=0.4)
+    losses = []
+    for is_captured in (True, False):
+        folder = tmp_path / str(is_captured)
+        trainer = make_trainer("ant", config, folder, device="cuda")
+        if not is_captured:
+            trainer._follow = {k: x.function for k, x in trainer._follow.items()}
+        losses.append([trainer.update() for trainer.step in range(config.total_steps)])
+    torch.testing.assert_close(*losses, rtol=1e-3, atol=1e-4)
