@@ -1,7 +1,8 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
-``compiled_env``, ``kinematics_libraries``, ``transfer``, ``gpu_rates`` or ``gpu_errors``.
+``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates`` or
+``gpu_errors``.
 """
 
 import json
@@ -171,7 +172,9 @@ def transfer_table(folder: Path = RESULTS) -> str:
 def gpu_rates_table(folder: Path = RESULTS) -> str:
     """Millions of control steps per second: a row per model and mode, a column per size."""
     found: dict[tuple[str, str], dict[int, float]] = {}
-    records = {k: v for k, v in read("?", folder / "gpu").items() if k.endswith("rates")}
+    records = {
+        k: v for k, v in read("?", folder / "gpu").items() if k.endswith("rates")
+    }
     for name, record in records.items():
         for item, values in record["results"]["items"].items():
             *what, size = item.replace("MJX ", "MJX, ").split(", ")
@@ -203,6 +206,22 @@ def gpu_errors_table(folder: Path = RESULTS) -> str:
     return "\n\n".join((rows(table), *lines)) if lines else ""
 
 
+def state_dtype_table(folder: Path = RESULTS) -> str:
+    """Errors and times of shipped models with states in float64 and in float32."""
+    path = folder / "state_dtype.json"
+    if not path.exists():
+        return ""
+    record = json.loads(path.read_text())
+    head = ["float64", "float32", "float64 (us)", "float32 (us)"]
+    table = [["model", "quantity, steps", *head]]
+    for model, row in record["results"].items():
+        for quantity, error in row["float64"].items():
+            errors = f"{error:.3g}", f"{row['float32'][quantity]:.3g}"
+            times = (f"{row[key]:.1f}" for key in ("float64_us", "float32_us"))
+            table.append([model, f"{quantity}, {row['steps']}", *errors, *times])
+    return f"{rows(table)}\n\n{made_by(record)}"
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
@@ -210,12 +229,13 @@ TABLES = {
     "compiled_env": env_table,
     "kinematics_libraries": kinematics_table,
     "transfer": transfer_table,
+    "state_dtype": state_dtype_table,
     "gpu_rates": gpu_rates_table,
     "gpu_errors": gpu_errors_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
-COMMANDS |= {"gpu_rates": "make gpu", "gpu_errors": "make gpu"}
+COMMANDS |= {"state_dtype": MEASURED, "gpu_rates": "make gpu", "gpu_errors": "make gpu"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -78,7 +78,13 @@ def meta(monkeypatch: pytest.MonkeyPatch) -> torch.device:
     return META
 
 
-def meta_env(task_id: str, kind: str, num_envs: int, generator: Generator) -> SceneEnv:
+def meta_env(
+    task_id: str,
+    kind: str,
+    num_envs: int,
+    generator: Generator,
+    state_dtype: torch.dtype = torch.float64,
+) -> SceneEnv:
     """An env whose model and state are on ``meta``; its specs stay where they are.
 
     Envs refuse that device by name, and TorchRL's specs read their bounds. Task, scene and
@@ -87,9 +93,11 @@ def meta_env(task_id: str, kind: str, num_envs: int, generator: Generator) -> Sc
     task = make_task(task_id)
     model = model_of_kind(kind, task.scene, generator)
     task, model = copy.deepcopy((task, model))
-    env = NeRDEnv(task, model, num_envs, seed=0, inference=inference_of(kind))
+    how = {"inference": inference_of(kind), "state_dtype": state_dtype}
+    env = NeRDEnv(task, model, num_envs, seed=0, **how)
     inner = env._torch_dynamics
     assert inner is not None
+    model = inner.model if isinstance(inner, NeRDDynamics) else inner.analytic_step
     model.to(META)
     if isinstance(inner, NeRDDynamics):
         inner.network.to(META)  # pyright: ignore

@@ -371,6 +371,8 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     earned = {"dynamics": "nerd", "kind": "learned", "mean": 9.96, "difference": -0.02}
     chain = {"scene": "ant", "library": "own", "compiled": True}
     checked = {key: {"x": 0.12345} for key in ("cpu_float32", "float32", "bf16_inside")}
+    precise = {"steps": 5, "float64": {"x": 0.1}, "float32": {"x": 0.2}}
+    precise |= {"float64_us": 3.0, "float32_us": 1.5}
     chain |= {"positions_ms": 0.123, "with_velocities_ms": 1.5}
     for name, results in (
         ("eval_robot", {"errors": errors}),
@@ -378,7 +380,11 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
         ("stability_robot", {"drop": {"passes": False}}),
         ("kinematics_libraries", [chain]),
         ("transfer_franka_x", {"policy": "runs/p", "returns": [earned]}),
-        ("gpu/b_rates", {"items": {"tiny streaming, graph, 512": {"steps_per_s": 2e6}}}),
+        ("state_dtype", {"ant": precise}),
+        (
+            "gpu/b_rates",
+            {"items": {"tiny streaming, graph, 512": {"steps_per_s": 2e6}}},
+        ),
         ("gpu/c_mjx_rates", {"items": {"MJX ant, 4096": {"steps_per_s": 5e4}}}),
         ("gpu/a_correctness", {"items": {"model a": checked}}),
     ):
@@ -394,6 +400,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "| p | nerd | learned | 10.0 | -2.0 |" in shown
     assert "| ant | own | compiled | 0.12 | 1.5 |" in shown
     assert "| tiny | graph | 2 | - |" in shown and "| ant | MJX | - | 0.05 |" in shown
+    assert "| ant | x, 5 | 0.1 | 0.2 | 3.0 | 1.5 |" in shown
     assert "| a | x | 0.123 | 0.123 | 0.123 |" in shown
     assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
 

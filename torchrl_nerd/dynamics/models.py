@@ -67,6 +67,8 @@ class TorchDynamics:
         self.scene, self.device, self.kind = model.scene, model.device, model.kind
         self.compile, self.differentiable = compile, differentiable
         self.is_single_threaded = model.compile_single_threaded
+        numbers = (x for x in model.buffers() if x.is_floating_point())
+        self.state_dtype = next((x.dtype for x in numbers), torch.float64)
         self._rows = 0
         self._compiled = Compiled(self._predict, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
@@ -121,7 +123,7 @@ class TorchDynamics:
         """
         check_step(self.scene, state, joint_torque, terrain)
         there, here = state[QPOS].device, self.device
-        qpos, qvel = (state[key].to(here, torch.float64) for key in (QPOS, QVEL))
+        qpos, qvel = (state[key].to(here, self.state_dtype) for key in (QPOS, QVEL))
         qpos = normalize_pos(self.scene.layout, qpos)
         ground = None if terrain is None else terrain.to(qpos)
         self._prepare(len(qpos))

@@ -51,6 +51,7 @@ class SceneEnv(RenderedEnv):
             their own env differ.
         device: where states, observations and rewards live.
         dump_dir: where the first fault of each kind leaves a dump of its last steps.
+        state_dtype: of states and torques; engines compute in their own.
 
     Raises:
         ValueError: no envs, no such device, a dynamics of another scene, or a folder that
@@ -73,8 +74,13 @@ class SceneEnv(RenderedEnv):
         seed: int | None = None,
         device: torch.device | str = "cpu",
         dump_dir: Path | str | None = None,
+        state_dtype: torch.dtype = torch.float64,
     ) -> None:
         expect_count(1, num_envs=num_envs)
+        if state_dtype not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"expected state_dtype torch.float32 or torch.float64, got {state_dtype!r}"
+            )
         if dynamics.scene.hash != task.scene.hash:
             raise ValueError(
                 f"the task is for scene '{task.scene.name}', the dynamics for "
@@ -98,10 +104,10 @@ class SceneEnv(RenderedEnv):
             self.recorder = FaultRecorder(Path(dump_dir), about)
         sizes, is_guarded = self._state_sizes, self.guard is not None
         for name, spec in make_specs(
-            task, sizes, self.batch_size, self.device, is_guarded
+            task, sizes, self.batch_size, self.device, is_guarded, state_dtype
         ):
             setattr(self, name, spec)
-        zeros = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
+        zeros = torch.zeros(num_envs, dtype=state_dtype, device=self.device)
         for name in ("_episode", "_age"):
             self.register_buffer(name, zeros.long())
         for key, size in self._state_sizes.items():  # (num_envs, size) each
@@ -215,7 +221,8 @@ class SceneEnv(RenderedEnv):
         rows = rows.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
         given: dict[str, Tensor] = {}
         if set_state:
-            given = given_state(tensordict, rows, self._state_sizes)
+            dtype = self._state()[QPOS].dtype
+            given = given_state(tensordict, rows, self._state_sizes, dtype)
             given[QPOS] = normalize_pos(self.scene.layout, given[QPOS])
             if not self._is_differentiable:
                 given = {key: value.detach() for key, value in given.items()}

@@ -1,6 +1,8 @@
 """One argument switches between ground truth, learned, hybrid and analytic dynamics."""
 
+import copy
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -16,6 +18,7 @@ from torchrl_nerd.dynamics.guarded import Guard
 from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.pixels import image_size
+from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
@@ -27,7 +30,7 @@ class GroundTruthEnv(SceneEnv):
     Args:
         task: id of a registered task, or a task.
         engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``).
-        num_envs, seed, dump_dir: see `SceneEnv`.
+        num_envs, seed, dump_dir, state_dtype: see `SceneEnv`.
         device: where all tensors live, and MuJoCo Warp runs; the others use the CPU.
 
     Raises:
@@ -48,6 +51,7 @@ class GroundTruthEnv(SceneEnv):
         seed: int | None = None,
         device: torch.device | str = "cpu",
         dump_dir: Path | str | None = None,
+        state_dtype: torch.dtype = torch.float64,
     ) -> None:
         if engine not in ENGINES:
             raise ValueError(
@@ -55,7 +59,8 @@ class GroundTruthEnv(SceneEnv):
             )
         task = task if isinstance(task, Task) else make_task(task)
         dynamics = ENGINES[engine](task.scene, expect_device(str(device)))
-        super().__init__(task, dynamics, num_envs, seed, device, dump_dir)
+        how = dump_dir, state_dtype
+        super().__init__(task, dynamics, num_envs, seed, device, *how)
 
 
 class NeRDEnv(SceneEnv):
@@ -67,6 +72,8 @@ class NeRDEnv(SceneEnv):
         task: id of a registered task, or a task.
         model: a model, or the name of one, see `from_pretrained`.
         num_envs, seed, dump_dir: see `SceneEnv`.
+        state_dtype: of state and features; float32 for GPUs without a fast float64, or
+            without any, such as ``mps``. The model given is copied.
         device: where the model and all tensors live.
         inference: ``"streaming"`` or ``"window"``; see `NeRDDynamics`.
         guard: what to do with steps far from the training data, see `GuardedDynamics`;
@@ -94,12 +101,16 @@ class NeRDEnv(SceneEnv):
         guard: Guard | None = None,
         dump_dir: Path | str | None = None,
         differentiable: bool = False,
+        state_dtype: torch.dtype = torch.float64,
     ) -> None:
         task = task if isinstance(task, Task) else make_task(task)
         name = type(model).__name__
         if not isinstance(model, Model):
             given, model = model, from_pretrained(model, task.scene)
             name = model_name(given, task.scene)
+        if state_dtype == torch.float32:
+            kept = {id(model.scene): model.scene}
+            model = cast_constants(copy.deepcopy(model, kept), state_dtype)
         model = model.to(expect_device(str(device)))
         how = {"differentiable": differentiable, "inference": inference}
         dynamics = dynamics_of(model, **how)
@@ -108,7 +119,8 @@ class NeRDEnv(SceneEnv):
                 dynamics = GuardedDynamics(dynamics, guard)
         else:
             _refuse_network_options(name, guard, inference)
-        super().__init__(task, dynamics, num_envs, seed, device, dump_dir)
+        how = dump_dir, state_dtype
+        super().__init__(task, dynamics, num_envs, seed, device, *how)
         self.model_name = name
 
 
@@ -126,6 +138,7 @@ def make_env(
     pixels_only: bool = False,
     render_size: int | tuple[int, int] = (240, 320),
     camera_id: int | str | None = None,
+    state_dtype: torch.dtype = torch.float64,
 ) -> SceneEnv:
     """A batched env of a task in the dynamics of your choice.
 
@@ -147,6 +160,7 @@ def make_env(
         pixels_only: instead of all else that an agent could see.
         render_size: height and width of an image, or one number for both, pixels.
         camera_id: of an image; see `envs.rendering.Renderer`.
+        state_dtype: ``torch.float32`` for GPUs without a fast float64, or without any.
 
     Raises:
         ValueError: unknown task or dynamics, or an option that the dynamics does not have,
@@ -161,9 +175,10 @@ def make_env(
                 f"'{dynamics}'"
             )
         _refuse_network_options(dynamics, guard)
-        env: SceneEnv = GroundTruthEnv(task, dynamics, *shared, dump_dir)
+        env: SceneEnv = GroundTruthEnv(task, dynamics, *shared, dump_dir, state_dtype)
     else:
-        how = {"guard": guard, "dump_dir": dump_dir, "differentiable": differentiable}
+        how: dict[str, Any] = {"guard": guard, "dump_dir": dump_dir}
+        how |= {"differentiable": differentiable, "state_dtype": state_dtype}
         env = NeRDEnv(task, dynamics, *shared, **how)
         env = env.compile() if compile else env
     env.render_size, env.camera_id = image_size(render_size), camera_id

@@ -16,6 +16,7 @@ def make_specs(
     rows: torch.Size,
     device: torch.device,
     is_guarded: bool,
+    state_dtype: torch.dtype = torch.float64,
 ) -> Iterator[tuple[str, TensorSpec]]:
     """Name and value of every spec.
 
@@ -25,6 +26,7 @@ def make_specs(
         rows: batch size of the env.
         device: of all tensors.
         is_guarded: whether steps have a ``trust``.
+        state_dtype: of the state and of torques.
     """
 
     def shape(width: int) -> torch.Size:
@@ -35,8 +37,7 @@ def make_specs(
 
     sizes = {**state_sizes, "joint_torque": len(task.scene.actuated)}
     state: dict[str, TensorSpec] = {
-        key: Unbounded(shape(size), device, torch.float64)
-        for key, size in sizes.items()
+        key: Unbounded(shape(size), device, state_dtype) for key, size in sizes.items()
     }
     if is_guarded:
         state[TRUST] = Bounded(0.0, 1.0, shape(1), device, torch.float32)

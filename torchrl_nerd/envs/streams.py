@@ -37,14 +37,21 @@ def stream_offsets(count: int, device: torch.device | str = "cpu") -> Tensor:
     return torch.arange(1, count + 1, device=device) * GOLDEN
 
 
-def uniforms(keys: Tensor, episode: Tensor, offsets: Tensor) -> Tensor:
-    """Uniform numbers in [0, 1), ``(rows, count)``, float64.
+def uniforms(
+    keys: Tensor,
+    episode: Tensor,
+    offsets: Tensor,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
+    """Uniform numbers in [0, 1), ``(rows, count)``.
 
     Args:
         keys: ``(rows,)``, see `row_keys`.
         episode: ``(rows,)`` int64: how many episodes each env has begun.
         offsets: ``(count,)``, see `stream_offsets`.
+        dtype: of the numbers: as many leading bits as it holds.
     """
     keys = _mix(keys + (episode + 1) * GOLDEN)
     bits = _mix(keys[:, None] + offsets)  # (rows, count)
-    return _shift_right(bits, 11).to(torch.float64) * 2.0**-53  # a double's 53 bits
+    held = 53 if dtype == torch.float64 else 24  # bits of a float's fraction
+    return _shift_right(bits, 64 - held).to(dtype) * 2.0**-held

@@ -123,7 +123,8 @@ class Transition:
         self, qpos: Tensor, qvel: Tensor, torque: Tensor, terrain: Tensor | None
     ) -> Tensors:
         state = TensorDict({QPOS: qpos, QVEL: qvel}, qpos.shape[:1], device=qpos.device)
-        return dict(self.dynamics.step(state, torque, terrain).items())
+        moved = dict(self.dynamics.step(state, torque, terrain).items())
+        return moved | {key: moved[key].to(qpos.dtype) for key in (QPOS, QVEL)}
 
     @uncompiled
     def _move_apart(self, *given: Tensor | None) -> Tensors:
@@ -148,7 +149,8 @@ class Transition:
             As `step`, without reward: zero torque, no fault, full trust, not done.
         """
         # drawn for all envs, then selected: shapes stay the same
-        fresh = self.task.initial_state(uniforms(*streams)) | given
+        drawn = uniforms(*streams, state[QPOS].dtype)
+        fresh = self.task.initial_state(drawn) | given
         column, num_torques = rows[:, None], len(self.task.scene.actuated)
         start = {k: torch.where(column, fresh[k], state[k]) for k in state}
         flags = ("done", "terminated", "truncated")
@@ -162,14 +164,18 @@ class Transition:
 
 
 def given_state(
-    tensordict: TensorDictBase | None, rows: Tensor, sizes: Mapping[str, int]
+    tensordict: TensorDictBase | None,
+    rows: Tensor,
+    sizes: Mapping[str, int],
+    dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
-    """The state that ``reset(td, set_state=True)`` asks for, float64 copies.
+    """The state that ``reset(td, set_state=True)`` asks for, copies.
 
     Args:
         tensordict: with ``qpos``, ``qvel`` and, where they vary, the task's parameters.
         rows: ``(num_envs,)``, envs that are reset; only their state must be finite.
         sizes: width of each key of the state.
+        dtype: of the state.
 
     Raises:
         ValueError: a key that is missing, of another shape or not finite.
@@ -189,5 +195,5 @@ def given_state(
             )
         if not value[rows].isfinite().all():
             raise ValueError(f"expected finite {key} to set the state to")
-        values[key] = value.to(rows.device, torch.float64, copy=True)
+        values[key] = value.to(rows.device, dtype, copy=True)
     return values

@@ -3,11 +3,14 @@
 A copy from the host makes an accelerator wait, and cannot be part of a CUDA graph.
 """
 
+import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+Module = TypeVar("Module", bound=nn.Module)
 
 _kept: dict[tuple, Tensor] = {}
 
@@ -27,6 +30,30 @@ def take(x: Tensor, places: Sequence[int], dim: int = -1) -> Tensor:
     if x.device.type == "cpu":  # reads a list as fast, and compiled code knows it
         return x[(slice(None),) * (dim % x.ndim) + (list(places),)]
     return x.index_select(dim, _constant(tuple(places), torch.int64, x.device))
+
+
+def cast_constants(module: Module, dtype: torch.dtype) -> Module:
+    """The module itself, its float64 numbers in another precision, and finite there."""
+    limit = torch.finfo(dtype).max
+    for part in module.modules():
+        for numbers in (part._buffers, part._parameters):
+            for x in numbers.values():
+                if x is not None and x.dtype == torch.float64:
+                    x.data = x.data.clamp(-limit, limit).to(dtype)
+    return module
+
+
+def placed(module: Module, like: Tensor) -> Module:
+    """A module of constants on the device of a state, and in its precision.
+
+    Whoever steps in float64 shares the module itself; others share a copy.
+    """
+    if like.dtype == torch.float64:
+        return module.to(like.device)
+    copies = vars(module).setdefault("_coarse", {})
+    if like.dtype not in copies:
+        copies[like.dtype] = cast_constants(copy.deepcopy(module), like.dtype)
+    return copies[like.dtype].to(like.device)
 
 
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose, keep_constants
+from torchrl_nerd.geometry.constants import placed
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.scenes.contact_points import (
@@ -254,16 +255,15 @@ class Scene:
             none = qpos.new_zeros(*qpos.shape[:-1], 0)
             return none, none[..., None].expand(*none.shape, 3)
         still = qpos.new_zeros(0, self.layout.nv)
-        points, _ = self.point_kinematics.to(qpos.device)(qpos, still)
-        ground = self.terrain_distance.to(qpos.device)
+        points, _ = placed(self.point_kinematics, qpos)(qpos, still)
+        ground = placed(self.terrain_distance, qpos)
         distance, normal = ground(points, terrain, *self.base_pose(qpos))
-        radii = self._radii.to(qpos.device).get_buffer("radii")
-        return distance - radii.to(qpos.dtype), normal
+        radii = placed(self._radii, qpos).get_buffer("radii")
+        return distance - radii, normal
 
     def base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""
-        position, rotation = self._pose.to(qpos.device)(qpos)
-        return position.to(qpos), rotation.to(qpos)
+        return placed(self._pose, qpos)(qpos)
 
     # constants as tensors that stay: compiled code would make them anew of arrays
     @cached_property

@@ -92,12 +92,14 @@ class Normalize(StateTransform):
             self.register_buffer(f"{name}_std", of_key.std.clone())
 
     def normalize(self, key: NestedKey, x: Tensor) -> Tensor:
-        """``(x - mean) / std`` of ``(*batch, D)`` in float64, in the dtype of ``x``."""
-        return ((x.double() - self.mean(key)) / self.std(key)).to(x.dtype)
+        """``(x - mean) / std`` of ``(*batch, D)`` in their dtype, in that of ``x``."""
+        mean = self.mean(key)
+        return ((x.to(mean.dtype) - mean) / self.std(key)).to(x.dtype)
 
     def denormalize(self, key: NestedKey, x: Tensor) -> Tensor:
-        """``mean + std * x`` of ``(*batch, D)`` in float64, in the dtype of ``x``."""
-        return (self.mean(key) + self.std(key) * x.double()).to(x.dtype)
+        """``mean + std * x`` of ``(*batch, D)`` in their dtype, in that of ``x``."""
+        mean = self.mean(key)
+        return (mean + self.std(key) * x.to(mean.dtype)).to(x.dtype)
 
     def mean(self, key: NestedKey) -> Tensor:
         """Mean ``(D,)``, float64."""

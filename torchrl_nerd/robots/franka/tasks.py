@@ -5,7 +5,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchrl_nerd.geometry.constants import constant
+from torchrl_nerd.geometry.constants import constant, placed
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
@@ -57,7 +57,7 @@ class FrankaReachTorque(Task):
     def end_effector(self, qpos: Tensor) -> Tensor:
         """The point between the fingertips, m, world, ``(*batch, 3)``."""
         still = qpos.new_zeros(0, qpos.shape[-1])  # no rows: positions alone
-        points, _ = self._kinematics.to(qpos.device)(qpos, still)
+        points, _ = placed(self._kinematics, qpos)(qpos, still)
         position, rotation = self.scene.base_pose(qpos)
         return position + (rotation @ points[..., 0, :, None]).squeeze(-1)
 
