@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import NeRDEnv, make_env
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.robots import TASKS
 
@@ -41,8 +42,16 @@ def test_it_steps_as_in_float64(task, dynamics, generator):
     fine, coarse = (x["qpos"] for x in found)
     assert not any(x.dtype == torch.float64 for x in found[1].values())
     torch.testing.assert_close(coarse.double(), fine, rtol=0.0, atol=2e-3)
-    if dynamics != "mujoco":
+    if dynamics not in ENGINES:
         check_env_specs(make_env(task, dynamics, 2, state_dtype=torch.float32))
+
+
+def test_suite_tasks_hand_out_float32():
+    """Theirs are float64 numbers of NumPy."""
+    how = {"num_envs": 2, "state_dtype": torch.float32}
+    env = make_env("dm_control/cartpole-swingup", "dm_control", **how)
+    check_env_specs(env)
+    assert env.rollout(2)["qpos"].dtype == torch.float32
 
 
 class _NoFloat64(TorchDispatchMode):

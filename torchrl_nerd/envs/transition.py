@@ -152,7 +152,10 @@ class Transition:
         drawn = uniforms(*streams, state[QPOS].dtype)
         fresh = self.task.initial_state(drawn) | given
         column, num_torques = rows[:, None], len(self.task.scene.actuated)
-        start = {k: torch.where(column, fresh[k], state[k]) for k in state}
+        start = {
+            key: torch.where(column, fresh[key].to(now.dtype), now)
+            for key, now in state.items()
+        }
         flags = ("done", "terminated", "truncated")
         return start | {
             "joint_torque": start[QPOS].new_zeros(len(rows), num_torques),
