@@ -118,14 +118,11 @@ WIDE := --network transformer-4x128 --batch-size 512 --single-step-fraction 0.85
 SECOND := --network transformer-4x128 --lr 0.005 --adamw-lr 0.0015 --rollout-restarts 1 \
 	--save-every 200 --threads 1
 
-model-cube: $(STAMP) ## the cube's transformer: single steps, then rollouts
+model-cube: $(STAMP) ## the cube's transformer: single steps; rollouts did not help
 	$(NERD) data cube --trajectories 8000 --seed 1 --out datasets/cube_wide
 	$(NERD) train cube --data datasets/cube_wide $(WIDE) --predicted-force --steps 7400 \
 		--bf16-fraction 0.7 --loss-eps 0.02 --validate-every 7400 --out runs/cube_wide
-	$(NERD) train cube --init-from runs/cube_wide/last --data datasets/cube_wide $(SECOND) \
-		--predicted-force --loss-eps 0.02 --steps 0 --rollout-steps 2000 \
-		--rollout-lr-ratio 0.15 --validate-every 500 --out runs/cube_on
-	cp runs/cube_on/best/* $(PRETRAINED)/cube/
+	cp runs/cube_wide/last/* $(PRETRAINED)/cube/
 
 model-franka: $(STAMP) ## Franka's transformer: single steps, then data along two policies
 	$(NERD) data franka --trajectories 20000 --seed 1 --out datasets/franka_wide
@@ -137,8 +134,8 @@ model-franka: $(STAMP) ## Franka's transformer: single steps, then data along tw
 	done
 	$(NERD) train franka --init-from runs/franka_wide/last $(SECOND) --out runs/franka_on \
 		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \
-		--single-step-fraction 0.85 --bf16-fraction 0 --steps 8000 --rollout-steps 1500 \
-		--rollout-lr-ratio 0.06 --validate-every 2375
+		--single-step-fraction 0.85 --bf16-fraction 0 --steps 6000 --rollout-steps 1000 \
+		--lr 0.0015 --adamw-lr 0.0005 --rollout-lr-ratio 0.15 --validate-every 2000
 	cp runs/franka_on/best/* $(PRETRAINED)/franka/
 
 model-anymal: $(STAMP) ## ANYmal's transformer: single steps, then data along two policies
@@ -155,7 +152,8 @@ model-anymal: $(STAMP) ## ANYmal's transformer: single steps, then data along tw
 	$(NERD) train anymal --init-from runs/anymal_wide/last $(SECOND) --out runs/anymal_on \
 		--data datasets/anymal_wide datasets/anymal_forward datasets/anymal_sideways \
 		--predicted-force --single-step-fraction 0.85 --bf16-fraction 0.8 --steps 5000 \
-		--rollout-steps 1500 --rollout-lr-ratio 0.25 --validate-every 3250
+		--rollout-steps 1000 --lr 0.002 --adamw-lr 0.0006 --rollout-lr-ratio 0.15 \
+		--validate-every 2500
 	cp runs/anymal_on/best/* $(PRETRAINED)/anymal/
 
 PENDULUM := --network transformer-2x96 --predicted-force --unconstrained-motion --loss-eps 1.0

@@ -8,9 +8,10 @@ from helpers import mujoco_step
 from tensordict import TensorDict
 
 from torchrl_nerd.configs import DataConfig
-from torchrl_nerd.data.generate import generate, load_data
-from torchrl_nerd.data.simulate import LARGEST, is_sound, simulate
+from torchrl_nerd.data.generate import expect_few_dropped, generate, load_data
+from torchrl_nerd.data.simulate import LARGEST, first_beyond, is_sound, simulate
 from torchrl_nerd.files import read_json
+from torchrl_nerd.geometry.manifold import joint_label
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.seeds import fold_in
 
@@ -188,3 +189,21 @@ def test_loading_says_what_is_wrong(tmp_path):
     assert load_data(SCENE, tmp_path).batch_size == (2, 1)
     with pytest.raises(ValueError, match=f"'{SCENE.name}'.*expected '{OTHER.name}'"):
         load_data(OTHER, tmp_path)
+
+
+def test_many_dropped_trajectories_are_refused_by_name(scene, generator):
+    """The first to leave the bounds is named; a few may."""
+    data = simulate(scene, 4, 3, generator)
+    name = joint_label(scene.model, scene.model.njnt - 1)
+    for row, step in ((1, 2), (2, 0)):
+        data["next", "qvel"][row, step:, -1] = 2.0 * LARGEST
+        data["next", "qpos"][row, step + 1 :] = torch.inf
+    data["next", "qpos"][3, 1:] = data["next", "qvel"][3, 1:] = torch.nan
+    assert is_sound(data).tolist() == [True, False, False, False]
+    found = first_beyond(scene, data[1:])
+    assert found == [f"qvel of joint '{name}'"] * 2 + ["MuJoCo"]
+    card = {"trajectories": 95, "dropped": 5, "beyond": {found[0]: 4, "MuJoCo": 1}}
+    expect_few_dropped(card)
+    card["trajectories"] = 94
+    with pytest.raises(ValueError, match="5 of 99 did not; first beyond it: qvel of"):
+        expect_few_dropped(card)

@@ -239,3 +239,24 @@ def test_actions_become_torque_through_the_tasks_controller(name, random_actions
 
 def state_of(state):
     return {key: state[key] for key in ("qpos", "qvel")}
+
+
+@pytest.mark.parametrize("base", ["", "<freejoint/>"])
+def test_joints_without_a_name_count_one_by_one(base, rng):
+    """A fixed base has an error for each; a floating one their mean."""
+    body = '<body pos="0 0 1"><geom size="0.1"/>{joint}{inside}</body>'
+    slide, hinge = ('<joint type="slide"/>', '<joint axis="0 1 0"/>')
+    leg = body.format(joint=hinge, inside=body.format(joint=slide, inside=""))
+    inside = leg + (leg if base else "")
+    xml = body.format(joint=base or hinge, inside=inside)
+    scene = make_scene(f"<mujoco><worldbody>{xml}</worldbody></mujoco>")
+    paths = list(random_paths(scene, rng))
+    found = summarize(scene, position_errors(scene, *paths))
+    units = {name: error.unit for name, error in found.items()}
+    if not base:
+        assert units == {"joint 0": "rad", "joint 1": "rad", "joint 2": "m"}
+        return
+    assert list(units) == ["base_position", "base_orientation", "joints"]
+    apart = (paths[0] - paths[1]).abs().numpy()[..., 7:]  # hinge, slide, hinge, slide
+    apart[..., ::2] = wrapped(apart[..., ::2])
+    assert found["joints"].mean == pytest.approx(apart.mean())

@@ -19,7 +19,9 @@ from torchrl_nerd.robots.double_pendulum.scene import (
 from torchrl_nerd.scenes.contact_points import (
     MARGIN_PER_RADIUS,
     MIN_MARGIN,
+    ground_geoms,
     own_contacts,
+    shape_points,
 )
 from torchrl_nerd.transforms import ContactFeatures
 
@@ -216,3 +218,36 @@ def test_own_contacts_are_mujocos(model):
     found = {tuple(sorted(pair)) for pair in data.contact.geom.tolist()}
     found = {pair for pair in found if moves[list(pair)].all()}
     assert {tuple(sorted(pair)) for pair in own_contacts(model)} == found
+
+
+GROUNDED = """<mujoco><worldbody>
+  <geom name="floor" type="plane" size="0 0 1"/>
+  <body name="fixed" pos="2 0 0"><geom type="box" size="1 1 1" contype="4"/></body>
+  <body name="a" pos="0 0 2"><freejoint/><geom name="a" size="0.1"/>
+    <body name="b"><joint axis="0 1 0"/><geom name="b" size="0.1"/></body>
+    <body name="c"><joint axis="1 0 0"/><geom name="c" size="0.1" contype="0"
+      conaffinity="0"/></body>
+    <body name="d"><joint axis="0 0 1"/><geom name="d" size="0.1" contype="0"
+      conaffinity="4"/></body></body>
+  </worldbody><contact><exclude body1="world" body2="b"/>{pairs}</contact></mujoco>"""
+PAIRS = ("", '<pair geom1="floor" geom2="c"/>', '<pair geom1="b" geom2="floor"/>')
+
+
+@pytest.mark.parametrize("pairs", PAIRS, ids=["none", "unlike", "excluded"])
+def test_the_ground_s_contacts_are_mujocos(pairs):
+    """Excluded bodies do not touch it, and explicit pairs always do."""
+    model = mujoco.MjModel.from_xml_string(GROUNDED.format(pairs=pairs))
+    wide = copy.copy(model)
+    wide.geom_margin[:] = 10.0
+    wide.pair_margin[:] = 10.0
+    data = mujoco.MjData(wide)
+    mujoco.mj_forward(wide, data)
+    moves = model.body_dofnum[model.body_weldid[model.geom_bodyid]] > 0
+    found = [pair for pair in data.contact.geom.tolist() if moves[pair].sum() == 1]
+    grounds, robots = (
+        {geom for pair in found for geom in pair if moves[geom] == kind}
+        for kind in (False, True)
+    )
+    assert set(ground_geoms(model)) == grounds
+    bodies = shape_points(model)[0]
+    assert set(bodies) == {int(model.geom_bodyid[geom]) for geom in robots}

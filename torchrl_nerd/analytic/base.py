@@ -92,6 +92,7 @@ def check_supported(scene: Scene) -> None:
         "dry friction": model.dof_frictionloss.any(),
         "air or water": model.opt.density or model.opt.viscosity,
         "self-contact": own_contacts(model),
+        "contact pairs with a law of their own": model.npair,
         "gravity compensation": model.body_gravcomp.any(),
     }
     found = ", ".join(name for name, is_there in forces.items() if is_there)

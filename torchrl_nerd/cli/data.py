@@ -23,6 +23,7 @@ from torchrl_nerd.data.generate import (
     CARD,
     Draw,
     draw_chunk,
+    expect_few_dropped,
     generate,
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
@@ -95,7 +96,8 @@ class Data(Command):
         """Write the data set and return its card.
 
         Raises:
-            ValueError: options that exclude each other; see `generate`, `load_recording`.
+            ValueError: options that exclude each other, or too many trajectories that had
+                to be dropped; see `generate`, `load_recording`.
         """
         if self.recorded is not None:
             if self.policy is not None:
@@ -116,4 +118,5 @@ class Data(Command):
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
         )
+        expect_few_dropped(card)
         return card

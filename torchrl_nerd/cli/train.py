@@ -17,7 +17,7 @@ from torchrl_nerd.cli.options import (
     scene_of,
 )
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import CARD, generate, load_data
+from torchrl_nerd.data.generate import CARD, expect_few_dropped, generate, load_data
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import read_json, writable_folder
 from torchrl_nerd.modules.nerd import NeRD
@@ -125,6 +125,7 @@ class Train(DeviceCommand):
             writable_folder(folder)
         if _is_missing(folders):
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
+            expect_few_dropped(read_json(folders[0] / CARD))
         if self.threads:
             torch.set_num_threads(self.threads)
         protocol = protocol_of(scene)

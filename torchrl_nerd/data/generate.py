@@ -6,6 +6,7 @@ varies, ``terrain``; under ``next`` the same state keys and ``joint_torque``.
 """
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from functools import partial
@@ -19,7 +20,7 @@ from tqdm import tqdm
 
 from torchrl_nerd import __version__
 from torchrl_nerd.configs import DataConfig
-from torchrl_nerd.data.simulate import is_sound, simulate
+from torchrl_nerd.data.simulate import LARGEST, first_beyond, is_sound, simulate
 from torchrl_nerd.data.store import (
     chunk_path,
     expect_finite,
@@ -33,6 +34,7 @@ from torchrl_nerd.seeds import fold_in
 
 CHUNK = 2048  # trajectories simulated together; a killed process loses at most these
 CARD = "data.json"
+MOST_DROPPED = 0.05  # share of trajectories; more, and the data are not the robot's
 
 Draw = Callable[[int, int, Generator], TensorDict]
 """``(rows, steps, generator) -> trajectories [rows, steps]``, diverged ones included."""
@@ -90,14 +92,36 @@ def generate(
     ) as bar:
         drawn = mapper(partial(draw_chunk, draw, config), chunks)
         for (number, rows), data in zip(chunks, drawn, strict=True):
-            kept = cast(TensorDict, data[is_sound(data)])
+            sound = is_sound(data)
+            kept = cast(TensorDict, data[sound])
             write_chunk(kept, chunk_path(folder, number))
             card["trajectories"] += len(kept)
             card["dropped"] += rows - len(kept)
+            counts = Counter(card.setdefault("beyond", {}))
+            counts.update(first_beyond(scene, cast(TensorDict, data[~sound])))
+            card["beyond"] = dict(counts)
             card["chunks_done"] = number + 1
             write_json(folder / CARD, card)
             bar.update(rows * config.steps)
     return folder
+
+
+def expect_few_dropped(card: dict[str, Any]) -> None:
+    """Refuse a data set of which more than `MOST_DROPPED` had to be dropped.
+
+    Raises:
+        ValueError: how many, and what left the bounds first.
+    """
+    dropped, kept = card["dropped"], card["trajectories"]
+    if dropped <= MOST_DROPPED * (dropped + kept):
+        return
+    beyond = Counter(card.get("beyond", {})).most_common(3)
+    first = ", ".join(f"{name} in {count}" for name, count in beyond)
+    raise ValueError(
+        f"expected nearly all trajectories to stay within {LARGEST:g}, {dropped} of "
+        f"{dropped + kept} did not; first beyond it: {first}. Give the robot narrower "
+        "ranges, weaker actuators or more damping, or a shorter timestep"
+    )
 
 
 def load_data(scene: Scene, *folders: Path) -> TensorDict:

@@ -2,11 +2,13 @@
 
 from typing import cast
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
+from torchrl_nerd.geometry.manifold import joint_label
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_torques
@@ -55,6 +57,27 @@ def as_transitions(
         steps = data.batch_size[1]
         data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
     return data
+
+
+def first_beyond(scene: Scene, data: TensorDictBase) -> list[str]:
+    """What was the first to leave the bounds, in each of trajectories that are not sound.
+
+    A joint's position or velocity, or MuJoCo's solver, which gave up on the whole state.
+    """
+    model, names = scene.model, []
+    for key, width, addresses in (
+        (QPOS, model.nq, model.jnt_qposadr),
+        (QVEL, model.nv, model.jnt_dofadr),
+    ):
+        joints = np.searchsorted(addresses, np.arange(width), side="right") - 1
+        names += [f"{key} of joint '{joint_label(model, int(j))}'" for j in joints]
+    found = []
+    for path in torch.cat((data["next", QPOS], data["next", QVEL]), -1).numpy():
+        is_beyond = ~(np.abs(path) < LARGEST)  # (steps, nq + nv)
+        step = int(is_beyond.any(-1).argmax())
+        gave_up = np.isnan(path[step]).all()
+        found.append("MuJoCo" if gave_up else names[int(is_beyond[step].argmax())])
+    return found
 
 
 def is_sound(data: TensorDictBase) -> Tensor:

@@ -15,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics
+from torchrl_nerd.geometry.manifold import joint_label
 from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
@@ -164,7 +165,7 @@ def position_errors(
     """Error of every quantity at every step, ``(n, steps)``, from ``(n, steps, nq)``.
 
     A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
-    over ``joints`` (rad); a fixed base gives one entry per joint, by name.
+    over ``joints`` (rad); a fixed base gives one entry per joint, see `joint_label`.
     """
     model, both, joints = scene.model, (ground_truth, other), {}
     for joint in range(model.njnt):
@@ -177,7 +178,7 @@ def position_errors(
             error = ground_truth[..., q] - other[..., q]  # (n, steps)
             is_hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
             error = (wrap_angle(error) if is_hinge else error).abs()
-        joints[model.joint(joint).name] = error
+        joints[joint_label(model, joint)] = error
     if not scene.base.is_floating:
         return joints
     q = scene.base.qpos_address
@@ -194,12 +195,11 @@ def position_errors(
 
 def unit_of(scene: Scene, quantity: str) -> str:
     """Unit of a quantity of `position_errors`: m or rad."""
-    if quantity == "base_position":
-        return "m"
-    if quantity in ("base_orientation", "joints"):
-        return "rad"
-    is_slide = scene.model.joint(quantity).type[0] == mujoco.mjtJoint.mjJNT_SLIDE
-    return "m" if is_slide else "rad"
+    if scene.base.is_floating:
+        return "m" if quantity == "base_position" else "rad"
+    model = scene.model
+    kinds = {joint_label(model, i): model.jnt_type[i] for i in range(model.njnt)}
+    return "m" if kinds[quantity] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
 
 
 def interval_of_mean(samples: Tensor) -> float:

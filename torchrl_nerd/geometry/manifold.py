@@ -66,6 +66,11 @@ class JointLayout:
         return tuple((slice(q, q + n), slice(v, v + n)) for q, v, n in found)
 
 
+def joint_label(model: mujoco.MjModel, joint: int) -> str:
+    """A joint's name; ``joint 3`` where it has none."""
+    return model.joint(joint).name or f"joint {joint}"
+
+
 def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
     """``qpos`` moved along ``tangent`` (velocity times time), ``(*batch, nq)``.
 

@@ -6,6 +6,7 @@ that no joint can move are dropped: the ground cannot do work on them, but for f
 the rim of a cap that turns on the spot.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -72,9 +73,9 @@ def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarr
     ValueError where a shape is none of sphere, capsule, box.
     """
     bodies, positions, radii = [], [], []
-    grounds = ground_geoms(model)
+    grounds, is_pair = ground_geoms(model), collision_filter(model)
     for geom in _moving_geoms(model):
-        if any(_collide(model, geom, ground) for ground in grounds):
+        if any(is_pair(geom, ground) for ground in grounds):
             points, radius = _points_of(model, geom)
             bodies += [int(model.geom_bodyid[geom])] * len(points)
             positions += list(points)
@@ -87,33 +88,47 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
     if model.opt.disableflags & NO_CONTACT:
         return []
     moving, weld = _moving_geoms(model), model.body_weldid[model.geom_bodyid]
+    is_pair = collision_filter(model)
     is_ground = (weld == 0) | (model.body_mocapid[weld] >= 0)
     return [
         geom
         for geom in np.flatnonzero(is_ground).tolist()
-        if any(_collide(model, geom, other) for other in moving)
+        if any(is_pair(geom, other) for other in moving)
     ]
 
 
 def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Pairs of the robot's own shapes between which MuJoCo detects contact.
-
-    Not those of one body, of a body and its parent, or that the model excludes. Source:
-    https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
-    """
+    """Pairs of the robot's own shapes between which MuJoCo detects contact."""
     if model.opt.disableflags & NO_CONTACT:
         return []
+    is_pair = collision_filter(model)
+    return [pair for pair in combinations(_moving_geoms(model), 2) if is_pair(*pair)]
+
+
+def collision_filter(model: mujoco.MjModel) -> Callable[[int, int], bool]:
+    """Whether MuJoCo looks for contact between two geoms, one of which moves.
+
+    Explicit pairs always. Else not those of one body, of a body and its parent (but for
+    the world), or that the model excludes, and only those whose bits say so. Source:
+    https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
+    """
     keep_parents = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     weld, excluded = model.body_weldid, set(model.exclude_signature.tolist())
-    pairs = list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
-    for pair in combinations(_moving_geoms(model), 2):
-        low, high = sorted(int(model.geom_bodyid[geom]) for geom in pair)
-        top, other = sorted((int(weld[low]), int(weld[high])))
-        is_parent = top == weld[model.body_parentid[other]] and not keep_parents
-        is_out = top == other or is_parent or (low << 16) + high in excluded
-        if not is_out and _collide(model, *pair):
-            pairs.append(pair)
-    return pairs
+    ends = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    pairs = {tuple(sorted(pair)) for pair in ends}
+    kinds, partners = model.geom_contype, model.geom_conaffinity
+
+    def is_pair(geom: int, other: int) -> bool:
+        if tuple(sorted((geom, other))) in pairs:
+            return True
+        low, high = sorted(int(model.geom_bodyid[x]) for x in (geom, other))
+        top, below = sorted((int(weld[low]), int(weld[high])))
+        is_parent = 0 < top == weld[model.body_parentid[below]] and not keep_parents
+        if top == below or is_parent or (low << 16) + high in excluded:
+            return False
+        return bool(kinds[geom] & partners[other] or kinds[other] & partners[geom])
+
+    return is_pair
 
 
 def geom_label(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
@@ -125,11 +140,6 @@ def geom_label(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
 def _moving_geoms(model: mujoco.MjModel) -> list[int]:
     weld = model.body_weldid[model.geom_bodyid]
     return np.flatnonzero(model.body_dofnum[weld]).tolist()
-
-
-def _collide(model: mujoco.MjModel, geom: int, other: int) -> bool:
-    kinds, partners = model.geom_contype, model.geom_conaffinity
-    return bool(kinds[geom] & partners[other] or kinds[other] & partners[geom])
 
 
 def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE, joint_label
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.support import DISABLE, silence_mujoco, unit_gravity
@@ -68,7 +68,7 @@ def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
     free, rng = _without(model, LIMIT), np.random.default_rng(0)
     effects: list[Effect] = []
     for joint in np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE))).tolist():
-        name = model.joint(joint).name or f"joint {joint}"
+        name = joint_label(model, joint)
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         for key, address in ((QPOS, q), (QVEL, v)):
             change = _largest_change(free, substeps, rng, _shift(key, address))
