@@ -114,47 +114,36 @@ model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data a
 # On two cores the same takes a day. The second stage is short and runs anywhere.
 DEVICE := cpu
 WIDE := --network transformer-4x128 --batch-size 512 --single-step-fraction 0.85 \
-	--rollout-steps 0 --warmup 300 --save-every 500 --device $(DEVICE)
+	--rollout-steps 0 --warmup 300 --validate-every 2000 --device $(DEVICE)
 SECOND := --network transformer-4x128 --lr 0.005 --adamw-lr 0.0015 --rollout-restarts 1 \
 	--save-every 200 --threads 1
 
 model-cube: $(STAMP) ## the cube's transformer: single steps; rollouts did not help
 	$(NERD) data cube --trajectories 8000 --seed 1 --out datasets/cube_wide
 	$(NERD) train cube --data datasets/cube_wide $(WIDE) --predicted-force --steps 7400 \
-		--bf16-fraction 0.7 --loss-eps 0.02 --validate-every 7400 --out runs/cube_wide
+		--bf16-fraction 0.7 --loss-eps 0.02 --out runs/cube_wide
 	cp runs/cube_wide/last/* $(PRETRAINED)/cube/
 
 model-franka: $(STAMP) ## Franka's transformer: single steps, then data along two policies
 	$(NERD) data franka --trajectories 20000 --seed 1 --out datasets/franka_wide
 	$(NERD) train franka --data datasets/franka_wide $(WIDE) --steps 16900 \
-		--bf16-fraction 0 --validate-every 16900 --out runs/franka_wide
+		--bf16-fraction 0 --out runs/franka_wide
+	$(NERD) data franka --trajectories 10000 --seed 1 --out datasets/franka_on
 	for task in reach reach_osc; do \
 		$(NERD) data franka --policy torchrl_nerd/policies/franka-$$task --noise 0.3 \
 			--trajectories 3000 --seed 11 --out datasets/franka_$$task || exit 1; \
 	done
 	$(NERD) train franka --init-from runs/franka_wide/last $(SECOND) --out runs/franka_on \
-		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \
+		--data datasets/franka_on datasets/franka_reach datasets/franka_reach_osc \
 		--single-step-fraction 0.85 --bf16-fraction 0 --steps 6000 --rollout-steps 1000 \
 		--lr 0.0015 --adamw-lr 0.0005 --rollout-lr-ratio 0.15 --validate-every 2000
 	cp runs/franka_on/best/* $(PRETRAINED)/franka/
 
-model-anymal: $(STAMP) ## ANYmal's transformer: single steps, then data along two policies
+model-anymal: $(STAMP) ## ANYmal's transformer: single steps; data along a policy did not help
 	$(NERD) data anymal --trajectories 20000 --seed 1 --out datasets/anymal_wide
 	$(NERD) train anymal --data datasets/anymal_wide $(WIDE) --predicted-force --steps 10500 \
-		--bf16-fraction 0.7 --validate-every 10500 --out runs/anymal_wide
-	for task in forward sideways; do \
-		$(PY) examples/ppo.py --task anymal/$$task --dynamics runs/anymal_wide/last \
-			--out runs/ppo_anymal_$$task --horizon 16 --minibatch 8192 --lr 1e-3 \
-			--total-frames 5000000 --episodes 256 || exit 1; \
-		$(NERD) data anymal --policy runs/ppo_anymal_$$task --noise 0.3 --trajectories 3000 \
-			--seed 11 --out datasets/anymal_$$task || exit 1; \
-	done
-	$(NERD) train anymal --init-from runs/anymal_wide/last $(SECOND) --out runs/anymal_on \
-		--data datasets/anymal_wide datasets/anymal_forward datasets/anymal_sideways \
-		--predicted-force --single-step-fraction 0.85 --bf16-fraction 0.8 --steps 5000 \
-		--rollout-steps 1000 --lr 0.002 --adamw-lr 0.0006 --rollout-lr-ratio 0.15 \
-		--validate-every 2500
-	cp runs/anymal_on/best/* $(PRETRAINED)/anymal/
+		--bf16-fraction 0.7 --out runs/anymal_wide
+	cp runs/anymal_wide/last/* $(PRETRAINED)/anymal/
 
 PENDULUM := --network transformer-2x96 --predicted-force --unconstrained-motion --loss-eps 1.0
 
@@ -162,7 +151,7 @@ model-double_pendulum: $(STAMP) ## the double pendulum's transformer: single ste
 	$(NERD) data double_pendulum --trajectories 40000 --seed 1 --out datasets/pendulum_wide
 	$(NERD) train double_pendulum --data datasets/pendulum_wide $(WIDE) $(PENDULUM) \
 		--single-step-fraction 0.75 --bf16-fraction 0.5 --steps 28100 \
-		--validate-every 28100 --out runs/pendulum_wide
+		--out runs/pendulum_wide
 	$(NERD) data double_pendulum --trajectories 60000 --out datasets/pendulum_on
 	$(NERD) train double_pendulum --init-from runs/pendulum_wide/last $(SECOND) $(PENDULUM) \
 		--data datasets/pendulum_on --lr 0.004 --adamw-lr 0.0012 --steps 0 \

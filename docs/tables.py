@@ -158,7 +158,8 @@ def kinematics_table(folder: Path = RESULTS) -> str:
 def transfer_table(folder: Path = RESULTS) -> str:
     """Returns of the policies of franka/reach_osc in each dynamics."""
     table = [["policy", "dynamics", "kind", "return", "difference (%)"]]
-    records = read("transfer_franka", folder).values()
+    paths = sorted(folder.glob("transfer_franka_reach_osc*.json"))
+    records = [json.loads(path.read_text()) for path in paths]
     for record in records:
         results = record["results"]
         for row in results["returns"]:

@@ -61,16 +61,14 @@ def make_policy_and_critic(env: EnvBase, cfg: Run) -> tuple[Policy, ValueOperato
     """Both see observations standardised by all seen so far, at first by random actions."""
     policy = Policy.for_env(env, cfg.horizon, cfg.widths, cfg.std, cfg.frame_stack)
     critic = nn.Sequential(policy.standardize, mlp((policy.sizes[0], *cfg.widths, 1)))
-    critic = critic.to(env.device)
-    return policy, ValueOperator(critic)
+    return policy, ValueOperator(critic.to(env.device))
 
 
 def make_learning(
     actor: ProbabilisticActor, critic: ValueOperator, cfg: Run
 ) -> tuple[GAE, ClipPPOLoss, Adam]:
     """What `update` takes beside a batch."""
-    device = next(critic.parameters()).device
-    how = {"value_network": critic, "device": device}
+    how = {"value_network": critic, "device": next(critic.parameters()).device}
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, **how)
     loss = ClipPPOLoss(actor, critic, clip_epsilon=cfg.clip, entropy_bonus=False)
     loss.normalize_advantage = True
@@ -102,14 +100,9 @@ def num_frames(cfg: Run) -> tuple[int, int]:
 def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:
     """Batches ``[num_envs, horizon]`` of an actor that learns between them."""
     frames, total = num_frames(cfg)
-    return Collector(
-        env,
-        actor,
-        frames_per_batch=frames,
-        total_frames=total,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,  # the actor needs none
-    )
+    how = {"frames_per_batch": frames, "total_frames": total, "track_traj_ids": False}
+    how["auto_register_policy_transforms"] = False  # the actor needs none
+    return Collector(env, actor, **how)
 
 
 def train(

@@ -59,9 +59,9 @@ RESULTS = {  # row of README -> scene, case, learned model
     "Cartpole": ("cartpole", "passive", "cartpole"),
     "double pendulum": ("double_pendulum", "terrain 1", "double_pendulum"),
     "Ant": ("ant", "passive", "ant"),
-    "ANYmal": ("anymal", "standing", "anymal-mlp"),
-    "Franka": ("franka", "random", "franka-mlp"),
-    "cube": ("cube", "toss", "cube-mlp"),
+    "ANYmal": ("anymal", "standing", "anymal"),
+    "Franka": ("franka", "random", "franka"),
+    "cube": ("cube", "toss", "cube"),
 }
 QUANTITIES = {
     "cart position": "slider",
@@ -379,7 +379,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
         ("bench_robot", {"errors": errors, "rates": [rate], "steps": 100}),
         ("stability_robot", {"drop": {"passes": False}}),
         ("kinematics_libraries", [chain]),
-        ("transfer_franka_x", {"policy": "runs/p", "returns": [earned]}),
+        ("transfer_franka_reach_osc_x", {"policy": "runs/p", "returns": [earned]}),
         ("state_dtype", {"ant": precise}),
         (
             "gpu/b_rates",

@@ -100,9 +100,10 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     """The model of that name, which `make_env` and every command take.
 
     Args:
-        name_or_folder: a shipped model, a scene (``"cube"`` stands for its learned model
-            ``"cube-mlp"``) or a checkpoint folder. For a given scene also ``"nerd"`` (its
-            learned model), ``"hybrid"``, ``"analytic"``, or an analytic step in `STEPS`.
+        name_or_folder: a shipped model, a scene (``"cube_real"`` stands for its learned
+            model ``"cube_real-mlp"``) or a checkpoint folder. For a given scene also
+            ``"nerd"`` (its learned model), ``"hybrid"``, ``"analytic"``, or an analytic
+            step in `STEPS`.
         scene: the robot; by default that of the model.
 
     Raises:
@@ -133,7 +134,7 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
 
 
 def model_name(name: str | Path, scene: Scene | None = None) -> str:
-    """The model that a name stands for: ``"cube-mlp"`` for ``"nerd"`` or ``"cube"``.
+    """The model that a name stands for: of a cube ``"cube"`` for ``"nerd"``.
 
     What stands for nothing else, or for nothing at all, is returned as it is.
     """

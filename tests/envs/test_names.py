@@ -43,10 +43,10 @@ def test_a_refusal_lists_all_that_there_is():
 
 
 def test_a_scene_stands_for_its_learned_model_as_it_does_in_from_pretrained():
-    task = "cube/toss"
-    env, expected = make_env(task, "cube"), from_pretrained("cube").state_dict()
+    task, scene = "cube_slope/toss", "cube_slope"
+    env, expected = make_env(task, scene), from_pretrained(scene).state_dict()
     weights = env.dynamics.model.state_dict()
-    assert env.model_name == make_env(task, "nerd").model_name == "cube-mlp"
+    assert env.model_name == make_env(task, "nerd").model_name == "cube_slope-mlp"
     assert make_env(TASK, "nerd").model_name == "ant"
     assert all(weights[key].equal(value) for key, value in expected.items())
 

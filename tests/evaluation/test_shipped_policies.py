@@ -34,8 +34,8 @@ def test_they_are_of_tasks_that_have_a_goal() -> None:
 LOST = {
     "cartpole/swingup": 0.01,
     "ant/run": 0.2,
-    "franka/reach": 0.4,
-    "franka/reach_osc": 0.1,
+    "franka/reach": 0.02,
+    "franka/reach_osc": 0.01,
 }
 """Largest part of MuJoCo's return that the network's own error may cost or add."""
 

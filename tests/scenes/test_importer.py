@@ -10,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.cli import main
 from torchrl_nerd.configs import NO_PREDICTIONS
@@ -23,6 +24,7 @@ from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.controllers import ActuatorController
+from torchrl_nerd.tasks import SceneTask
 from torchrl_nerd.transforms import StateDelta
 
 ROWS = 20
@@ -478,3 +480,27 @@ def test_ranges_that_cannot_be_are_refused(ranges, why, tmp_path):
 def test_what_is_no_name_is_no_scene(name):
     with pytest.raises(ValueError, match="unknown scene .*, expected one of"):
         load_scene(name)
+
+
+FLOATING = """<mujoco><worldbody>{ground}<body pos="0 0 1"><freejoint/><geom size="0.1"/>
+  </body></worldbody></mujoco>"""
+
+
+def test_a_plane_for_a_file_without_ground(tmp_path):
+    """The robot comes to rest on it, as on a plane of the file; two are one too many."""
+    bare, grounded = (tmp_path / f"{name}.xml" for name in ("bare", "grounded"))
+    bare.write_text(FLOATING.format(ground=""))
+    grounded.write_text(FLOATING.format(ground='<geom type="plane" size="0 0 1"/>'))
+    assert Scene.from_mjcf(bare).terrain is None
+    scenes = [Scene.from_mjcf(bare, terrain="plane"), Scene.from_mjcf(grounded)]
+    heights = []
+    for scene in scenes:
+        env = make_env(SceneTask(scene), "mujoco", seed=0)
+        heights.append(
+            env.rollout(200, break_when_any_done=False)["next", "qpos"][..., 2]
+        )
+    assert torch.equal(*heights) and abs(float(heights[0][0, -1]) - 0.1) < 0.01
+    with pytest.raises(ValueError, match="no ground beside a plane"):
+        Scene.from_mjcf(grounded, terrain="plane")
+    with pytest.raises(ValueError, match="terrain 'plane' or None, got 'hills'"):
+        Scene.from_mjcf(bare, terrain="hills")  # pyright: ignore

@@ -158,7 +158,11 @@ def _state_meaning(scene: Scene) -> str:
 def _terrain(scene: Scene, has_normal: bool) -> str:
     terrain = scene.terrain
     if terrain is None:
-        return "none that the robot can touch"
+        falls = (
+            '; it falls freely, unless Scene.from_mjcf(..., terrain="plane") adds one'
+        )
+        is_free = scene.base.is_floating
+        return "none that the robot can touch" + (falls if is_free else "")
     planes = sum(surface.kind == PLANE for surface in terrain.surfaces)
     where = "drawn for each trajectory" if terrain.is_per_row else "fixed"
     normal = "a feature" if has_normal else "no feature: it follows from the state"

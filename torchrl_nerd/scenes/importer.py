@@ -38,20 +38,33 @@ LEAST_SPEED = 1.0  # m/s or rad/s: where nothing falls and nothing pushes
 DRAWS = 4096  # of actions and states, to find the largest torques
 
 
-def read_mjcf(path: Path, control_step: float | None) -> tuple[mujoco.MjModel, int]:
+def read_mjcf(
+    path: Path, control_step: float | None, terrain: str | None = None
+) -> tuple[mujoco.MjModel, int]:
     """Model and substeps of an MJCF file, at a control step or the one nearest to 0.02 s.
 
+    With terrain ``"plane"`` level ground is added to it.
+
     Raises:
-        ValueError: in one sentence, no file, MuJoCo's complaint, or a control step of no
-            whole number of timesteps.
+        ValueError: in one sentence, no file, MuJoCo's complaint, a control step of no
+            whole number of timesteps, or ground that cannot be added.
     """
     if not path.is_file():
         raise ValueError(f"expected an MJCF file, found none at {path}")
+    if terrain not in (None, "plane"):
+        raise ValueError(f"expected terrain 'plane' or None, got {terrain!r}")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         complaint = " ".join(str(error).split())
         raise ValueError(f"MuJoCo cannot compile {path}: {complaint}") from None
+    if terrain is not None:
+        if ground_geoms(model):
+            raise ValueError(f"expected no ground beside a plane in {path}, got some")
+        spec = mujoco.MjSpec.from_file(str(path))
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        spec.worldbody.add_geom(type=plane, size=(0.0, 0.0, 1.0))
+        model = spec.compile()
     timestep = model.opt.timestep
     if control_step is None:
         return model, max(1, round(CONTROL_STEP / timestep))

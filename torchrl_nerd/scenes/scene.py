@@ -4,7 +4,7 @@ import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -71,6 +71,7 @@ class Scene:
         path: str | Path,
         control_step: float | None = None,
         name: str | None = None,
+        terrain: Literal["plane"] | None = None,
         **ranges: Any,
     ) -> "Scene":
         """The robot in an MJCF file, driven by its own actuators.
@@ -79,14 +80,15 @@ class Scene:
             path: the file.
             control_step: s; by default the whole number of timesteps nearest to 0.02 s.
             name: the scene's name; by default the path.
+            terrain: ``"plane"`` adds level ground at z = 0 to a file that has none.
             ranges: fields of `Sampling` in place of those that follow from the joints'
                 limits and the actuators' strengths.
 
         Raises:
-            ValueError: a file that is not there or does not compile, or a robot with
-                something not supported (named).
+            ValueError: a file that is not there or does not compile, a robot with
+                something not supported (named), or a plane beside another ground.
         """
-        parts = read_mjcf(Path(path), control_step)
+        parts = read_mjcf(Path(path), control_step, terrain)
         return cls._from(name or str(path), *parts, ranges)
 
     @classmethod
