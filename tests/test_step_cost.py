@@ -18,7 +18,7 @@ KINDS = ("mlp-4x64", "mlp-1x32", "gru", "transformer-2x64", "paper")
 
 
 def closed_form(network: str, inputs: int, outputs: int) -> int:
-    """Multiplications and additions of one token."""
+    """Multiplications and additions in the matrix products of one token."""
     config = NETWORKS[network]
     width = config.width
     embed, head = inputs * width, width * HEAD_WIDTH + HEAD_WIDTH * outputs
@@ -27,8 +27,8 @@ def closed_form(network: str, inputs: int, outputs: int) -> int:
     feed_forward = 2 * width * 4 * width
     if isinstance(config, MLPConfig):
         return 2 * (embed + config.depth * feed_forward + head)
-    attention = 4 * width**2 + 2 * (config.band - 1) * width
-    return 2 * (embed + config.layers * (attention + feed_forward) + head)
+    # scores and means of the past are sums of products, not matrix products
+    return 2 * (embed + config.layers * (4 * width**2 + feed_forward) + head)
 
 
 def state_of(scene, rows, generator):
@@ -59,7 +59,7 @@ def test_compiled_and_window_steps_are_counted_and_true_ones_are_not(generator):
     assert flop(compile=True) == flop()
     size = int(torch.randint(2, 12, (), generator=generator))
     width, layers = model.config.width, model.config.layers
-    seen = 4 * (size**2 - size * (model.config.band - 1)) * width * layers
+    seen = 4 * size**2 * width * layers  # there scores are matrix products
     streamed = closed_form(
         "transformer-2x64", model.scene_features.size, model.state_delta.size
     )

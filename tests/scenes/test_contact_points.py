@@ -220,7 +220,7 @@ def test_own_contacts_are_mujocos(model):
     assert {tuple(sorted(pair)) for pair in own_contacts(model)} == found
 
 
-GROUNDED = """<mujoco><worldbody>
+WITH_FLOOR = """<mujoco><worldbody>
   <geom name="floor" type="plane" size="0 0 1"/>
   <body name="fixed" pos="2 0 0"><geom type="box" size="1 1 1" contype="4"/></body>
   <body name="a" pos="0 0 2"><freejoint/><geom name="a" size="0.1"/>
@@ -236,7 +236,7 @@ PAIRS = ("", '<pair geom1="floor" geom2="c"/>', '<pair geom1="b" geom2="floor"/>
 @pytest.mark.parametrize("pairs", PAIRS, ids=["none", "unlike", "excluded"])
 def test_the_ground_s_contacts_are_mujocos(pairs):
     """Excluded bodies do not touch it, and explicit pairs always do."""
-    model = mujoco.MjModel.from_xml_string(GROUNDED.format(pairs=pairs))
+    model = mujoco.MjModel.from_xml_string(WITH_FLOOR.format(pairs=pairs))
     wide = copy.copy(model)
     wide.geom_margin[:] = 10.0
     wide.pair_margin[:] = 10.0

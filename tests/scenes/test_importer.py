@@ -488,11 +488,11 @@ FLOATING = """<mujoco><worldbody>{ground}<body pos="0 0 1"><freejoint/><geom siz
 
 def test_a_plane_for_a_file_without_ground(tmp_path):
     """The robot comes to rest on it, as on a plane of the file; two are one too many."""
-    bare, grounded = (tmp_path / f"{name}.xml" for name in ("bare", "grounded"))
+    bare, floored = (tmp_path / f"{name}.xml" for name in ("bare", "floored"))
     bare.write_text(FLOATING.format(ground=""))
-    grounded.write_text(FLOATING.format(ground='<geom type="plane" size="0 0 1"/>'))
+    floored.write_text(FLOATING.format(ground='<geom type="plane" size="0 0 1"/>'))
     assert Scene.from_mjcf(bare).terrain is None
-    scenes = [Scene.from_mjcf(bare, terrain="plane"), Scene.from_mjcf(grounded)]
+    scenes = [Scene.from_mjcf(bare, terrain="plane"), Scene.from_mjcf(floored)]
     heights = []
     for scene in scenes:
         env = make_env(SceneTask(scene), "mujoco", seed=0)
@@ -501,6 +501,6 @@ def test_a_plane_for_a_file_without_ground(tmp_path):
         )
     assert torch.equal(*heights) and abs(float(heights[0][0, -1]) - 0.1) < 0.01
     with pytest.raises(ValueError, match="no ground beside a plane"):
-        Scene.from_mjcf(grounded, terrain="plane")
+        Scene.from_mjcf(floored, terrain="plane")
     with pytest.raises(ValueError, match="terrain 'plane' or None, got 'hills'"):
         Scene.from_mjcf(bare, terrain="hills")  # pyright: ignore
