@@ -110,7 +110,7 @@ class Trainer:
         self._follow = {
             name: partial(self.follow, x) for name, x in self.losses.items()
         }
-        if self.device.type == "cuda":
+        if self.device.type == "cuda" and self.model.kind == "learned":
             written = self.state.tensors
             self._follow = {k: Captured(x, written) for k, x in self._follow.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
