@@ -66,12 +66,17 @@ class TorchDynamics:
     def __init__(self, model: Model, compile: bool, differentiable: bool) -> None:
         self.scene, self.device, self.kind = model.scene, model.device, model.kind
         self.compile, self.differentiable = compile, differentiable
-        self.is_single_threaded = model.compile_single_threaded
+        self._suits_one_thread = model.compile_single_threaded
         numbers = (x for x in model.buffers() if x.is_floating_point())
         self.state_dtype = next((x.dtype for x in numbers), torch.float64)
         self._rows = 0
         self._compiled = Compiled(self._predict, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
+
+    @property
+    def is_single_threaded(self) -> bool:
+        """Whether compiled steps are long code for one thread of the processor."""
+        return self._suits_one_thread and self.device.type == "cpu"
 
     @property
     def compile_options(self) -> Mapping[str, Any]:
@@ -83,7 +88,7 @@ class TorchDynamics:
     def parts(self, rows: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
         is_whole = self.differentiable or self._compiled.is_eager
-        if is_whole or self.device.type != "cpu" or not self.is_single_threaded:
+        if is_whole or not self.is_single_threaded:
             return 1
         return parts_of(rows, max(1, MIN_WORK // self.scene.layout.nv))
 

@@ -144,7 +144,7 @@ class SceneEnv(RenderedEnv):
             inner.compile = not kwargs and inner.parts(self.batch_size.numel()) > 1
             self._transition.is_round = inner.compile
             # analytic steps for one thread are long code; a network's are not
-            self._transition.is_whole = not inner.compile_options
+            self._transition.is_whole = not inner.is_single_threaded
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
         self._transit = Compiled(self._transition.step, **options)
         self._restart = Compiled(self._transition.restart, **options)
