@@ -14,8 +14,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.transformer import FullLinear, KeyValueCache
-
-WARMUP = 3  # steps before a capture, in which libraries make their own memory
+from torchrl_nerd.training.capture import capture
 
 
 class InPlaceStep:
@@ -92,16 +91,7 @@ def graphed(step: Callable[[], None], device: torch.device) -> Callable[[], obje
     """
     if device.type != "cuda":
         return step
-    stream = torch.cuda.Stream(device)
-    stream.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(stream):
-        for _ in range(WARMUP):
-            step()
-    torch.cuda.current_stream(device).wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        step()
-    return graph.replay
+    return capture(step, device)[0].replay
 
 
 class Bfloat16(nn.Module):

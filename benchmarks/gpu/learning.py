@@ -68,8 +68,7 @@ def config_of(network: str, setup: Setup, **changes: Any) -> TrainConfig:
         "rollout_length": setup.pick(8, 2),
         "rollout_batch_size": setup.pick(256, 2),
     }
-    how |= {"single_step_fraction": 0.0, "seed": setup.seed}
-    how |= {"bf16_fraction": 1.0}
+    how |= {"single_step_fraction": 0.0, "bf16_fraction": 1.0, "seed": setup.seed}
     return replace(TrainConfig(), **(how | changes))
 
 

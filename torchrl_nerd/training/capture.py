@@ -1,13 +1,36 @@
 """A function of tensors as a CUDA graph: its kernels start without a host in between."""
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+Output = TypeVar("Output")
 WARMUP = 3  # calls before a capture, in which libraries make their own memory
 Key = tuple[tuple[int, ...] | None, ...]
 Graph = tuple[torch.cuda.CUDAGraph, list[Tensor | None], Tensor]
+
+
+def capture(
+    function: Callable[[], Output], device: torch.device
+) -> tuple[torch.cuda.CUDAGraph, Output]:
+    """A CUDA graph of a function, and the memory that its replays write the result to.
+
+    The function runs a few times first, and what it writes to is written to.
+
+    Raises:
+        RuntimeError: the function makes the host wait.
+    """
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):
+        for _ in range(WARMUP):
+            function()
+    torch.cuda.current_stream(device).wait_stream(stream)
+    with torch.cuda.device(device), torch.cuda.graph(graph):
+        output = function()
+    return graph, output
 
 
 class Captured:
@@ -43,15 +66,8 @@ class Captured:
     def _capture(self, given: tuple[Tensor | None, ...]) -> Graph:
         inputs = [None if x is None else x.clone() for x in given]
         before = [(x, x.clone()) for x in self.state().values()]
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            for _ in range(WARMUP):
-                self.function(*inputs)
-        torch.cuda.current_stream().wait_stream(stream)
+        device = next(x.device for x in inputs if x is not None)
+        graph, output = capture(lambda: self.function(*inputs), device)
         for tensor, value in before:
             tensor.copy_(value)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            output = self.function(*inputs)
         return graph, inputs, output
