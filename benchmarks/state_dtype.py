@@ -3,7 +3,7 @@
     python benchmarks/state_dtype.py --json results/state_dtype.json
 
 Errors are those of test starts against MuJoCo, of the whole horizon of each robot's
-protocol; rates of the eager step alone. Both precisions start at the same states.
+protocol; processor time of the eager step alone, in which both precisions take turns.
 """
 
 import copy
@@ -14,10 +14,11 @@ from typing import Any
 
 import torch
 import tyro
+from scaling import two_in_turn
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.bench.rates import mid_states
+from torchrl_nerd.evaluation.bench.rates import Runner, mid_states, stepper
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.geometry.constants import cast_constants
@@ -32,6 +33,7 @@ class Options:
     models: tuple[str, ...] = ("cartpole", "double_pendulum", "ant", "franka", "cube")
     trajectories: int = 256
     rows: int = 512
+    rounds: int = 7
     seed: int = 0
     json: Path | None = None
     """Write the results to this file."""
@@ -45,6 +47,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
     protocol = protocol_of(model.scene)
     case, source = next(iter(protocol.cases.items()))
     horizon, is_random = max(protocol.horizons), case in protocol.random_actions
+    state, runners = mid_states(model.scene, options.rows, options.seed), []
     for dtype in (torch.float64, torch.float32):
         dynamics = NeRDDynamics(cast_constants(copy.deepcopy(model), dtype))
         given = source, dynamics, MujocoDynamics(model.scene), [horizon]
@@ -53,23 +56,11 @@ def measure(name: str, options: Options) -> dict[str, Any]:
         )[horizon]
         kind = str(dtype).removeprefix("torch.")
         found[kind] = {quantity: x.mean for quantity, x in errors.items()}
-        found[f"{kind}_us"] = 1e6 * _seconds(dynamics, options) / options.rows
+        runners.append(Runner(stepper(dynamics, state), time.process_time))
+    rates = two_in_turn(*runners, options.rounds)
+    for kind, rate in zip(("float64", "float32"), rates, strict=False):
+        found[f"{kind}_us"] = 1e6 / (options.rows * rate)
     return {"case": case, "steps": horizon, **found}
-
-
-def _seconds(dynamics: NeRDDynamics, options: Options, calls: int = 20) -> float:
-    """Of one step of all envs: the least of three samples."""
-    scene = dynamics.scene
-    state = mid_states(scene, options.rows, options.seed)
-    torque = torch.zeros(len(state), len(scene.actuated))
-    dynamics.reset(state)
-    times = []
-    for _ in range(3):
-        began = time.perf_counter()
-        for _ in range(calls):
-            dynamics.step(state, torque, state.get("terrain", None))
-        times.append((time.perf_counter() - began) / calls)
-    return min(times)
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -23,6 +23,12 @@ def read(name: str, folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
     return {p.stem.removeprefix(f"{name}_"): json.loads(p.read_text()) for p in paths}
 
 
+def one(name: str, folder: Path) -> dict[str, Any] | None:
+    """The record of ``NAME.json``, if it is there."""
+    path = folder / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
 def rows(cells: Iterable[Iterable[str]]) -> str:
     """A table of Markdown, header first."""
     header, *body = [list(row) for row in cells]
@@ -123,10 +129,9 @@ def stability_tables(folder: Path = RESULTS) -> str:
 
 def env_table(folder: Path = RESULTS) -> str:
     """One row per task: microseconds of an action of one env, seconds to compile."""
-    path = folder / "compiled_env.json"
-    if not path.exists():
+    record = one("compiled_env", folder)
+    if record is None:
         return ""
-    record = json.loads(path.read_text())
     names = {
         "eager_us": "learned, eager (us)",
         "compiled_us": "learned, compiled (us)",
@@ -143,10 +148,9 @@ def env_table(folder: Path = RESULTS) -> str:
 
 def kinematics_table(folder: Path = RESULTS) -> str:
     """A row per robot, library and way to run it."""
-    path = folder / "kinematics_libraries.json"
-    if not path.exists():
+    record = one("kinematics_libraries", folder)
+    if record is None:
         return ""
-    record = json.loads(path.read_text())
     table = [["robot", "library", "run", "positions (ms)", "with velocities (ms)"]]
     for row in record["results"]:
         times = (row[key] for key in ("positions_ms", "with_velocities_ms"))
@@ -172,47 +176,44 @@ def transfer_table(folder: Path = RESULTS) -> str:
 
 def gpu_rates_table(folder: Path = RESULTS) -> str:
     """Millions of control steps per second: a row per model and mode, a column per size."""
-    found: dict[tuple[str, str], dict[int, float]] = {}
-    records = {
-        k: v for k, v in read("?", folder / "gpu").items() if k.endswith("rates")
-    }
-    for name, record in records.items():
+    found: dict[tuple[str, ...], dict[int, float]] = {}
+    records = [one(f"gpu/{name}", folder) for name in ("b_rates", "c_mjx_rates")]
+    records = [record for record in records if record is not None]
+    for record in records:
         for item, values in record["results"]["items"].items():
-            *what, size = item.replace("MJX ", "MJX, ").split(", ")
+            *what, size = item.split(", ")
             if "steps_per_s" not in values or not size.isdigit():
                 continue
-            model, mode = what if name == "b_rates" else reversed(what)
-            row = found.setdefault((model, mode), {})
+            model, *mode = what
+            name = model.removeprefix("MJX ").removesuffix(" streaming")
+            row = found.setdefault((name, *(mode or ["MJX"])), {})
             row[int(size)] = values["steps_per_s"] / 1e6
     sizes = sorted({size for row in found.values() for size in row})
     table = [["model or task", "run as", *(f"{size:,}" for size in sizes)]]
-    for (model, mode), row in sorted(found.items()):
-        cells = (number(row[x]) if x in row else "-" for x in sizes)
-        table.append([model.removesuffix(" streaming"), mode, *cells])
-    lines = [made_by(record) for record in records.values()]
-    return "\n\n".join((rows(table), *lines)) if lines else ""
+    for key, row in sorted(found.items()):
+        table.append([*key, *(number(row.get(size)) for size in sizes)])
+    return "\n\n".join((rows(table), *map(made_by, records))) if records else ""
 
 
 def gpu_errors_table(folder: Path = RESULTS) -> str:
     """Mean errors of shipped models on CPU and GPU, in float32 and with bf16 inside."""
+    record = one("gpu/a_correctness", folder)
+    if record is None:
+        return ""
     table = [["model", "quantity", "CPU", "GPU", "GPU, bf16 inside"]]
-    records = [v for k, v in read("?", folder / "gpu").items() if k == "a_correctness"]
-    for record in records:
-        for name, found in record["results"]["items"].items():
-            for quantity in found.get("float32", {}):
-                keys = ("cpu_float32", "float32", "bf16_inside")
-                cells = (f"{found[key][quantity]:.3g}" for key in keys)
-                table.append([name.removeprefix("model "), quantity, *cells])
-    lines = [made_by(record) for record in records]
-    return "\n\n".join((rows(table), *lines)) if lines else ""
+    for name, found in record["results"]["items"].items():
+        for quantity in found.get("float32", {}):
+            keys = ("cpu_float32", "float32", "bf16_inside")
+            cells = (f"{found[key][quantity]:.3g}" for key in keys)
+            table.append([name.removeprefix("model "), quantity, *cells])
+    return f"{rows(table)}\n\n{made_by(record)}"
 
 
 def state_dtype_table(folder: Path = RESULTS) -> str:
     """Errors and times of shipped models with states in float64 and in float32."""
-    path = folder / "state_dtype.json"
-    if not path.exists():
+    record = one("state_dtype", folder)
+    if record is None:
         return ""
-    record = json.loads(path.read_text())
     head = ["float64", "float32", "float64 (us)", "float32 (us)"]
     table = [["model", "quantity, steps", *head]]
     for model, row in record["results"].items():

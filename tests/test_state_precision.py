@@ -7,7 +7,7 @@ import state_dtype
 
 def test_a_row_for_every_model(seed, tmp_path):
     path = tmp_path / "state_dtype.json"
-    options = state_dtype.Options(("cube-mlp",), 2, 2, seed, path)
+    options = state_dtype.Options(("cube-mlp",), 2, 2, 1, seed, path)
     state_dtype.main(options)
     (row,) = json.loads(path.read_text())["results"].values()
     assert row["case"] == "toss" and row["steps"] == 80
