@@ -57,7 +57,8 @@ def measure(name: str, options: Options) -> dict[str, Any]:
         kind = str(dtype).removeprefix("torch.")
         found[kind] = {quantity: x.mean for quantity, x in errors.items()}
         runners.append(Runner(stepper(dynamics, state), time.process_time))
-    rates = two_in_turn(*runners, options.rounds)
+    fine, coarse = runners
+    rates = two_in_turn(fine, coarse, options.rounds)
     for kind, rate in zip(("float64", "float32"), rates, strict=False):
         found[f"{kind}_us"] = 1e6 / (options.rows * rate)
     return {"case": case, "steps": horizon, **found}
