@@ -132,7 +132,8 @@ def servos(request, tmp_path) -> Scene:
 
 def states_and_actions(scene, generator, clearance=None):
     """Random states, some of them in the ground, and random actions, ``[ROWS]``."""
-    anywhere = replace(scene, sampling=replace(scene.sampling, clearance=clearance))
+    sampling = replace(scene.sampling, clearance=clearance, penetration=None)
+    anywhere = replace(scene, sampling=sampling)
     state, _ = anywhere.sample_initial(ROWS, generator)
     u = torch.rand(ROWS, scene.controller.num_actions, generator=generator).double()
     return TensorDict(state, batch_size=[ROWS]), 2.4 * u - 1.2
@@ -326,8 +327,8 @@ def test_random_trajectories_stay_sound(name, generator):
 
 def test_servos_are_driven_by_random_actions(servos, generator):
     scale = torch.rand(2000, 1, generator=generator).double()
-    anywhere = replace(servos, sampling=replace(servos.sampling, clearance=None))
-    state, _ = anywhere.sample_initial(2000, generator)
+    ranges = replace(servos.sampling, clearance=None, penetration=None)
+    state, _ = replace(servos, sampling=ranges).sample_initial(2000, generator)
     norms = torch.linalg.vector_norm(state[QPOS][:, -4:], dim=-1)
     assert (norms - 1.0).abs().max() < 1e-12
     qvel = torch.zeros_like(state[QVEL])

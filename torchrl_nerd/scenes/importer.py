@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 CONTROL_STEP = 0.02  # s, where nobody says
 FREE_SLIDE = 1.0  # m
 LEAST_REACH = 0.01  # m
+START_PENETRATION = 1e-3  # m: about what a resting robot's soft contacts give
 LEAST_SPEED = 1.0  # m/s or rad/s: where nothing falls and nothing pushes
 DRAWS = 4096  # of actions and states, to find the largest torques
 
@@ -175,6 +176,7 @@ def default_sampling(
         base=_base_sampling(model, speed) if base.is_floating else None,
         drive=None if controller.is_motor else controller.drive,
         clearance=0.0 if len(contact_points(model, base)) else None,
+        penetration=START_PENETRATION,
     )
     return replace(sampling, **ranges)
 

@@ -26,7 +26,7 @@ Starts = Callable[[int, Generator], dict[str, Tensor]]
 """``(rows, generator) -> qpos (rows, nq), qvel (rows, nv)``, perhaps ``terrain``."""
 
 Row = tuple[float, ...]
-MAX_REDRAWS = 300  # of states that are not clear of the ground
+MAX_REDRAWS = 300  # of states that are not clear of the ground or of the robot itself
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,9 @@ class Sampling:
     | ``level_ground`` | draws grounds that the robot hits head-on, see `strategies` |
     | ``drive`` | torques that depend on the state, in place of uniform ones |
     | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
+    | ``penetration`` | starts with a contact deeper than this (m), of the robot with the
+      ground or with itself, are drawn again; the least deep draw of a row stays if all of
+      its draws are deeper |
     | ``zero_torque_fraction`` | share of trajectories with no torque at all |
     | ``low_torque_fraction`` | share whose torque and velocity are scaled down by U(0, 1) |
     | ``starts`` | draws the initial states, in place of the ranges |
@@ -95,6 +98,7 @@ class Sampling:
     level_ground: GroundSampler | None = None
     drive: Drive | None = None
     clearance: float | None = None
+    penetration: float | None = None
     zero_torque_fraction: float = 0.25
     low_torque_fraction: float = 0.25
     starts: Starts | None = None
@@ -135,10 +139,12 @@ def draw_initial(
     rows: int,
     generator: Generator,
     clearances: Callable[[Tensor], Tensor],
+    depths: Callable[[Tensor], Tensor],
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Initial states and each one's torque scale ``(rows, 1)``; see `Scene.sample_initial`.
 
-    ``clearances``: of ``qpos (n, nq)``, gaps of contact points to the ground ``(n, P)``, m.
+    Of ``qpos (n, nq)``, ``clearances`` are gaps of contact points to the ground ``(n, P)``
+    and ``depths`` of the deepest contact ``(n,)``, m.
 
     Raises:
         ValueError: no state within the ranges is clear of the ground.
@@ -147,7 +153,8 @@ def draw_initial(
         state = dict(sampling.starts(rows, generator))
         torque_scale, _ = sample_scale(sampling, rows, generator)
     else:
-        qpos, qvel = _draw_clear(sampling, layout, rows, generator, clearances)
+        how = sampling, layout, rows, generator
+        qpos, qvel = _draw_clear(*how, clearances, depths)
         torque_scale, speed_scale = sample_scale(sampling, rows, generator)
         state = {"qpos": qpos, "qvel": speed_scale * qvel}
     if sampling.ground is not None and "terrain" not in state:
@@ -161,21 +168,37 @@ def _draw_clear(
     rows: int,
     generator: Generator,
     clearances: Callable[[Tensor], Tensor],
+    depths: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """Positions and velocities within the ranges, clear of the ground."""
+    """Positions and velocities within the ranges, clear of the ground and of the robot."""
+
+    def excess(qpos: Tensor) -> tuple[Tensor, Tensor]:
+        """By how much states are too near to the ground, and too deep, m, ``(n,)``."""
+        low = deep = qpos.new_zeros(len(qpos))
+        if sampling.clearance is not None:
+            low = (sampling.clearance - clearances(qpos).amin(-1)).clamp_min(0.0)
+        if sampling.penetration is not None:
+            deep = (depths(qpos) - sampling.penetration).clamp_min(0.0)
+        return low, deep
+
     qpos, qvel = _draw(sampling, layout, rows, generator)
-    if sampling.clearance is None:
-        return qpos, qvel
+    low, deep = excess(qpos)
     for _ in range(MAX_REDRAWS):
-        is_low = clearances(qpos).amin(-1) < sampling.clearance
-        if not is_low.any():
+        again = (low + deep > 0.0).nonzero()[:, 0]
+        if not len(again):
             return qpos, qvel
-        again = _draw(sampling, layout, int(is_low.sum()), generator)
-        qpos[is_low], qvel[is_low] = again
-    raise ValueError(
-        f"expected ranges with states clear of the ground, found none in {MAX_REDRAWS} "
-        "draws: give others, or clearance=None"
-    )
+        new_qpos, new_qvel = _draw(sampling, layout, len(again), generator)
+        new_low, new_deep = excess(new_qpos)
+        better = new_low + new_deep < (low + deep)[again]
+        chosen = again[better]
+        qpos[chosen], qvel[chosen] = new_qpos[better], new_qvel[better]
+        low[chosen], deep[chosen] = new_low[better], new_deep[better]
+    if low.any():
+        raise ValueError(
+            f"expected ranges with states clear of the ground, found none in {MAX_REDRAWS} "
+            "draws: give others, or clearance=None"
+        )
+    return qpos, qvel
 
 
 def _draw(

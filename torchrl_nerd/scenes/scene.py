@@ -2,7 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from torchrl_nerd.scenes.importer import (
     load_suite,
     read_mjcf,
 )
+from torchrl_nerd.scenes.penetration import deepest_contacts
 from torchrl_nerd.scenes.sampling import Sampling, draw_initial
 from torchrl_nerd.scenes.support import check_supported, unit_gravity
 from torchrl_nerd.scenes.symmetries import Symmetries, find_symmetries
@@ -227,8 +228,11 @@ class Scene:
             ``qpos (rows, nq)``, ``qvel (rows, nv)`` and, where the ground varies,
             ``terrain (rows, terrain.size)``, all float64.
         """
-        ranges = self.sampling, self.layout
-        return draw_initial(*ranges, rows, generator, self.clearances)
+        ranges, depths = (
+            (self.sampling, self.layout),
+            partial(deepest_contacts, self.model),
+        )
+        return draw_initial(*ranges, rows, generator, self.clearances, depths)
 
     def clearances(self, qpos: Tensor, terrain: Tensor | None = None) -> Tensor:
         """Gap between every contact point's shape and the ground, m, ``(*batch, P)``.
