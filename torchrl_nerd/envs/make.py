@@ -143,8 +143,8 @@ def make_env(
     """A batched env of a task in the dynamics of your choice.
 
     Args:
-        task: id of a registered task, ``dm_control/DOMAIN-TASK``, a task, or a robot alone
-            (an MJCF file, ``gymnasium/ID``), which becomes a `SceneTask`.
+        task: id of a registered task, ``dm_control/DOMAIN-TASK``, ``gymnasium/ID``, a
+            task, or an MJCF file, which becomes a `SceneTask`; see `make_task`.
         dynamics: ``"nerd"`` (learned), ``"hybrid"``, ``"analytic"``, ``"mujoco"``,
             ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
             analytic step's name, or a checkpoint folder.

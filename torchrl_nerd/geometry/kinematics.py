@@ -85,14 +85,7 @@ class PointKinematics(nn.Module):
             positions ``(*batch, P, 3)``, m, and velocities ``(*moving, P, 3)``, m/s.
         """
         q, v = (x.reshape(-1, x.shape[-1]).T.contiguous() for x in (qpos, qvel))
-        zero, still = q.new_zeros(3, 1, 1), v.new_zeros(3, 1, min(1, v.shape[-1]))
-        identity = torch.eye(3, dtype=q.dtype, device=q.device)[..., None, None]
-        above = zero, identity, still, still  # the base itself, seen from the base
-        motions = [above] if self.base.is_floating else []
-        for groups in self.depths:
-            above = _join([group(above, q, v) for group in groups])  # pyright: ignore
-            motions.append(above)
-        position, rotation, omega, velocity = _pick(_join(motions), self.body_of_point)
+        position, rotation, omega, velocity = self.body_motion(q, v)
         arm = rotate_by(rotation, self.points)  # (3, P, N)
         velocity = velocity + cross(omega, arm[..., : v.shape[-1]])
         return tuple(  # pyright: ignore
@@ -101,6 +94,17 @@ class PointKinematics(nn.Module):
             .reshape(*like.shape[:-1], *x.shape[1::-1])
             for x, rows, like in ((position + arm, q, qpos), (velocity, v, qvel))
         )
+
+    def body_motion(self, q: Tensor, v: Tensor) -> Motion:
+        """Of every point's body; ``q (nq, N)`` and ``v (nv, moving)`` are contiguous."""
+        zero, still = q.new_zeros(3, 1, 1), v.new_zeros(3, 1, min(1, v.shape[-1]))
+        identity = torch.eye(3, dtype=q.dtype, device=q.device)[..., None, None]
+        above = zero, identity, still, still  # the base itself, seen from the base
+        motions = [above] if self.base.is_floating else []
+        for groups in self.depths:
+            above = _join([group(above, q, v) for group in groups])  # pyright: ignore
+            motions.append(above)
+        return _pick(_join(motions), self.body_of_point)
 
 
 class _Group(nn.Module):

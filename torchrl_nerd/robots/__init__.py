@@ -27,6 +27,8 @@ from torchrl_nerd.robots.robot import (
 from torchrl_nerd.scenes import Scene, import_scene, is_import
 from torchrl_nerd.settings import did_you_mean
 from torchrl_nerd.tasks import SceneTask, Task
+from torchrl_nerd.tasks.locomotion import TASKS as LOCOMOTION
+from torchrl_nerd.tasks.locomotion import LocomotionTask
 from torchrl_nerd.tasks.suite import SuiteTask
 
 ROBOTS: dict[str, Robot] = {
@@ -79,7 +81,8 @@ def load_scene(name: str | Path) -> Scene:
 def make_task(name: str | Path) -> Task:
     """The task of that id: a registered one or ``dm_control/DOMAIN-TASK``.
 
-    An MJCF file and ``gymnasium/ID`` name a robot alone, which becomes a `SceneTask`.
+    So is ``gymnasium/ID`` where the environment runs along x, see `LocomotionTask`. Other
+    ids of Gymnasium and MJCF files name a robot alone, which becomes a `SceneTask`.
 
     Raises:
         ValueError: no such task, one registered as something else, or a robot with
@@ -92,8 +95,10 @@ def make_task(name: str | Path) -> Task:
             raise ValueError(f"expected a Task by the id '{name}', got {task!r}")
         return task
     if is_import(name):
-        is_suite = name.startswith("dm_control/")
-        return SuiteTask(name) if is_suite else SceneTask(import_scene(name))
+        if name.startswith("dm_control/"):
+            return SuiteTask(name)
+        runs = name.removeprefix("gymnasium/") in LOCOMOTION
+        return LocomotionTask(name) if runs else SceneTask(import_scene(name))
     raise ValueError(
         f"unknown task {name!r}{_meant(name, TASKS)}, expected one of "
         f"{', '.join(TASKS)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
@@ -116,7 +121,7 @@ def _meant(name: object, known: Collection[str]) -> str:
 
 def task_id(task: Task) -> str:
     """The id of a task, or the name of its class."""
-    if isinstance(task, SuiteTask) or type(task) is SceneTask:
+    if isinstance(task, SuiteTask | LocomotionTask) or type(task) is SceneTask:
         return task.name
     ids = (name for name, kind in TASKS.items() if kind is type(task))
     return next(ids, type(task).__name__)

@@ -16,6 +16,7 @@ from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.importer import load_suite
+from torchrl_nerd.tasks.suite_formulas import FORMULAS
 from torchrl_nerd.tasks.task import State, Task
 
 SEEDS = 2**32  # of NumPy's RandomState, which the suite draws from
@@ -33,11 +34,12 @@ PARTS = (  # of mj_forward: positions, velocities and the sensors of both
 class SuiteTask(Task):
     """Reward, observation, resets and time limit of ``dm_control/DOMAIN-TASK``.
 
-    They are the suite's, unchanged, and each env costs its Python. The observation is the
-    suite's, flattened in its order; an action of -1 to 1 spans the control range. A task
-    that reads contact forces (hopper's feet) is shown those of the ground truth's last
-    substep, as in the suite. Learned dynamics know none: there MuJoCo computes them at
-    the state and the action that led to it.
+    They are the suite's: as functions of tensors for the domains in `FORMULAS`, else by
+    its own code, env by env, as all resets are. The observation is the suite's, flattened
+    in its order; an action of -1 to 1 spans the control range. A task that reads contact
+    forces (hopper's feet) is shown those of the ground truth's last substep, as in the
+    suite. Learned dynamics know none: there MuJoCo computes them at the state and the
+    action that led to it.
 
     Args:
         name: such as ``"dm_control/cheetah-run"``.
@@ -67,6 +69,9 @@ class SuiteTask(Task):
         self._forces, self._num_ctrl = judge.forces, model.nu
         self._targets = judge.targets
         self._start, self._judge = _RowMemo(judge.start), _RowMemo(judge)
+        domain, _, task = name.removeprefix("dm_control/").partition("-")
+        known = domain in FORMULAS
+        self._formula = FORMULAS[domain](self.scene, task) if known else None
 
     def build_scene(self) -> Scene:
         """The suite's robot and its ground."""
@@ -80,14 +85,22 @@ class SuiteTask(Task):
 
     def observation(self, state: State) -> Tensor:
         """The suite's, flattened in its order."""
-        return self._judged(state)[..., 2:]
+        if self._formula is None or not self._is_felt(state):
+            return self._judged(state)[..., 2:]
+        return self._formula.observation(state[QPOS], state[QVEL], self._extra(state))
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
         """The suite's, of the state that the step led to and the action."""
-        return self._judged(dict(next_state.items()) | {ACTION: action})[..., 0]
+        if self._formula is None:
+            return self._judged(dict(next_state.items()) | {ACTION: action})[..., 0]
+        qpos, qvel = next_state[QPOS], next_state[QVEL]
+        ctrl = self._ctrl(action.to(qpos.dtype))
+        return self._formula.reward(qpos, qvel, ctrl, self._extra(next_state))
 
     def terminated(self, next_state: State) -> Tensor:
         """Where the suite ends an episode before its time."""
+        if self._formula is not None:  # it ends none of these
+            return super().terminated(next_state)
         return self._judged(next_state)[..., 1] > 0.0
 
     def show(self, model: MjModel, data: MjData, state: State) -> None:
@@ -95,14 +108,30 @@ class SuiteTask(Task):
         if self.parameters:
             model.geom_pos[self._targets] = state[TARGET].cpu().reshape(-1, 3)
 
+    def _is_felt(self, state: State) -> bool:
+        """Whether all contact forces that the task reads are known."""
+        return not len(self._forces) or SENSORDATA in state.keys()
+
+    def _extra(self, state: State) -> Tensor:
+        """Targets, or forces felt, where the task has any, ``(*batch, k)``."""
+        if self.parameters:
+            return state[TARGET]
+        felt = state.get(SENSORDATA)
+        none = state[QPOS][..., :0]
+        return none if felt is None else felt[..., self._forces].to(none.dtype)
+
+    def _ctrl(self, action: Tensor) -> Tensor:
+        """MuJoCo's controls at an action, ``(*batch, nu)``."""
+        controller = self.controller
+        assert isinstance(controller, ActuatorController)
+        return controller.ctrl(action)
+
     def _judged(self, state: State) -> Tensor:
         """Reward, end and observation of each env; the control is zero after a reset."""
         qpos = state[QPOS]
         ctrl = qpos.new_zeros(*qpos.shape[:-1], self._num_ctrl)
         if ACTION in state.keys():
-            controller = self.controller
-            assert isinstance(controller, ActuatorController)
-            ctrl = controller.ctrl(state[ACTION].to(qpos.dtype))
+            ctrl = self._ctrl(state[ACTION].to(qpos.dtype))
         felt = qpos.new_full((*qpos.shape[:-1], len(self._forces)), torch.nan)
         if SENSORDATA in state.keys():
             felt = state[SENSORDATA][..., self._forces]
