@@ -1,6 +1,8 @@
 """What can touch the ground, what is left out of it, and that nothing is lost."""
 
 import copy
+from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import torch
 from helpers import every_scene, make_scene, random_states, random_transitions
 
+from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.keys import CONTACT_DISTANCE, CONTACT_NORMAL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.robots.double_pendulum.scene import (
@@ -18,11 +21,18 @@ from torchrl_nerd.robots.double_pendulum.scene import (
 )
 from torchrl_nerd.scenes.contact_points import (
     MARGIN_PER_RADIUS,
+    MAX_POINTS,
     MIN_MARGIN,
+    TOLERANCE,
+    contact_points,
     ground_geoms,
     own_contacts,
     shape_points,
+    terrain_geoms,
+    touching_geoms,
 )
+from torchrl_nerd.scenes.importer import read_mjcf
+from torchrl_nerd.scenes.shapes import shape_balls
 from torchrl_nerd.transforms import ContactFeatures
 
 PLANE = '<geom type="plane" size="0 0 1"/>'
@@ -162,13 +172,79 @@ def test_no_ground_in_use_reaches_the_dropped_root_of_the_pendulum(generator):
     assert (distance > RADIUS - 1e-9).all()
 
 
-@pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])
-def test_shapes_without_points_are_refused_by_name(kind):
-    size = f'type="{kind}" size="0.1 0.2 0.3"'
-    with pytest.raises(ValueError, match=f"'foot' .* is a {kind}; expected sphere"):
-        _ = one_shape(size).contacts
-    assert len(one_shape(size, ground="").contacts) == 0
-    assert len(one_shape(f'{size} contype="0" conaffinity="0"').contacts) == 0
+CLOUD = " ".join(f"{x:.4f}" for x in np.random.default_rng(3).normal(0, 0.1, 240))
+ROUND = {
+    "wheel": 'type="cylinder" size="0.2 0.05"',
+    "rod": 'type="cylinder" size="0.02 0.4"',
+    "egg": 'type="ellipsoid" size="0.1 0.15 0.3"',
+    "pancake": 'type="ellipsoid" size="0.2 0.05 0.2"',
+    "ball": 'type="ellipsoid" size="0.1 0.1 0.1"',
+    "cloud": 'type="mesh" mesh="cloud"',
+}
+
+
+def check_distances(model, points, error, rng, rows=200):
+    """The lowest point is where MuJoCo has the lowest shape, or above by the error."""
+    bodies, positions, radii = points
+    data, poses = mujoco.MjData(model), random_states(model, rows, rng)[0].numpy()
+    places = world_points(model, poses, bodies, positions)
+    (ground,), over = terrain_geoms(model), []
+    for pose, height in zip(poses, places[..., 2], strict=True):
+        data.qpos = pose
+        mujoco.mj_kinematics(model, data)
+        want = min(
+            mujoco.mj_geomDistance(model, data, ground, geom, 1e3, None)
+            for geom in touching_geoms(model)
+        )
+        over.append((height - radii).min() - want)
+    assert min(over) > -1e-6 and max(over) < error + 1e-6
+    return max(over)
+
+
+def one_round_shape(shape):
+    body = f'<geom name="foot" {shape} pos="0.1 -0.2 0.3" quat="0.7 0.1 -0.3 0.4"/>'
+    return make_scene(
+        f"""<mujoco><asset><mesh name="cloud" vertex="{CLOUD}"/></asset><worldbody>
+        {PLANE}<body pos="0 0 2"><freejoint/>{body}</body></worldbody></mujoco>"""
+    )
+
+
+@pytest.mark.parametrize("most", [6, 1000])
+@pytest.mark.parametrize("shape", ROUND)
+def test_few_points_stand_for_a_shape_up_to_the_error_they_state(shape, most, rng):
+    scene = replace(one_round_shape(ROUND[shape]), max_contact_points=most)
+    points = scene.contacts
+    assert len(points) <= most
+    if most > len(points):
+        own = shape_balls(scene.model, 1)[2]
+        assert points.error <= own + TOLERANCE and own < 0.005
+    places = points.bodies, points.positions, points.radii
+    worst = check_distances(scene.model, places, points.error, rng)
+    if len(points) == most > 1:
+        assert worst > 0.05 * points.error  # it is no idle bound
+
+
+def test_the_ball_of_a_round_ellipsoid_is_it():
+    points = one_round_shape(ROUND["ball"]).contacts
+    assert len(points) == 1 and points.error < 1e-15
+    assert abs(points.radii[0] - 0.1) < 1e-15
+
+
+PLANE_TYPE = mujoco.mjtGeom.mjGEOM_PLANE
+FOUND = sorted((Path(__file__).parents[2] / "../shared/robots").glob("*/*.xml"))
+
+
+@pytest.mark.skipif(not FOUND, reason="no third-party robots here")
+@pytest.mark.parametrize("path", FOUND, ids=lambda path: path.parent.name)
+def test_third_party_robots_are_where_mujoco_has_them(path, rng):
+    """Cylinders, boxes and meshes of real robots, and MuJoCo's own distances."""
+    model, _ = read_mjcf(path, None)
+    if not terrain_geoms(model):
+        model, _ = read_mjcf(path, None, "plane")
+    points = contact_points(model, Base.from_model(model))
+    assert len(points) <= MAX_POINTS and points.error < 0.1
+    if (model.geom_type[terrain_geoms(model)] == PLANE_TYPE).all():
+        check_distances(model, shape_points(model), points.error, rng, rows=30)
 
 
 def test_only_what_can_touch_has_points():

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import StepConfig
-from torchrl_nerd.scenes.contact_points import own_contacts
+from torchrl_nerd.scenes.contact_points import own_contacts, touching_geoms
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.shapes import EXACT, geom_kind
 
 
 class StepResult(NamedTuple):
@@ -88,12 +89,14 @@ def check_supported(scene: Scene) -> None:
         ValueError: in one sentence, naming all of them.
     """
     model = scene.model
+    kinds = {geom_kind(model, geom) for geom in touching_geoms(model)}
     forces = {
         "dry friction": model.dof_frictionloss.any(),
         "air or water": model.opt.density or model.opt.viscosity,
         "self-contact": own_contacts(model),
         "contact pairs with a law of their own": model.npair,
         "gravity compensation": model.body_gravcomp.any(),
+        "cylinders, ellipsoids or meshes on the ground": not kinds <= {*EXACT},
     }
     found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:

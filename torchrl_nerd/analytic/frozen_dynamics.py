@@ -57,7 +57,10 @@ class DynamicsEvaluation(nn.Module):
         # linear ones, which move every point; the base's angular ones come next
         self.num_base_dofs = 3 * scene.base.is_floating
         # points of several bodies in one place act together, each moved by its own joints
-        weights = points.merged @ axes.ancestry(shape_points(model)[0]).T
+        weights = (
+            points.merged
+            @ axes.ancestry(shape_points(model, scene.max_contact_points)[0]).T
+        )
         weights /= points.merged.sum(1, keepdims=True)  # (P, J)
         longest = int((weights > 0.0).sum(1).max(initial=0))
         # a point's own joints first, then others of weight zero, to fill the row

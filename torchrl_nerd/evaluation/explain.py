@@ -15,7 +15,7 @@ from torchrl_nerd.keys import (
 )
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.contact_points import own_contacts
+from torchrl_nerd.scenes.contact_points import body_label, own_contacts
 from torchrl_nerd.scenes.symmetries import Effect, base_effects
 from torchrl_nerd.scenes.terrain import PLANE
 
@@ -48,6 +48,8 @@ class SolverReport:
     points_found: int  # contact points of the robot's shapes
     points_merged: int  # of these, how many always coincide with another one
     points_fixed: int  # of these, how many no joint can move
+    points_thinned: int  # left out beside them, so that few points stand for each body
+    contact_error: float  # m: how far a shape reaches beyond its points at most
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,12 @@ class SceneReport:
             f"with one at the same place, {solver.points_fixed} dropped since no joint "
             f"moves them, {len(self.contact_bodies)} kept"
         )
+        if solver.contact_error:
+            lines.append(
+                f"contact points thinned: {solver.points_thinned} left out, so shapes "
+                f"reach up to {1e3 * solver.contact_error:.1f} mm beyond the rest; "
+                "max_contact_points= of Scene.from_mjcf sets their number"
+            )
         if bodies:
             on = ", ".join(f"{body} {count}" for body, count in bodies)
             lines.append(f"contact points kept, by body: {on}")
@@ -117,11 +125,8 @@ def explain(scene: Scene) -> SceneReport:
     fixed = found.count(-1)
     effects = base_effects(model, scene.base, scene.substeps)
 
-    def name(body: int) -> str:
-        return model.body(body).name or f"body {body}"
-
     pairs = {
-        tuple(sorted(name(int(model.geom_bodyid[geom])) for geom in pair))
+        tuple(sorted(body_label(model, int(model.geom_bodyid[g])) for g in pair))
         for pair in own_contacts(model)
     }
     step, reason = _analytic_step(scene)
@@ -135,8 +140,10 @@ def explain(scene: Scene) -> SceneReport:
             points_found=len(found),
             points_merged=len(found) - fixed - kept,
             points_fixed=fixed,
+            points_thinned=scene.contacts.thinned,
+            contact_error=scene.contacts.error,
         ),
-        contact_bodies=tuple(map(name, scene.contacts.bodies)),
+        contact_bodies=tuple(body_label(model, b) for b in scene.contacts.bodies),
         self_contacts=tuple((low, high) for low, high in sorted(pairs)),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
         controller=f"{type(controller).__name__}, {controller.num_actions} actions",

@@ -1,21 +1,29 @@
 """The points of a robot that can touch the ground.
 
 As in the paper (section 3.2; facts of the reference code): a sphere's centre, a capsule's
-two cap centres, a box's eight corners. Points that always coincide are merged, points
-that no joint can move are dropped: the ground cannot do work on them, but for friction at
-the rim of a cap that turns on the spot.
+two cap centres, a box's eight corners. Cylinders, ellipsoids and meshes have points too,
+see `shapes`: body by body those that matter most over a plane, up to `TOLERANCE` or a
+number that the scene allows. Points that always coincide are merged, points that no joint
+can move are dropped: the ground cannot do work on them, but for friction at the rim of a
+cap that turns on the spot.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations
 
 import mujoco
 import numpy as np
 
 from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.rotations import quat_matrix
+from torchrl_nerd.scenes.shapes import EXACT, geom_kind, shape_balls, thin
 
+TOLERANCE = 0.002  # m: how far a shape may reach beyond its contact points
+MAX_POINTS = 64  # of all shapes, where nobody says
+PLANE, BOX, HEIGHT_FIELD = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("PLANE", "BOX", "HFIELD")
+)
 MARGIN_PER_RADIUS = 4.0  # paper, appendix A: xi = max(4 thickness, 0.1 m)
 MIN_MARGIN = 0.1  # m
 
@@ -33,6 +41,8 @@ class ContactPoints:
     radii: np.ndarray  # (P,), m: a point at this distance from the ground touches it
     margins: np.ndarray  # (P,), m: xi, distance beyond which a point has no features
     stands_for: list[int]  # of every point of the shapes: which one here, -1 for none
+    error: float = 0.0  # m: how far a shape reaches beyond its points at most
+    thinned: int = 0  # points of the shapes that were left out for few
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -48,13 +58,15 @@ class ContactPoints:
         return len(self.stands_for)
 
 
-def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
-    """Find the contact points of the robot in a compiled model.
+def contact_points(
+    model: mujoco.MjModel, base: Base, most: int = MAX_POINTS
+) -> ContactPoints:
+    """Find the contact points of the robot in a compiled model, about ``most`` at most.
 
     Raises:
-        ValueError: a shape that can touch the ground is none of sphere, capsule, box.
+        ValueError: a shape that can touch the ground is none of `shape_balls`'.
     """
-    bodies, positions, radii = shape_points(model)
+    bodies, positions, radii, error, thinned = _shape_points(model, most)
     leaders = _leaders(model, base, bodies, positions, radii)
     kept = sorted(set(leaders) - {-1})
     return ContactPoints(
@@ -63,24 +75,55 @@ def contact_points(model: mujoco.MjModel, base: Base) -> ContactPoints:
         radii=radii[kept],
         margins=np.maximum(MARGIN_PER_RADIUS * radii[kept], MIN_MARGIN),
         stands_for=[kept.index(i) if i >= 0 else -1 for i in leaders],
+        error=error,
+        thinned=thinned,
     )
 
 
-def shape_points(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Every point of every shape that can touch the ground, none merged.
+def shape_points(
+    model: mujoco.MjModel, most: int = MAX_POINTS
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """The points of every shape that can touch the ground, none merged.
 
-    Body ids, positions ``(N, 3)`` (m, body frame) and radii ``(N,)`` (m). Raises
-    ValueError where a shape is none of sphere, capsule, box.
+    Body ids, positions ``(N, 3)`` (m, body frame) and radii ``(N,)`` (m). A robot of
+    ``most`` points of spheres, capsules and boxes keeps them all; of another one the
+    spheres' remain and those that `thin` keeps.
     """
-    bodies, positions, radii = [], [], []
-    grounds, is_pair = ground_geoms(model), collision_filter(model)
-    for geom in _moving_geoms(model):
-        if any(is_pair(geom, ground) for ground in grounds):
-            points, radius = _points_of(model, geom)
-            bodies += [int(model.geom_bodyid[geom])] * len(points)
-            positions += list(points)
-            radii += [radius] * len(points)
-    return bodies, np.array(positions).reshape(-1, 3), np.array(radii)
+    return _shape_points(model, most)[:3]
+
+
+def _shape_points(
+    model: mujoco.MjModel, most: int
+) -> tuple[list[int], np.ndarray, np.ndarray, float, int]:
+    """See `shape_points`; `ContactPoints.error` and ``thinned`` too."""
+    bodies, exact, single, error = [], [], [], 0.0
+    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 3)), np.zeros(0))]
+    for geom in touching_geoms(model):
+        points, radius, beyond = shape_balls(model, geom)
+        parts.append((points, radius))
+        bodies += [int(model.geom_bodyid[geom])] * len(points)
+        exact += [geom_kind(model, geom) in EXACT] * len(points)
+        single += [len(points) == 1] * len(points)
+        error = max(error, beyond)
+    positions, radii = (np.concatenate(x) for x in zip(*parts, strict=True))
+    kept = np.array(exact, bool)
+    if not kept.all() or len(kept) > most:
+        kept = np.array(single, bool)
+        kept, more = thin(positions, radii, np.array(bodies), kept, TOLERANCE, most)
+        error += more
+    chosen = np.flatnonzero(kept)
+    bodies = [bodies[i] for i in chosen]
+    return bodies, positions[chosen], radii[chosen], error, int((~kept).sum())
+
+
+def touching_geoms(model: mujoco.MjModel) -> list[int]:
+    """Moving shapes that can touch a surface of `terrain_geoms`."""
+    grounds, is_pair = terrain_geoms(model), collision_filter(model)
+    return [
+        geom
+        for geom in _moving_geoms(model)
+        if any(is_pair(geom, ground) for ground in grounds)
+    ]
 
 
 def ground_geoms(model: mujoco.MjModel) -> list[int]:
@@ -95,6 +138,17 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
         for geom in np.flatnonzero(is_ground).tolist()
         if any(is_pair(geom, other) for other in moving)
     ]
+
+
+def terrain_geoms(model: mujoco.MjModel) -> list[int]:
+    """Of `ground_geoms` those to which the distance of a point is known.
+
+    Planes, and boxes and height fields that no mocap body carries.
+    """
+    weld = model.body_weldid[model.geom_bodyid]
+    is_known = np.isin(model.geom_type, (BOX, HEIGHT_FIELD)) & (weld == 0)
+    is_known |= model.geom_type == PLANE
+    return [geom for geom in ground_geoms(model) if is_known[geom]]
 
 
 def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
@@ -131,34 +185,20 @@ def collision_filter(model: mujoco.MjModel) -> Callable[[int, int], bool]:
     return is_pair
 
 
-def geom_label(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
-    """Name of a geom, or its number, and its kind, for messages."""
-    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-    return f"geom '{model.geom(geom).name or geom}'", kind
+def body_label(model: mujoco.MjModel, body: int) -> str:
+    """A body's name; ``body 3`` where it has none."""
+    return model.body(body).name or f"body {body}"
+
+
+def geom_label(model: mujoco.MjModel, geom: int) -> str:
+    """A geom's name, or its number, and its body, for messages."""
+    body = body_label(model, int(model.geom_bodyid[geom]))
+    return f"geom '{model.geom(geom).name or geom}' of '{body}'"
 
 
 def _moving_geoms(model: mujoco.MjModel) -> list[int]:
     weld = model.body_weldid[model.geom_bodyid]
     return np.flatnonzero(model.body_dofnum[weld]).tolist()
-
-
-def _points_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
-    """Points ``(n, 3)``, m, body frame, and radius, m."""
-    size, (name, kind) = model.geom_size[geom], geom_label(model, geom)
-    if kind == "sphere":
-        local, radius = np.zeros((1, 3)), size[0]
-    elif kind == "capsule":
-        local, radius = np.array([[0, 0, size[1]], [0, 0, -size[1]]]), size[0]
-    elif kind == "box":
-        local, radius = np.array(list(product((-1, 1), repeat=3))) * size, 0.0
-    else:
-        raise ValueError(
-            f"{name} of body '{model.body(model.geom_bodyid[geom]).name}', which can touch "
-            f"the ground, is a {kind}; expected sphere, capsule or box, or contype and "
-            "conaffinity that keep it from the ground"
-        )
-    turn = quat_matrix(model.geom_quat[geom])
-    return local @ turn.T + model.geom_pos[geom], float(radius)
 
 
 def _leaders(

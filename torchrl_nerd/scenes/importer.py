@@ -24,7 +24,7 @@ import torch
 
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE
-from torchrl_nerd.scenes.contact_points import contact_points, ground_geoms
+from torchrl_nerd.scenes.contact_points import contact_points, terrain_geoms
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling, uniform
 
@@ -60,7 +60,7 @@ def read_mjcf(
         complaint = " ".join(str(error).split())
         raise ValueError(f"MuJoCo cannot compile {path}: {complaint}") from None
     if terrain is not None:
-        if ground_geoms(model):
+        if terrain_geoms(model):
             raise ValueError(f"expected no ground beside a plane in {path}, got some")
         spec = mujoco.MjSpec.from_file(str(path))
         plane = mujoco.mjtGeom.mjGEOM_PLANE
@@ -257,7 +257,7 @@ def _base_sampling(model: mujoco.MjModel, speed: list[float]) -> BaseSampling:
     """Start of a floating base, whose joint is the model's first."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    heights = [float(data.geom_xpos[geom, 2]) for geom in ground_geoms(model)]
+    heights = [float(data.geom_xpos[geom, 2]) for geom in terrain_geoms(model)]
     ground = min(heights, default=0.0)
     linear, angular = (tuple(speed[a : a + 3]) for a in (0, 3))
     return BaseSampling(

@@ -16,9 +16,10 @@ from torchrl_nerd.geometry.constants import placed
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.scenes.contact_points import (
+    MAX_POINTS,
     ContactPoints,
     contact_points,
-    ground_geoms,
+    terrain_geoms,
 )
 from torchrl_nerd.scenes.controllers import ActuatorController, Controller, driven_dofs
 from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
@@ -49,6 +50,7 @@ class Scene:
     | ``controller`` | turns actions into joint torques |
     | ``sampling`` | ranges of training states and torques |
     | ``reference_ratio`` | substeps in one of the scene's own, see `reference`; else 1 |
+    | ``max_contact_points`` | about how many contact points the robot may have |
 
     Raises:
         ValueError: the model has something no NeRD can be built for (named).
@@ -60,6 +62,7 @@ class Scene:
     controller: Controller
     sampling: Sampling
     reference_ratio: int = 1
+    max_contact_points: int = MAX_POINTS
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -73,6 +76,7 @@ class Scene:
         control_step: float | None = None,
         name: str | None = None,
         terrain: Literal["plane"] | None = None,
+        max_contact_points: int = MAX_POINTS,
         **ranges: Any,
     ) -> "Scene":
         """The robot in an MJCF file, driven by its own actuators.
@@ -82,6 +86,7 @@ class Scene:
             control_step: s; by default the whole number of timesteps nearest to 0.02 s.
             name: the scene's name; by default the path.
             terrain: ``"plane"`` adds level ground at z = 0 to a file that has none.
+            max_contact_points: about how many of them; fewer make faster models.
             ranges: fields of `Sampling` in place of those that follow from the joints'
                 limits and the actuators' strengths.
 
@@ -90,7 +95,8 @@ class Scene:
                 something not supported (named), or a plane beside another ground.
         """
         parts = read_mjcf(Path(path), control_step, terrain)
-        return cls._from(name or str(path), *parts, ranges)
+        scene = cls._from(name or str(path), *parts, ranges)
+        return replace(scene, max_contact_points=max_contact_points)
 
     @classmethod
     def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":
@@ -186,12 +192,12 @@ class Scene:
     @cached_property
     def contacts(self) -> ContactPoints:
         """The robot's contact points; none where nothing can touch."""
-        return contact_points(self.model, self.base)
+        return contact_points(self.model, self.base, self.max_contact_points)
 
     @cached_property
     def terrain(self) -> Terrain | None:
         """The ground, or None where nothing can touch it."""
-        grounds = ground_geoms(self.model) if len(self.contacts) else []
+        grounds = terrain_geoms(self.model) if len(self.contacts) else []
         return Terrain.from_model(self.model, grounds) if grounds else None
 
     @cached_property

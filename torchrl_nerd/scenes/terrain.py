@@ -28,11 +28,10 @@ from torchrl_nerd.geometry.surfaces import (
     plane_distance,
     plane_in_frame,
 )
-from torchrl_nerd.scenes.contact_points import geom_label
-
-PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
-BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
-HEIGHT_FIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+from torchrl_nerd.scenes.contact_points import (
+    HEIGHT_FIELD,
+    PLANE,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +66,10 @@ class Terrain:
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel, geoms: list[int]) -> "Terrain":
-        """The ground that these geoms make.
+        """The ground that these geoms make, of `terrain_geoms`.
 
         Raises:
-            ValueError: a geom is of a shape that no distance is known for, or a mocap body
-                carries more or other ground than one plane.
+            ValueError: a mocap body carries more than one plane.
         """
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -230,11 +228,6 @@ def _read_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surf
     kind, size = int(model.geom_type[geom]), model.geom_size[geom].copy()
     body = int(model.body_weldid[model.geom_bodyid[geom]])
     mocap = int(model.body_mocapid[body])
-    if kind not in ((PLANE, BOX, HEIGHT_FIELD) if mocap < 0 else (PLANE,)):
-        name, what = geom_label(model, geom)
-        expected = "a plane, box or height field" if mocap < 0 else "a plane"
-        where = "the ground" if mocap < 0 else "a mocap body of the ground"
-        raise ValueError(f"{name} of {where} is a {what}; expected {expected}")
     heights = None
     if kind == HEIGHT_FIELD:
         field = int(model.geom_dataid[geom])
