@@ -91,16 +91,12 @@ REFUSED = {
     "an actuator that reads": ('<body><joint name="a" type="ball"/><geom size="1"/>'
         "</body>", '<actuator><position name="m" joint="a"/></actuator>'),
     "a delayed actuator": (BODY, MOTOR.format('delay="0.01" nsample="2"')),
-    "a tendon with": (BODY, '<tendon><fixed name="m" range="0 1"><joint joint="a" '
-        'coef="1"/></fixed></tendon>'),
-    "an equality": (BODY, '<equality><joint name="m" joint1="a"/></equality>'),
-    "a contact pair": ('<geom name="f" type="plane" size="1 1 1"/>'
-        + BODY.replace("<geom", '<geom name="g"'),
-        '<contact><pair name="m" geom1="f" geom2="g"/></contact>'),
+    "a surface that moves": (BODY.replace("<geom", '<geom name="m" surfacevel="1 0 0"'),
+        ""),
+    "ground of another shape": ('<geom name="m" type="capsule" size="1 1"/>'
+        + '<body><freejoint/><geom size="1"/></body>', ""),
     "a floating base whose": ('<body><freejoint/><geom size="1"/></body>',
         '<option wind="3 1 0" density="100"/>'),
-    "is a ellipsoid": ('<geom type="plane" size="1 1 1"/><body><joint/>'
-        '<geom name="m" type="ellipsoid" size="1 2 1"/></body>', ""),
     "2 moving trees": (BODY + BODY.replace('"a"', '"b"'), ""),
     "no joint": ('<body><geom size="1"/></body>', ""),
 }  # fmt: skip
@@ -407,11 +403,29 @@ def test_what_cannot_be_learned_is_refused_by_name(named, tmp_path):
     assert "\n" not in said and ("'m'" in said or "robot.xml" in said)
 
 
+def test_all_reasons_are_named_at_once(tmp_path):
+    world = (
+        '<geom name="log" type="cylinder" size="1 1"/><body name="torso"><freejoint/>'
+    )
+    world += '<geom size="1"/><body name="arm"><joint name="a"/><geom size="1"/></body>'
+    path = write(tmp_path, world + "</body>", "<actuator>" + 5 * (
+        '<general joint="a" dyntype="filter" dynprm="0.1"/>') + "</actuator>"
+        '<option wind="3 1 0" density="100"><flag sleep="enable"/></option>')  # fmt: skip
+    with pytest.raises(ValueError) as error:
+        Scene.from_mjcf(path)
+    said = str(error.value)
+    for part in (str(path), "'0' of body 'arm'", "and 2 more", "'log' of body 'world'"):
+        assert part in said
+    assert "may sleep" in said and "where it is or faces" in said
+
+
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("dm_control/quadruped-walk", "an equality constraint"),
-        ("dm_control/ball_in_cup-catch", "a tendon with a limit"),
+        (
+            "dm_control/quadruped-walk",
+            "actuator with a state .*'yaw_front_left' of body",
+        ),
         ("dm_control/finger-spin", "2 moving trees"),
         ("gymnasium/Reacher-v5", "2 moving trees"),
         ("gymnasium/Ant-v4", "expected an environment .* version 5"),

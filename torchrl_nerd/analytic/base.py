@@ -95,6 +95,8 @@ def check_supported(scene: Scene) -> None:
         "air or water": model.opt.density or model.opt.viscosity,
         "self-contact": own_contacts(model),
         "contact pairs with a law of their own": model.npair,
+        "equality constraints": model.neq,
+        "tendons": model.ntendon,
         "gravity compensation": model.body_gravcomp.any(),
         "cylinders, ellipsoids or meshes on the ground": not kinds <= {*EXACT},
     }

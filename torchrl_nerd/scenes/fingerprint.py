@@ -27,11 +27,22 @@ RARELY = {
     **dict.fromkeys(("pair_geom1", "pair_geom2", "pair_dim", "pair_solref"), -1.0),
     **dict.fromkeys(("pair_solimp", "pair_friction", "pair_margin"), -1.0),
     **dict.fromkeys(("pair_gap", "exclude_signature"), -1.0),
+    **dict.fromkeys(("tendon_stiffness", "tendon_damping", "tendon_armature"), 0.0),
+    **dict.fromkeys(("tendon_stiffnesspoly", "tendon_dampingpoly"), 0.0),
+    **dict.fromkeys(("tendon_frictionloss", "tendon_limited"), 0.0),
+    **dict.fromkeys(("eq_obj1id", "eq_obj2id", "eq_type", "eq_objtype"), -1.0),
+    **dict.fromkeys(("eq_data", "eq_active0", "eq_solref", "eq_solimp"), -1.0),
     "dof_solref": (0.02, 1.0),
     "dof_solimp": (0.9, 0.95, 0.001, 0.5, 2.0),
 }
 """Arrays and the value of which each of their entries is by default."""
 
+TENDONS = (
+    *("tendon_num", "tendon_range", "tendon_lengthspring", "tendon_solref_lim"),
+    *("tendon_solimp_lim", "tendon_solref_fri", "tendon_solimp_fri", "tendon_margin"),
+    *("wrap_type", "wrap_objid", "wrap_prm", "site_pos", "site_quat"),
+)
+"""Of tendons, where one acts by itself or is bound."""
 SOLVER = ("solver", "iterations", "noslip_iterations", "enableflags")  # no tolerances
 GROUND = (
     *("geom_bodyid", "body_mocapid", "geom_dataid"),
@@ -91,6 +102,8 @@ def _unusual(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     unusual = {k: v for k, v in values.items() if np.any(v != RARELY[k])}
     if np.any(model.qpos_spring != model.qpos0):
         unusual["qpos_spring"] = model.qpos_spring
+    if model.ntendon and (model.neq or any(k.startswith("tendon") for k in unusual)):
+        unusual |= {name: np.asarray(getattr(model, name)) for name in TENDONS}
     option, default = model.opt, mujoco.MjOption()
     has_override = option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
     for name in (*SOLVER, *(OVERRIDES if has_override else ())):

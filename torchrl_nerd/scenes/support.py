@@ -3,8 +3,8 @@
 A NeRD sees joints, joint torques and contact with the ground. Refused is what has a
 memory of its own, what acts through something else, and what makes a floating base move
 otherwise here than there. Left in is what the state alone decides although no feature
-names it: damping and springs, dry friction, still air or water, contact between the
-robot's own bodies.
+names it: damping and springs, dry friction, still air or water, equality constraints,
+tendons, contact between the robot's own bodies.
 """
 
 import copy
@@ -18,6 +18,11 @@ import numpy as np
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.locks import fork_safe_lock
+from torchrl_nerd.scenes.contact_points import (
+    body_label,
+    ground_geoms,
+    terrain_geoms,
+)
 
 JOINT, IN_PARENT, TENDON = (
     int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}"))
@@ -26,6 +31,8 @@ JOINT, IN_PARENT, TENDON = (
 GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
 BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 DISABLE = mujoco.mjtDisableBit
+ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+MOST_NAMED = 3  # elements of one kind in a message
 NOTHING = -1  # where another has the type of a joint
 
 Refusal = tuple[str, Any, Callable[[int], Any] | None]
@@ -56,46 +63,61 @@ def silence_mujoco() -> Iterator[None]:
 
 
 def check_supported(name: str, model: mujoco.MjModel) -> None:
-    """Refuse the model of scene ``name`` if it has something no feature describes.
+    """Refuse the model of scene ``name`` if it has something that no NeRD can learn.
 
     Raises:
-        ValueError: naming the first such thing, and which object it is.
+        ValueError: with all reasons, each naming its elements and their bodies.
     """
+    reasons = []
     for what, is_there, get in (*_parts(model), *_actuators(model)):
-        found = np.flatnonzero(is_there)
-        if len(found):
-            which = get(int(found[0])).name if get is not None else ""
-            which = f" ('{which}')" if which else ""
-            raise ValueError(f"scene '{name}' has {what}{which}: not supported")
+        found = np.flatnonzero(is_there).tolist()
+        if found and get is not None:
+            what += f" ({', '.join(_label(model, get(i)) for i in found[:MOST_NAMED])}"
+            what += f" and {len(found) - MOST_NAMED} more" * (len(found) > MOST_NAMED)
+            what += ")"
+        reasons += [what] if found else []
     try:
         base = Base.from_model(model)
     except ValueError as error:
-        raise ValueError(f"scene '{name}': {error}") from None
-    if base.is_floating and not _moves_alike_everywhere(model, base):
+        reasons.append(str(error))
+    else:
+        if base.is_floating and not _moves_alike_everywhere(model, base):
+            reasons.append(
+                "a floating base whose motion depends on where it is or faces (wind, a "
+                "spring, a constraint)"
+            )
+    if reasons:
         raise ValueError(
-            f"scene '{name}' has a floating base whose motion depends on where it is or "
-            "faces (wind, a spring): not supported"
+            f"scene '{name}' is not supported: it has {'; '.join(reasons)}"
         )
+
+
+def _label(model: mujoco.MjModel, element: Any) -> str:
+    """Name of an element, or its number, and its body where it is on one."""
+    label = f"'{element.name or element.id}'"
+    body = getattr(element, "bodyid", None)
+    if body is None and hasattr(element, "trntype") and element.trntype[0] in ON_JOINT:
+        body = model.jnt_bodyid[[element.trnid[0]]]
+    if body is None:
+        return label
+    return f"{label} of body '{body_label(model, int(body[0]))}'"
 
 
 def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
     """Everything but the actuators."""
-    pulls = model.tendon_stiffness + model.tendon_damping + model.tendon_frictionloss
-    pulls = pulls + model.tendon_armature + model.tendon_limited
-    pulls = pulls + abs(model.tendon_stiffnesspoly).sum(-1)
-    pulls = pulls + abs(model.tendon_dampingpoly).sum(-1)
-    what = "a tendon with a limit, spring, damping, friction or mass"
-    yield what, pulls, model.tendon
-    yield "an equality constraint", np.ones(model.neq), model.equality
     yield "a flexible body", model.nflex, None
     yield "a plugin", model.nplugin, None
-    slides = model.geom_surfacevel.any()
-    yield "a surface that moves under what stands on it", slides, None
-    is_static = model.body_weldid[model.geom_bodyid] == 0
-    paired = is_static[model.pair_geom1] | is_static[model.pair_geom2]
-    yield "a contact pair with the ground", paired, model.pair
+    slides = model.geom_surfacevel.any(-1)
+    yield "a surface that moves under what stands on it", slides, model.geom
     sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
     yield "bodies that may sleep", sleeps, None
+    unknown = np.zeros(model.ngeom, bool)
+    unknown[ground_geoms(model)] = mujoco.mjtJoint.mjJNT_FREE in model.jnt_type
+    unknown[terrain_geoms(model)] = False
+    what = (
+        "ground of another shape than plane, box and height field, for a floating base"
+    )
+    yield what, unknown, model.geom
 
 
 def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
