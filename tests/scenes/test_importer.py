@@ -414,7 +414,7 @@ def test_all_reasons_are_named_at_once(tmp_path):
     with pytest.raises(ValueError) as error:
         Scene.from_mjcf(path)
     said = str(error.value)
-    for part in (str(path), "'0' of body 'arm'", "and 2 more", "'log' of body 'world'"):
+    for part in (str(path), "'0' of 'arm'", "and 2 more", "'log' of 'world', a cyl"):
         assert part in said
     assert "may sleep" in said and "where it is or faces" in said
 
@@ -424,7 +424,7 @@ def test_all_reasons_are_named_at_once(tmp_path):
     [
         (
             "dm_control/quadruped-walk",
-            "actuator with a state .*'yaw_front_left' of body",
+            "actuator with a state .*'yaw_front_left' of 'hip",
         ),
         ("dm_control/finger-spin", "2 moving trees"),
         ("gymnasium/Reacher-v5", "2 moving trees"),

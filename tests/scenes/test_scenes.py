@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from helpers import HANDMADE, make_scene, random_states, random_transitions
+from helpers import HANDMADE, random_states, random_transitions
 
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import SCENES, load_scene
@@ -177,22 +177,3 @@ def test_an_unknown_scene_is_named_with_those_that_exist():
     with pytest.raises(ValueError, match="unknown scene 'hovercraft'") as error:
         load_scene("hovercraft")
     assert all(name in str(error.value) for name in SCENES)
-
-
-@pytest.mark.parametrize(
-    ("extra", "named"),
-    [
-        (
-            '<tendon><fixed stiffness="1"><joint joint="a" coef="1"/></fixed></tendon>',
-            "a tendon with a limit, spring",
-        ),
-        ('<equality><joint joint1="a"/></equality>', "an equality constraint"),
-    ],
-)
-def test_what_no_feature_describes_is_refused_by_name(extra, named):
-    body = '<body><joint name="a"/><geom size="1"/></body>'
-    xml = f"<mujoco><worldbody>{body}</worldbody>{extra}</mujoco>"
-    with pytest.raises(ValueError, match=f"'handmade' has {named}"):
-        make_scene(xml)
-    with pytest.raises(ValueError, match="at least 1 substep, got 0"):
-        replace(load_scene("cartpole"), substeps=0)

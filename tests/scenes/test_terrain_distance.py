@@ -216,27 +216,33 @@ def test_bad_terrain_is_refused_in_one_sentence(dynamics, generator):
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "sphere"])
-def test_ground_of_another_shape_is_refused_by_name(kind):
+def test_a_floating_base_needs_ground_of_a_known_shape(kind):
     geom = f'<geom name="stump" type="{kind}" size="0.1 0.2 0.3"/>'
     xml = f"<mujoco><worldbody>{geom}{ROBOT}</worldbody></mujoco>"
     with pytest.raises(
-        ValueError, match=f"'stump' of the ground is a {kind}; expected"
+        ValueError, match=f"ground of another shape .*'stump' of 'world', a {kind}"
     ):
         _ = make_scene(xml).terrain
 
 
-@pytest.mark.parametrize(
-    ("geoms", "why"),
-    [
-        ('<geom name="a" type="box" size="1 1 1"/>', "'a' of a mocap body .* is a box"),
-        (2 * '<geom type="plane" size="0 0 1"/>', "one plane on a mocap body"),
-    ],
-)
-def test_mocap_bodies_with_other_ground_than_a_plane_are_refused(geoms, why):
-    body = f'<body mocap="true">{geoms}</body>'
+def test_a_mocap_body_with_two_planes_is_refused():
+    planes = 2 * '<geom type="plane" size="0 0 1"/>'
+    body = f'<body mocap="true">{planes}</body>'
     xml = f"<mujoco><worldbody>{body}{ROBOT}</worldbody></mujoco>"
-    with pytest.raises(ValueError, match=why):
+    with pytest.raises(ValueError, match="one plane on a mocap body"):
         _ = make_scene(xml).terrain
+
+
+def test_a_box_on_a_mocap_body_stands_where_the_file_has_it():
+    """Nothing moves it, so it is as fixed as one of the world."""
+    box = '<body {} pos="0 0.1 0.2"><geom type="box" size="1 1 0.1"/></body>'
+    at, surfaces = 'mocap="true"', []
+    for kind in (at, ""):
+        xml = f"<mujoco><worldbody>{box.format(kind)}{ROBOT}</worldbody></mujoco>"
+        (surface,) = make_scene(xml).terrain.surfaces
+        surfaces.append(surface)
+    assert surfaces[0].mocap == -1
+    np.testing.assert_array_equal(surfaces[0].position, surfaces[1].position)
 
 
 def test_the_hash_sees_the_ground_and_the_robots_does_not():

@@ -141,13 +141,8 @@ def ground_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def terrain_geoms(model: mujoco.MjModel) -> list[int]:
-    """Of `ground_geoms` those to which the distance of a point is known.
-
-    Planes, and boxes and height fields that no mocap body carries.
-    """
-    weld = model.body_weldid[model.geom_bodyid]
-    is_known = np.isin(model.geom_type, (BOX, HEIGHT_FIELD)) & (weld == 0)
-    is_known |= model.geom_type == PLANE
+    """Of `ground_geoms` those to which the distance of a point is known."""
+    is_known = np.isin(model.geom_type, (PLANE, BOX, HEIGHT_FIELD))
     return [geom for geom in ground_geoms(model) if is_known[geom]]
 
 

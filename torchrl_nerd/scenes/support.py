@@ -23,6 +23,7 @@ from torchrl_nerd.scenes.contact_points import (
     ground_geoms,
     terrain_geoms,
 )
+from torchrl_nerd.scenes.shapes import geom_kind
 
 JOINT, IN_PARENT, TENDON = (
     int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}"))
@@ -100,7 +101,9 @@ def _label(model: mujoco.MjModel, element: Any) -> str:
         body = model.jnt_bodyid[[element.trnid[0]]]
     if body is None:
         return label
-    return f"{label} of body '{body_label(model, int(body[0]))}'"
+    label += f" of '{body_label(model, int(body[0]))}'"
+    is_geom = hasattr(element, "contype")
+    return label + f", a {geom_kind(model, element.id)}" * is_geom
 
 
 def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:

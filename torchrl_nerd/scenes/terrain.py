@@ -227,7 +227,7 @@ class TerrainDistance(nn.Module):
 def _read_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surface:
     kind, size = int(model.geom_type[geom]), model.geom_size[geom].copy()
     body = int(model.body_weldid[model.geom_bodyid[geom]])
-    mocap = int(model.body_mocapid[body])
+    mocap = int(model.body_mocapid[body]) if kind == PLANE else -1
     heights = None
     if kind == HEIGHT_FIELD:
         field = int(model.geom_dataid[geom])
