@@ -124,7 +124,7 @@ def test_a_misspelt_name_is_told_the_nearest():
 
 
 @pytest.mark.parametrize("dynamics", ["analytic", "mujoco"])
-@pytest.mark.parametrize("num_envs", [1.5, "2", None, 0, -1])
+@pytest.mark.parametrize("num_envs", [1.5, "2", None, 0, -1, True])
 def test_the_number_of_envs_is_a_number(dynamics, num_envs):
     said = refusal(lambda: make_env("cartpole/swingup", dynamics, num_envs))
     assert said == f"expected num_envs, a whole number of at least 1, got {num_envs!r}"

@@ -276,6 +276,7 @@ def test_what_images_need_is_made_late_and_freed():
     [
         ({"num_envs": 0}, "num_envs, a whole number of at least 1, got 0"),
         ({"num_envs": 1.5}, "num_envs, a whole number of at least 1, got 1.5"),
+        ({"num_envs": 9}, "at most 1 envs, got 9"),
         ({"height": 0}, "height, a whole number of at least 1, got 0"),
         ({"width": 2.5}, "width, a whole number of at least 1, got 2.5"),
         ({"camera_id": "nose"}, "nose"),

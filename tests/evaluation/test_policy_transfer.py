@@ -108,8 +108,8 @@ def test_mujoco_engines_agree_and_ground_truth_is_added(policy: Policy) -> None:
 def test_policy_survives_disk(frame_stack: int, tmp_path) -> None:
     policy = Policy((4 * frame_stack, 16, 16, 1), frame_stack=frame_stack)
     policy.standardize.fit(torch.randn(50, 4 * frame_stack) * 3.0 + 1.0)
-    save_policy(policy, tmp_path / "policy", {"task": TASK})
-    loaded = load_policy(tmp_path / "policy", make_task(TASK))
+    save_policy(policy, str(tmp_path / "policy"), {"task": TASK})
+    loaded = load_policy(str(tmp_path / "policy"), make_task(TASK))
     observation = torch.randn(7, 4 * frame_stack)
     for one, other in zip(policy(observation), loaded(observation), strict=True):
         assert torch.equal(one, other)

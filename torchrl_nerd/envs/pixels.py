@@ -76,6 +76,8 @@ class RenderedEnv(EnvBase):
         """
         if num_envs is not None:
             expect_count(1, num_envs=num_envs)
+            if num_envs > (count := self.batch_size.numel()):
+                raise ValueError(f"expected at most {count} envs, got {num_envs}")
         state = {key: value[:num_envs] for key, value in self._state().items()}
         height = self.render_size[0] if height is None else height
         width = self.render_size[1] if width is None else width

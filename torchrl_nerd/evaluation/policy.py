@@ -156,7 +156,7 @@ def make_actor(policy: Policy) -> ProbabilisticActor:
 
 
 def save_policy(
-    policy: Policy, folder: Path, card: dict[str, Any] | None = None
+    policy: Policy, folder: Path | str, card: dict[str, Any] | None = None
 ) -> Path:
     """Write weights, then card, each whole or not at all; nothing is pickled.
 
@@ -165,14 +165,14 @@ def save_policy(
         folder: where; made if missing.
         card: what else to say: task, dynamics it was trained in, configuration.
     """
-    folder = writable_folder(folder)
+    folder = writable_folder(Path(folder))
     write_tensors(folder / WEIGHTS, policy.state_dict())
     shape = {"sizes": list(policy.sizes), "frame_stack": policy.frame_stack}
     write_json(folder / CARD, {"format": 1, **shape, **(card or {})})
     return folder
 
 
-def load_policy(folder: Path, task: Task | None = None) -> Policy:
+def load_policy(folder: Path | str, task: Task | None = None) -> Policy:
     """A policy from a folder that `save_policy` wrote.
 
     Args:
@@ -182,6 +182,7 @@ def load_policy(folder: Path, task: Task | None = None) -> Policy:
     Raises:
         ValueError: in one sentence, what is missing, broken or of another shape.
     """
+    folder = Path(folder)
     card = _read_card(folder)
     found, frame_stack = card.get("sizes"), card.get("frame_stack", 1)
     sizes = found if isinstance(found, list) else []

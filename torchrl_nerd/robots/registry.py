@@ -12,6 +12,7 @@ from torchrl_nerd.robots.robot import Preset, Robot
 from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.tasks import Task
 
+RESERVED = ("nerd", "hybrid", "analytic", "mujoco", "dm_control", "mujoco_warp")
 VARIABLE = "NERD_ROBOTS"
 """Environment variable: modules or files that register robots, separated as in PATH."""
 
@@ -114,10 +115,13 @@ def _check_types(robot: Robot) -> None:
 
 def _check_names(robot: Robot) -> None:
     scenes = robot.scenes
-    bad = [s for s in scenes if not s or "/" in s or is_import(s)]
+    bad = [s for s in scenes if not s or "/" in s or is_import(s) or s in RESERVED]
     if bad or not scenes:
         found = repr(bad[0]) if bad else "none"
-        raise ValueError(f"expected names of scenes without / or .xml, got {found}")
+        raise ValueError(
+            "expected names of scenes without / or .xml that are no kind of dynamics "
+            f"({', '.join(RESERVED)}), got {found}"
+        )
 
     def is_of(name: str, mark: str) -> bool:  # a scene's name may hold a dash
         return any(name.startswith(scene + mark) for scene in scenes)
