@@ -1,10 +1,15 @@
 """The report of a scene, and its text."""
 
+from collections import Counter
+
 import mujoco
 import pytest
+import torch
 from helpers import every_scene, make_scene
 
-from torchrl_nerd.evaluation.explain import explain
+from torchrl_nerd.data.simulate import simulate
+from torchrl_nerd.evaluation.explain import TRAJECTORIES, explain
+from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.robots import load_scene
 
@@ -49,14 +54,38 @@ def test_an_analytic_step_is_named_or_why_there_is_none(name, step):
 
 def test_self_contacts_are_those_that_mujoco_finds():
     scene = make_scene(CROSSED)
-    assert explain(scene).self_contacts == (("lower", "upper"),)
-    assert "self-contacts: 1 pairs of bodies" in str(explain(scene))
+    report = explain(scene)
+    (pair,) = report.self_contacts
+    assert set(pair.bodies) == {"lower", "upper"}
+    assert "self-contacts: 1 pairs of bodies" in str(report)
     data = mujoco.MjData(scene.model)
     data.qpos[1:] = 2.0944, 2.0944  # rad: the three bodies at a triangle's corners
     data.qpos[1] = 3.14159  # folded: lower lies in upper
     mujoco.mj_forward(scene.model, data)
     assert data.ncon == 1
     assert "self-contacts: none" in str(explain(load_scene("cartpole")))
+
+
+def test_pairs_are_named_by_how_often_they_touch_in_training_data():
+    scene = load_scene("dm_control/hopper-hop")
+    model, report = scene.model, explain(scene)
+    data = simulate(scene, *TRAJECTORIES, torch.Generator().manual_seed(0))
+    states, touching = data["next", QPOS].flatten(0, 1), Counter()
+    engine = mujoco.MjData(model)
+    for state in states:
+        engine.qpos[:] = state
+        mujoco.mj_forward(model, engine)
+        ends = ((contact.geom1, contact.geom2) for contact in engine.contact)
+        pairs = (model.geom_bodyid[list(pair)] for pair in ends)
+        touching.update({frozenset(model.body(b).name for b in x) for x in pairs})
+    shares = [pair.share for pair in report.self_contacts]
+    assert shares == sorted(shares, reverse=True) and 0.0 < shares[0] < 1.0
+    for pair in report.self_contacts:
+        assert pair.share == pytest.approx(
+            touching[frozenset(pair.bodies)] / len(states)
+        )
+    most = report.self_contacts[0]
+    assert f"{'-'.join(most.bodies)} {most.share:.1%}" in str(report)
 
 
 def test_merged_and_fixed_contact_points_are_counted():

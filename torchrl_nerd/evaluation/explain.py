@@ -3,22 +3,29 @@
 from collections import Counter
 from dataclasses import dataclass
 
+import numpy as np
+from torch import Generator
+
 from torchrl_nerd.analytic import STEPS, default_step, make_step
+from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
     CONTACT_FORCE,
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
+    QPOS,
     ROBOT_STATE,
     ROBOT_TORQUE,
 )
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, own_contacts
+from torchrl_nerd.scenes.penetration import count_touching
 from torchrl_nerd.scenes.symmetries import Effect, base_effects
 from torchrl_nerd.scenes.terrain import PLANE
 
+TRAJECTORIES = 64, 20  # and their steps: what self-contacts are counted in
 MEANINGS = {
     ROBOT_TORQUE: "joint torque, N and N m",
     CONTACT_DISTANCE: "clearance to the ground minus the margin, m; 0 beyond the margin",
@@ -53,6 +60,14 @@ class SolverReport:
 
 
 @dataclass(frozen=True)
+class SelfContact:
+    """Two bodies of a robot that can touch, and how often they do in training data."""
+
+    bodies: tuple[str, str]
+    share: float  # of states
+
+
+@dataclass(frozen=True)
 class SceneReport:
     """What ``nerd explain`` prints; its text by ``print``."""
 
@@ -60,7 +75,7 @@ class SceneReport:
     features: tuple[Feature, ...]  # of the token, in order
     solver: SolverReport
     contact_bodies: tuple[str, ...]  # body of each contact point that is kept
-    self_contacts: tuple[tuple[str, str], ...]  # bodies that can touch each other
+    self_contacts: tuple[SelfContact, ...]  # of bodies that can touch, most often first
     terrain: str  # the ground, in words
     controller: str  # what turns an action into joint torque, in words
     analytic_step: str | None  # name of the step that supports the scene, if any does
@@ -73,8 +88,6 @@ class SceneReport:
 
     def __str__(self) -> str:
         solver, bodies = self.solver, Counter(self.contact_bodies).items()
-        pairs = ["-".join(pair) for pair in self.self_contacts]
-        touching = f"{len(pairs)} pairs of bodies, without features: {', '.join(pairs)}"
         lines = [
             f"{self.scene}: {self.token_width} features a step\n",
             f"{'feature':<18}{'width':>6}  meaning",
@@ -103,11 +116,24 @@ class SceneReport:
         return "\n".join(
             [
                 *lines,
-                f"self-contacts: {touching if pairs else 'none'}",
+                f"self-contacts: {self._touching()}",
                 f"terrain: {self.terrain}",
                 f"controller: {self.controller}",
                 f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
             ]
+        )
+
+    def _touching(self) -> str:
+        """Which bodies touch each other, and in how many states of training data."""
+        if not self.self_contacts:
+            return "none"
+        touch = [pair for pair in self.self_contacts if pair.share]
+        shares = (f"{'-'.join(pair.bodies)} {pair.share:.1%}" for pair in touch)
+        never = len(self.self_contacts) - len(touch)
+        also = [f"{never} pairs in none"] if never else []
+        return (
+            f"{len(self.self_contacts)} pairs of bodies, without features; share of "
+            f"random states in which they touch: {', '.join([*shares, *also])}"
         )
 
 
@@ -125,10 +151,6 @@ def explain(scene: Scene) -> SceneReport:
     fixed = found.count(-1)
     effects = base_effects(model, scene.base, scene.substeps)
 
-    pairs = {
-        tuple(sorted(body_label(model, int(model.geom_bodyid[g])) for g in pair))
-        for pair in own_contacts(model)
-    }
     step, reason = _analytic_step(scene)
     controller = scene.controller
     return SceneReport(
@@ -144,12 +166,30 @@ def explain(scene: Scene) -> SceneReport:
             contact_error=scene.contacts.error,
         ),
         contact_bodies=tuple(body_label(model, b) for b in scene.contacts.bodies),
-        self_contacts=tuple((low, high) for low, high in sorted(pairs)),
+        self_contacts=tuple(
+            SelfContact((body_label(model, low), body_label(model, high)), share)
+            for (low, high), share in _self_contacts(scene)
+        ),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
         controller=f"{type(controller).__name__}, {controller.num_actions} actions",
         analytic_step=step,
         why_no_step=reason,
     )
+
+
+def _self_contacts(scene: Scene) -> list[tuple[tuple[int, int], float]]:
+    """Pairs of bodies that can touch and their share of touching states, most first."""
+    bodies = scene.model.geom_bodyid
+    pairs = {
+        (int(low), int(high)): 0.0
+        for low, high in np.sort(bodies[own_contacts(scene.model)]).reshape(-1, 2)
+    }
+    if pairs:
+        data = simulate(scene, *TRAJECTORIES, Generator().manual_seed(0))
+        states = data[is_sound(data)]["next", QPOS].flatten(0, 1)
+        counts = count_touching(scene.model, states)
+        pairs |= {pair: counts[pair] / max(1, len(states)) for pair in pairs}
+    return sorted(pairs.items(), key=lambda item: (-item[1], item[0]))
 
 
 def _state_meaning(scene: Scene) -> str:

@@ -1,4 +1,7 @@
-"""How deep a robot stands in itself or in the ground, by MuJoCo's own collision."""
+"""Where a robot touches itself and the ground, and how deep, by MuJoCo's own collision."""
+
+from collections import Counter
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -12,12 +15,30 @@ def deepest_contacts(model: mujoco.MjModel, qpos: Tensor) -> Tensor:
     0 where nothing touches. Contacts with mocap bodies, which ``qpos (rows, nq)`` does not
     place, do not count.
     """
-    data, depths = mujoco.MjData(model), np.zeros(len(qpos))
     is_mocap = model.body_mocapid[model.body_weldid[model.geom_bodyid]] >= 0
-    for row, place in enumerate(qpos.numpy(force=True)):
+    depths = [
+        -dist[~is_mocap[geoms].any(-1)].min(initial=0.0)
+        for geoms, dist in _contacts(model, qpos)
+    ]
+    return torch.tensor(depths, dtype=torch.float64).to(qpos)
+
+
+def count_touching(model: mujoco.MjModel, qpos: Tensor) -> Counter[tuple[int, int]]:
+    """In how many of the states ``(rows, nq)`` two bodies touch, by their ids, low first."""
+    counts: Counter[tuple[int, int]] = Counter()
+    for geoms, dist in _contacts(model, qpos):
+        bodies = np.sort(model.geom_bodyid[geoms[dist <= 0.0]])
+        counts.update({(int(low), int(high)) for low, high in bodies})
+    return counts
+
+
+def _contacts(
+    model: mujoco.MjModel, qpos: Tensor
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Geoms ``(n, 2)`` and signed distances ``(n,)``, m, of the contacts in each state."""
+    data = mujoco.MjData(model)
+    for place in qpos.numpy(force=True):
         data.qpos[:] = place
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        counts = ~is_mocap[data.contact.geom].any(-1)
-        depths[row] = -data.contact.dist[counts].min(initial=0.0)
-    return torch.from_numpy(depths).to(qpos)
+        yield data.contact.geom, data.contact.dist
