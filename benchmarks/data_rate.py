@@ -21,11 +21,11 @@ from tyro.conf import Positional
 
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import generate
-from torchrl_nerd.dynamics.mujoco import torque_model
+from torchrl_nerd.dynamics.mujoco import engine_model
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.sampling import sample_torque
+from torchrl_nerd.scenes.sampling import sample_commands
 
 CONTROL = int(  # applied force, and where the ground is
     mujoco.mjtState.mjSTATE_QFRC_APPLIED
@@ -54,12 +54,12 @@ def seconds_of_rollout(
     """One bare call of MuJoCo."""
     generator = Generator().manual_seed(seed)
     start, scale = scene.sample_initial(rows, generator)
-    model = torque_model(scene)
+    model = engine_model(scene, has_actuators=False)
     data = [mujoco.MjData(model) for _ in range(threads)]
     state = np.concatenate(
         (np.zeros((rows, 1)), start["qpos"].numpy(), start["qvel"].numpy()), -1
     )
-    torque = sample_torque(scene.sampling, scale, steps, generator)
+    torque = sample_commands(scene.sampling, scale, steps, generator)
     control = np.zeros((rows, steps, mujoco.mj_stateSize(model, CONTROL)))
     control[:, :, scene.actuated] = torque.numpy()
     if scene.terrain is not None and "terrain" in start:

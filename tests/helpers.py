@@ -21,7 +21,7 @@ from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import ContactPoints
 from torchrl_nerd.scenes.controllers import TorqueController
-from torchrl_nerd.scenes.sampling import Sampling, sample_torque
+from torchrl_nerd.scenes.sampling import Sampling, sample_commands
 
 EXCERPT = Path(__file__).parent / "data" / "tosses_excerpt.npz"
 """A dozen tosses of a real cube; source and licence are in the file beside it."""
@@ -116,7 +116,7 @@ def random_transitions(scene: Scene, rows: int, generator: Generator) -> TensorD
         states = random_states(scene.model, rows, np.random.default_rng(seed))
         start = dict(zip((QPOS, QVEL), states, strict=True))
         scale = torch.ones(rows, 1, dtype=torch.float64)
-    torque = sample_torque(scene.sampling, scale, 1, generator)[:, 0]
+    torque = sample_commands(scene.sampling, scale, 1, generator)[:, 0]
     return mujoco_step(scene, TensorDict(start, batch_size=[rows]), torque)
 
 
@@ -258,7 +258,7 @@ def simulated(
 ) -> Recording:
     """A log of MuJoCo motion under random torques."""
     state, scale = scene.sample_initial(trajectories, generator)
-    torque = sample_torque(scene.sampling, scale, states - 1, generator)
+    torque = sample_commands(scene.sampling, scale, states - 1, generator)
     start, dynamics = TensorDict(state, [trajectories]), MujocoDynamics(scene)
     dynamics.reset(start)
     path = dynamics.rollout(start, torque, start.get(TERRAIN, None))

@@ -40,8 +40,13 @@ OBSERVATION = "observation"
 """What the policy sees ``(*batch, D)``, float32; the task defines it."""
 
 JOINT_TORQUE = ("next", "joint_torque")
-"""What the controller applied over the step, per actuated dof ``(*batch, num_actuated)``,
-N and N m, float64. Recorded under ``next``: it belongs to the transition."""
+"""Torque of the controller per actuated dof ``(*batch, num_actuated)``, N and N m, float64:
+held over the step, or a servo's at the step's start. Recorded under ``next``: it belongs to
+the transition."""
+
+CTRL = ("next", "ctrl")
+"""Control of each servo over the step ``(*batch, nu)``, MuJoCo's ``data.ctrl``,
+float64. Only of a scene with servos, whose torque at the step's start does not tell all."""
 
 NEXT_QPOS = ("next", "qpos")
 NEXT_QVEL = ("next", "qvel")
@@ -51,6 +56,9 @@ ROBOT_STATE = "robot_state"
 
 ROBOT_TORQUE = "robot_torque"
 """Joint torques ``(*batch, num_actuated)``, N and N m, float32."""
+
+ROBOT_CTRL = "robot_ctrl"
+"""Controls of servos ``(*batch, nu)``, float32. Only of a scene with servos."""
 
 CONTACT_DISTANCE = "contact_distance"
 """Clearance of each contact point to the ground, minus the margin, at most zero

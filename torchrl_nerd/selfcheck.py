@@ -9,13 +9,13 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import drive
 
 PREFIX = "check."  # of the names of what is stored
 ROWS = 8
@@ -41,8 +41,8 @@ def stored_steps(model: Model, scene: Scene) -> dict[str, Tensor]:
     ``scene`` is the model's own, as the data were stepped, see `Scene.reference`.
     """
     start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
-    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
-    given = {**start, "joint_torque": (scale * high).clone()}
+    middle, half = scene.sampling.commands
+    given = {**start, _command(scene): middle + scale * half}
     return {PREFIX + k: v for k, v in (given | _steps(model, scene, given)).items()}
 
 
@@ -93,13 +93,19 @@ def warn_of_differences(check: SelfCheck, folder: Path) -> None:
 def _steps(model: Model, scene: Scene, given: dict[str, Tensor]) -> dict[str, Tensor]:
     """One step of MuJoCo and of the model."""
     state = TensorDict({key: given[key] for key in (QPOS, QVEL)}, [len(given[QPOS])])
-    torque, terrain = given["joint_torque"], given.get(TERRAIN)
+    driven = drive(scene, given[_command(scene)], state[QPOS], state[QVEL])
+    (torque, ctrl), terrain = driven, given.get(TERRAIN)
     made, mujoco = {}, MujocoDynamics(scene, num_threads=1)
     for kind, dynamics in (("mujoco", mujoco), ("model", dynamics_of(model))):
         dynamics.reset(state)
-        after = dynamics.step(state, torque, terrain)
+        after = dynamics.step(state, torque, terrain, ctrl)
         made |= {f"{kind}_{key}": after[key] for key in (QPOS, QVEL)}
     return made
+
+
+def _command(scene: Scene) -> str:
+    """What the stored steps call the command."""
+    return "joint_torque" if scene.servos is None else "ctrl"
 
 
 def _difference(a: Tensor, b: Tensor) -> float:

@@ -85,7 +85,11 @@ class MjxDynamics(Memoryless):
         self.advance = _advance(scene)
 
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`."""
         given = (state[QPOS], state[QVEL], joint_torque)

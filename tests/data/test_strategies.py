@@ -38,7 +38,11 @@ from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import PRESETS, SCENES, load_scene, make_task
-from torchrl_nerd.scenes.sampling import sample_scale, sample_torque, sample_torques
+from torchrl_nerd.scenes.sampling import (
+    sample_commands,
+    sample_correlated_commands,
+    sample_scale,
+)
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tasks import Task
 from torchrl_nerd.training.policy_data import policy_data
@@ -84,7 +88,7 @@ def test_the_default_draws_are_those_of_shipped_models(scene, seed):
     data, generator = simulate(scene, rows, steps, seeded(seed)), seeded(seed)
     start, scale = scene.sample_initial(rows, generator)
     counts = (SEGMENT, SEGMENT, 3)
-    parts = [sample_torque(scene.sampling, scale, n, generator) for n in counts]
+    parts = [sample_commands(scene.sampling, scale, n, generator) for n in counts]
     assert torch.equal(data["next", "joint_torque"], torch.cat(parts, 1))
     for key, value in start.items():
         assert torch.equal(data[key][:, 0], value)
@@ -132,7 +136,7 @@ def test_torques_keep_as_long_as_asked_and_stay_uniform(scene, generator):
     tau = dt * float(torch.empty(()).uniform_(2.0, 12.0, generator=generator))
     sampling = replace(scene.sampling, correlation_time=(tau, tau))
     one = torch.ones(rows, 1, dtype=torch.float64)
-    torque = sample_torques(sampling, one, steps, dt, generator)
+    torque = sample_correlated_commands(sampling, one, steps, dt, generator)
     share = (torque / torch.tensor(sampling.torque))[..., 0]
     assert share.abs().max() <= 1.0
     for time in (0, steps - 1):  # stationary: uniform at the start as at the end
@@ -149,7 +153,9 @@ def test_each_row_has_a_correlation_time_of_its_own(generator):
     scene = load_scene("cartpole")
     sampling = replace(scene.sampling, correlation_time=(1e-3, 1e3))
     one = torch.ones(2000, 1, dtype=torch.float64)
-    torque = sample_torques(sampling, one, 40, scene.control_step, generator)[..., 0]
+    torque = sample_correlated_commands(
+        sampling, one, 40, scene.control_step, generator
+    )[..., 0]
     turns = (torque.diff(dim=1).abs() / sampling.torque[0]).mean(1)
     assert 0.2 < (turns < 0.05).double().mean() < 0.6  # kept
     assert 0.1 < (turns > 0.5).double().mean() < 0.4  # drawn anew at every step

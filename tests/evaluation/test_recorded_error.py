@@ -29,7 +29,7 @@ class Replay:
     def reset(self, state, rows=None):
         pass
 
-    def step(self, state, joint_torque, terrain=None):
+    def step(self, state, joint_torque, terrain=None, ctrl=None):
         apart = torch.cdist(state["qpos"], self.recording.qpos)
         after = apart.argmin(1) + 1
         values = {

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from servo_helpers import servo_scene
 from tensordict import TensorDict
 
 from torchrl_nerd import make_env
@@ -22,8 +23,10 @@ from torchrl_nerd.modules.nerd import NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import actuate
 from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.controllers import ActuatorController
+from torchrl_nerd.scenes.sampling import sample_correlated_commands
 from torchrl_nerd.tasks import SceneTask
 from torchrl_nerd.transforms import StateDelta
 
@@ -48,48 +51,13 @@ STEPS = {  # control step (s), substeps: of the tasks and environments
 PLANAR = [f"dm_control/{x}" for x in ("cheetah-run", "hopper-hop", "walker-walk")]
 PLANAR += [f"gymnasium/{x}-v5" for x in ("HalfCheetah", "Hopper", "Walker2d")]
 
-SERVOS = """
-<mujoco><option timestep="0.002" integrator="{integrator}"/>
-  <default><geom contype="1" conaffinity="0"/></default><worldbody>
-  <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
-  <body pos="0 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="3"/>
-    <body pos="0.3 0 0"><joint name="a" axis="0 1 0" range="-60 60"
-        limited="true" actuatorfrcrange="-6 5"/>
-      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" mass="0.5"/>
-      <body pos="0.2 0 0"><joint name="b" axis="0 1 0.2" damping="0.1"/>
-        <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" mass="0.4"/>
-      </body></body>
-    <body pos="-0.3 0 0"><joint name="c" type="slide" axis="1 0 0"/>
-      <geom type="sphere" size="0.05" mass="0.5"/>
-      <body pos="-0.1 0 0"><joint name="d" type="ball"/>
-        <geom type="capsule" fromto="0 0 0 -0.2 0 0" size="0.03" mass="0.4"/>
-      </body></body>
-  </body></worldbody>
-  <tendon><fixed name="t"><joint joint="b" coef="0.7"/><joint joint="c" coef="-2"/>
-  </fixed></tendon>
-  <actuator>
-    <position joint="a" kp="20" kv="1" gear="1.5" ctrlrange="-0.5 1"/>
-    <motor joint="a" gear="3" ctrlrange="-1 0.5"/>
-    <velocity joint="b" kv="2" forcerange="-1 0.5"/>
-    <general tendon="t" gear="2" gainprm="5" biastype="affine" biasprm="0.3 -4 -0.2"/>
-    <damper joint="c" kv="3" ctrlrange="0 1"/>
-    <motor joint="d" gear="1 2 -0.5"/><motor joint="d" gear="0 1 0"/>
-  </actuator></mujoco>"""
-"""Every actuator there is law for: several on a joint, on a tendon, on a ball, limited."""
-
 BODY = '<body><joint name="a"/><geom size="0.1"/></body>'
 MOTOR = '<actuator><motor name="m" joint="a" {}/></actuator>'
 REFUSED = {
     "an actuator with a state": (BODY, '<actuator><general name="m" joint="a" '
         'dyntype="filter" dynprm="0.1"/></actuator>'),
-    "an actuator that is no": (BODY, '<actuator><general name="m" joint="a" '
+    "an actuator whose force a callback": (BODY, '<actuator><general name="m" joint="a" '
         'gaintype="user"/></actuator>'),
-    "an actuator on no joint": (BODY.replace("</body>", '<site name="s"/></body>'),
-        '<actuator><motor name="m" site="s"/></actuator>'),
-    "an actuator on its free": ('<body><freejoint name="a"/><geom size="1"/></body>',
-        MOTOR.format("")),
-    "an actuator that reads": ('<body><joint name="a" type="ball"/><geom size="1"/>'
-        "</body>", '<actuator><position name="m" joint="a"/></actuator>'),
     "a delayed actuator": (BODY, MOTOR.format('delay="0.01" nsample="2"')),
     "a surface that moves": (BODY.replace("<geom", '<geom name="m" surfacevel="1 0 0"'),
         ""),
@@ -97,6 +65,8 @@ REFUSED = {
         + '<body><freejoint/><geom size="1"/></body>', ""),
     "a floating base whose": ('<body><freejoint/><geom size="1"/></body>',
         '<option wind="3 1 0" density="100"/>'),
+    "a floating base whose .* an actuator": ('<body><freejoint name="a"/><geom size="1"/>'
+        "</body>", MOTOR.format("")),
     "2 moving trees": (BODY + BODY.replace('"a"', '"b"'), ""),
     "no joint": ('<body><geom size="1"/></body>', ""),
 }  # fmt: skip
@@ -106,12 +76,6 @@ def write(folder, world, rest=""):
     path = folder / "robot.xml"
     path.write_text(f"<mujoco><worldbody>{world}</worldbody>{rest}</mujoco>")
     return path
-
-
-def servo_scene(folder, integrator="Euler", control_step=0.004) -> Scene:
-    path = folder / "servos.xml"
-    path.write_text(SERVOS.format(integrator=integrator))
-    return Scene.from_mjcf(path, control_step)
 
 
 @pytest.fixture(params=STEPS)
@@ -160,25 +124,20 @@ def check_torques(scene, generator):
         np.testing.assert_allclose(force, data.qfrc_actuator, 0.0, 1e-12 * size)
 
 
-def check_steps(scene, generator, hold):
-    """One control step against the original model, its actuators on or held."""
+def check_steps(scene, generator):
+    """One control step is the original model's, bit for bit, its controls held."""
     state, action = states_and_actions(scene, generator)
     dynamics = MujocoDynamics(scene, num_threads=1)
-    torque = scene.controller(action, state[QPOS], state[QVEL])
-    after = dynamics.step(state, torque)
+    torque, ctrl = actuate(scene.controller, action, state[QPOS], state[QVEL])
+    after = dynamics.step(state, torque, None, ctrl)
     for row in range(ROWS):
         data = set_up(scene, state, action, row)
-        if hold:
-            mujoco.mj_forward(scene.model, data)
-            data.qfrc_applied = data.qfrc_actuator
-            data.qacc_warmstart = 0.0
-        model = copy.copy(scene.model)
-        if hold:
-            model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
-        mujoco.mj_step(model, data, scene.substeps)
+        np.testing.assert_allclose(data.ctrl, ctrl[row], 1e-12)
+        data.ctrl = ctrl[row]
+        mujoco.mj_step(scene.model, data, scene.substeps)
         for key, want in ((QPOS, data.qpos), (QVEL, data.qvel)):
-            size = 1.0 + abs(want).max()
-            np.testing.assert_allclose(after[key][row], want, 0.0, 1e-10 * size)
+            np.testing.assert_array_equal(after[key][row], want)
+    return state, torque, after
 
 
 def test_torques_are_the_actuators(robot, generator):
@@ -192,18 +151,17 @@ def test_servo_torques_are_the_actuators(servos, generator):
 
 
 def test_mujoco_steps_are_the_original_models(robot, generator):
-    assert robot.controller.is_motor
-    check_steps(robot, generator, hold=False)
+    assert robot.controller.is_motor and robot.servos is None
+    state, torque, after = check_steps(robot, generator)
+    held = MujocoDynamics(robot, num_threads=1).step(state, torque)
+    for key in (QPOS, QVEL):  # a motor's torque says the same, but for rounding
+        size = 1.0 + after[key].abs().amax(1, keepdim=True)
+        assert ((held[key] - after[key]).abs() <= 1e-10 * size).all()
 
 
-def test_mujoco_steps_of_servos_are_the_originals_with_the_force_held(
-    servos, generator
-):
-    check_steps(servos, generator, hold=True)
-
-
-def test_servos_stepped_at_every_timestep_need_no_holding(tmp_path, generator):
-    check_steps(servo_scene(tmp_path, control_step=0.002), generator, hold=False)
+def test_mujoco_steps_of_servos_are_the_originals(servos, generator):
+    assert servos.servos is servos.controller
+    check_steps(servos, generator)
 
 
 def test_a_dm_control_episode_is_dm_controls_own(generator):
@@ -321,20 +279,23 @@ def test_random_trajectories_stay_sound(name, generator):
     assert (data["next", "joint_torque"].abs() <= largest).all()
 
 
-def test_servos_are_driven_by_random_actions(servos, generator):
+def test_servos_are_driven_by_random_controls(servos, generator):
+    """Uniform about the middle of their ranges, as far from it as the row's scale."""
+    low, high = torch.from_numpy(servos.model.actuator_ctrlrange.copy()).T
+    is_free = servos.model.actuator_ctrllimited == 0
+    low[is_free], high[is_free] = -1.0, 1.0
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
     scale = torch.rand(2000, 1, generator=generator).double()
-    ranges = replace(servos.sampling, clearance=None, penetration=None)
-    state, _ = replace(servos, sampling=ranges).sample_initial(2000, generator)
-    norms = torch.linalg.vector_norm(state[QPOS][:, -4:], dim=-1)
-    assert (norms - 1.0).abs().max() < 1e-12
-    qvel = torch.zeros_like(state[QVEL])
-    drive = servos.sampling.drive
-    torque = drive(state[QPOS], qvel, scale, generator)
-    largest = torch.tensor(servos.sampling.torque, dtype=torch.float64)
-    assert (torque.abs() <= 1.1 * scale * largest).all()
-    assert (torque.abs().amax(0) > 0.3 * largest).all()
-    idle = drive(state[QPOS], qvel, 0.0 * scale, generator)
-    assert not idle.any() and is_sound(simulate(servos, 4, 5, generator)).all()
+    for times in (None, (0.004, 0.1)):
+        sampling = replace(servos.sampling, correlation_time=times)
+        ctrl = sample_correlated_commands(sampling, scale, 5, 0.004, generator)
+        share = (ctrl - middle) / (scale[:, None] * half)
+        assert share.abs().max() <= 1.0 + 1e-9 and ctrl.shape == (2000, 5, 8)
+        assert abs(share.square().mean() - 1.0 / 3.0) < 0.01
+    data = simulate(servos, 4, 20, generator)
+    assert is_sound(data).all() and data["next", "ctrl"].shape == (4, 20, 8)
+    expected = servos.servos.torque(data["next", "ctrl"], data[QPOS], data[QVEL])
+    assert torch.equal(data["next", "joint_torque"], expected)
 
 
 def test_ranges_can_be_given():

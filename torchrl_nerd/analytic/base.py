@@ -90,6 +90,8 @@ def check_supported(scene: Scene) -> None:
     """
     model = scene.model
     kinds = {geom_kind(model, geom) for geom in touching_geoms(model)}
+    names = ("armature", "damping", "dampingpoly")
+    of_actuators = (getattr(model, f"actuator_{name}") for name in names)
     forces = {
         "dry friction": model.dof_frictionloss.any(),
         "air or water": model.opt.density or model.opt.viscosity,
@@ -99,11 +101,13 @@ def check_supported(scene: Scene) -> None:
         "tendons": model.ntendon,
         "gravity compensation": model.body_gravcomp.any(),
         "cylinders, ellipsoids or meshes on the ground": not kinds <= {*EXACT},
+        "servos of MuJoCo": scene.servos is not None,
+        "actuators with damping or mass": any(x.any() for x in of_actuators),
     }
     found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:
         raise ValueError(
-            "expected, for an analytic step, a robot moved by actuators, gravity, springs, "
+            "expected, for an analytic step, a robot moved by motors, gravity, springs, "
             f"damping, limits and contact with the ground alone, got scene '{scene.name}' "
             f"with {found}"
         )

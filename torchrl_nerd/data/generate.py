@@ -2,7 +2,8 @@
 
 A data set is a folder with a JSON card and safetensors files of trajectories
 ``[trajectories, steps]`` in TorchRL's layout: ``qpos``, ``qvel`` and, where the ground
-varies, ``terrain``; under ``next`` the same state keys and ``joint_torque``.
+varies, ``terrain``; under ``next`` the same state keys, ``joint_torque`` and, of servos,
+``ctrl``.
 """
 
 import json

@@ -17,6 +17,7 @@ from torchrl_nerd import __version__
 from torchrl_nerd.data.generate import CARD
 from torchrl_nerd.data.physics_checks import check_log
 from torchrl_nerd.data.recorded import (
+    CONTROL,
     TORQUE,
     Recording,
     complete,
@@ -27,6 +28,7 @@ from torchrl_nerd.data.store import chunk_path, write_chunk
 from torchrl_nerd.files import writable_folder, write_json
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import num_ctrl
 
 FREE_BODY = {
     "position": ("x", "y", "z"),
@@ -35,7 +37,7 @@ FREE_BODY = {
     "angular_velocity": ("wx", "wy", "wz"),
 }
 ARRAYS = (
-    *(QPOS, QVEL, TORQUE, TERRAIN, *FREE_BODY),
+    *(QPOS, QVEL, TORQUE, CONTROL, TERRAIN, *FREE_BODY),
     *("trajectory_offsets", "trajectory", "time"),
 )
 LARGEST_LOG = 2**30  # bytes of an npz file, unpacked
@@ -64,6 +66,9 @@ def read_log(path: Path, scene: Scene) -> Recording:
     if scene.terrain is not None and scene.terrain.is_per_row:
         needed.append(TERRAIN)
         sizes[TERRAIN] = scene.terrain.size
+    if num_ctrl(scene):
+        needed.append(CONTROL)
+        sizes[CONTROL] = num_ctrl(scene)
     for name in needed:
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"
@@ -95,6 +100,7 @@ def read_log(path: Path, scene: Scene) -> Recording:
         scene.control_step,
         tensors.get("time"),
         tensors.get(TERRAIN),
+        tensors.get(CONTROL),
     )
     if log.time is None:
         return log
@@ -142,7 +148,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"expected a CSV table in {path}: {said}") from None
     names = set(table.dtype.names or ())
     columns = dict(FREE_BODY)
-    for array in (QPOS, QVEL, TORQUE, TERRAIN):
+    for array in (QPOS, QVEL, TORQUE, CONTROL, TERRAIN):
         count = sum(name.startswith(f"{array}_") for name in names)
         if count:
             columns[array] = tuple(f"{array}_{number}" for number in range(count))

@@ -12,7 +12,7 @@ from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 
-TORQUE = "joint_torque"
+TORQUE, CONTROL = "joint_torque", "ctrl"
 SPLIT_SEED, TRAIN_SHARE, VALIDATION_SHARE = 0, 380 / 510, 65 / 510
 CLEAR = 0.005  # m between the lowest contact point and the ground: free flight
 FLIGHT = 8  # frames at the start of a trajectory in which free fall is measured
@@ -24,20 +24,23 @@ class Recording:
 
     qpos: Tensor  # (N, nq)
     qvel: Tensor  # (N, nv); NaN where not recorded, until `complete`
-    joint_torque: Tensor  # (N, num_actuated), N m or N, held until the next state
+    joint_torque: Tensor  # (N, num_actuated), N m or N, held until the next state;
+    # a servo's is that of the row's own time
     offsets: Tensor  # (T + 1,): trajectory i is rows offsets[i]:offsets[i + 1]
     frame: float  # time between two states, s
     time: Tensor | None = None  # time stamps (N,), s
     terrain: Tensor | None = None  # the ground (N, terrain.size), where it varies
+    ctrl: Tensor | None = None  # of servos (N, num_ctrl), held until the next state
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
     @property
     def columns(self) -> dict[str, Tensor]:
-        """States and torques by their keys, ``(N, *)``."""
+        """States and what drives them by their keys, ``(N, *)``."""
         found = {QPOS: self.qpos, QVEL: self.qvel, TORQUE: self.joint_torque}
-        return found if self.terrain is None else {**found, TERRAIN: self.terrain}
+        extra = {TERRAIN: self.terrain, CONTROL: self.ctrl}
+        return found | {k: value for k, value in extra.items() if value is not None}
 
     @property
     def inside(self) -> Tensor:
@@ -84,7 +87,7 @@ class Recording:
         return torch.searchsorted(self.offsets, rows, right=True) - 1
 
     def windows(self, starts: Tensor, states: int) -> TensorDict:
-        """Consecutive states and torques ``[windows, states]``."""
+        """Consecutive states and what drives them ``[windows, states]``."""
         rows = starts[:, None] + torch.arange(states)  # (windows, states)
         return TensorDict({k: v[rows] for k, v in self.columns.items()}, [*rows.shape])
 
@@ -97,10 +100,15 @@ class Recording:
         after = self.inside.nonzero()[:, 0]
         now = {key: column[after - 1] for key, column in self.columns.items()}
         moved = {QPOS: self.qpos[after], QVEL: self.qvel[after]}
-        moved[TORQUE] = now.pop(TORQUE)
+        moved |= {key: now.pop(key) for key in (TORQUE, CONTROL) if key in now}
         size, number = [len(after)], self.trajectory_of(after)
         other = {"next": TensorDict(moved, size), "collector": {"traj_ids": number}}
         return TensorDict({**now, **other}, size)
+
+
+def command_of(window: TensorDict) -> Tensor:
+    """What is held over the steps of a window: servos' controls, or the torque."""
+    return window.get(CONTROL, window[TORQUE])
 
 
 def is_free_body(scene: Scene) -> bool:
@@ -114,7 +122,8 @@ def complete(log: Recording, scene: Scene) -> Recording:
 
     Velocities are estimated from positions as `estimate_velocities` does. A velocity that
     is a mean over the frame before lags its state: of a free body in flight the median lag
-    is measured, and what gravity adds in that time is added.
+    is measured, and what gravity adds in that time is added. The torque of servos follows
+    from their controls.
     """
     layout = scene.layout
     qpos = integrate_pos(layout, log.qpos, torch.zeros_like(log.qvel))
@@ -130,7 +139,10 @@ def complete(log: Recording, scene: Scene) -> Recording:
             mean = backward_differences(log, scene)[:, 2]
             now = mean + 0.5 * log.frame * float(free_fall(log)[2])
             qvel[flies, 2] += (now - qvel[:, 2])[steady].median()
-    return replace(log, qvel=qvel)
+    log = replace(log, qvel=qvel)
+    if scene.servos is None or log.ctrl is None:
+        return log
+    return replace(log, joint_torque=scene.servos.torque(log.ctrl, qpos, qvel))
 
 
 def estimate_velocities(log: Recording, scene: Scene) -> Tensor:

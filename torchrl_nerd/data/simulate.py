@@ -9,9 +9,10 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.geometry.manifold import joint_label
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import CTRL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.sampling import sample_torques
+from torchrl_nerd.scenes.commands import drive, held
+from torchrl_nerd.scenes.sampling import sample_correlated_commands
 
 SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
 LARGEST = 1e5  # reference code: a trajectory beyond this has diverged
@@ -24,35 +25,43 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     terrain = start.pop(TERRAIN, None)
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
-    states, torques = [state[:, None]], []
+    states, commands = [state[:, None]], []
     sampling, drawn = scene.sampling, ()
     if sampling.drive is None:
-        drawn = sample_torques(sampling, scale, steps, scene.control_step, generator)
-        drawn = drawn.split(SEGMENT, 1)
+        how = steps, scene.control_step, generator
+        drawn = sample_correlated_commands(sampling, scale, *how).split(SEGMENT, 1)
     for segment in range(steps if sampling.drive else len(drawn)):
         last = cast(TensorDict, states[-1][:, -1])
         if sampling.drive is None:
-            torque = drawn[segment]  # (rows, SEGMENT, num_actuated)
+            command = drawn[segment]  # (rows, SEGMENT, m)
         else:  # depends on the state: one step at a time
-            torque = sampling.drive(last[QPOS], last[QVEL], scale, generator)[:, None]
-        torques.append(torque)
-        states.append(dynamics.rollout(last, torque, terrain))
-    return as_transitions(states, torques, terrain)
+            command = sampling.drive(last[QPOS], last[QVEL], scale, generator)[:, None]
+        torque, ctrl = held(scene, command)
+        commands.append(command)
+        states.append(dynamics.rollout(last, torque, terrain, ctrl))
+    return as_transitions(scene, states, commands, terrain)
 
 
 def as_transitions(
-    states: list[TensorDictBase], torques: list[Tensor], terrain: Tensor | None
+    scene: Scene,
+    states: list[TensorDictBase],
+    commands: list[Tensor],
+    terrain: Tensor | None,
 ) -> TensorDict:
     """A data set ``[rows, steps]`` in TorchRL's layout.
 
     Args:
+        scene: the robot.
         states: parts of trajectories, ``[rows, *]``, in order: steps + 1 states in all.
-        torques: of the steps between them, parts of ``(rows, *, num_actuated)``.
+        commands: of the steps between them, parts of ``(rows, *, m)``.
         terrain: ``(rows, terrain.size)`` where the ground varies.
     """
     path = cast(TensorDict, TensorDict.cat(states, 1))
     data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))
-    data["next"] = after.set("joint_torque", torch.cat(torques, 1))
+    torque, ctrl = drive(scene, torch.cat(commands, 1), data[QPOS], data[QVEL])
+    data["next"] = after.set("joint_torque", torque)
+    if ctrl is not None:
+        data[CTRL] = ctrl
     if terrain is not None:
         steps = data.batch_size[1]
         data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()

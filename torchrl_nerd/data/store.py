@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl_nerd.files import writable_folder
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import num_ctrl
 from torchrl_nerd.tensor_files import read_tensors, write_tensors
 
 
@@ -45,6 +46,8 @@ def expect_layout(data: TensorDictBase, scene: Scene, steps: int, path: Path) ->
     sizes = {QPOS: scene.layout.nq, QVEL: scene.layout.nv}
     sizes |= {f"next/{key}": size for key, size in sizes.items()}
     sizes |= {"next/joint_torque": len(scene.actuated)}
+    if num_ctrl(scene):
+        sizes |= {"next/ctrl": num_ctrl(scene)}
     if scene.terrain is not None and scene.terrain.is_per_row:
         sizes |= {"terrain": scene.terrain.size}
     found = dict(data.flatten_keys("/").items())

@@ -15,6 +15,7 @@ from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import preset_of
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import held, idle
 from torchrl_nerd.scenes.sampling import log_uniform
 
 MAX_CORRELATION_TIME = 1.0  # s; the shortest is one control step
@@ -33,10 +34,11 @@ class SettledStates:
         terrain = start.pop(TERRAIN, None)
         state = first = TensorDict(start, [rows])
         dynamics = MujocoDynamics(self.scene)
-        idle = torch.zeros(rows, len(self.scene.actuated), dtype=torch.float64)
+        torque, ctrl = held(self.scene, idle(self.scene, rows, 1))
         dynamics.reset(first)
         for _ in range(round(self.seconds / self.scene.control_step)):
-            state = cast(TensorDict, dynamics.step(state, idle, terrain))
+            path = dynamics.rollout(state, torque, terrain, ctrl)
+            state = cast(TensorDict, path[:, 0])
         is_fine = torch.cat((state[QPOS], state[QVEL]), -1).isfinite().all(-1)[:, None]
         end = {k: torch.where(is_fine, state[k], first[k]) for k in (QPOS, QVEL)}
         return end if terrain is None else end | {TERRAIN: terrain}

@@ -1,4 +1,4 @@
-"""The interface of all dynamics: state and torque in, next state out."""
+"""The interface of all dynamics: state, torque and controls in, next state out."""
 
 from typing import Any, Protocol
 
@@ -33,14 +33,21 @@ class Dynamics(Protocol):
         ...
 
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """The state one control step later.
 
         Args:
             state: ``qpos (num_envs, nq)``, ``qvel (num_envs, nv)``.
-            joint_torque: ``(num_envs, num_actuated)``, N and N m, held over the step.
+            joint_torque: ``(num_envs, num_actuated)``, N and N m, held over the step; with
+                ``ctrl``, that of its start.
             terrain: ``(num_envs, terrain.size)`` where the ground varies.
+            ctrl: ``(num_envs, nu)``, held over the step: the ground truth steps with
+                MuJoCo's own actuators, and a model of servos knows them by it.
 
         Returns:
             A new tensordict; envs that the physics could not step are not finite. The
@@ -71,7 +78,11 @@ def as_numpy(x: Tensor) -> np.ndarray:
 
 
 def check_step(
-    scene: Scene, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
+    scene: Scene,
+    state: TensorDictBase,
+    joint_torque: Tensor | None,
+    terrain: Tensor | None,
+    ctrl: Tensor | None = None,
 ) -> None:
     """Raise ValueError where a shape is not the scene's, naming got and expected.
 
@@ -88,9 +99,10 @@ def check_step(
         (QPOS, state[QPOS], scene.model.nq),
         (QVEL, state[QVEL], scene.model.nv),
         ("joint_torque", joint_torque, len(scene.actuated)),
+        ("ctrl", ctrl, scene.model.nu),
     ):
-        got = tuple(value.shape)
-        if got != (rows, width):
+        got = None if value is None else tuple(value.shape)
+        if got not in (None, (rows, width)):
             raise ValueError(f"expected {name} of shape {(rows, width)}, got {got}")
 
 

@@ -10,23 +10,24 @@ from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
-from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
+from torchrl_nerd.dynamics.mujoco import engine_model, feels_forces
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from dm_control.mujoco import Physics
 
 
-def make_physics(scene: Scene) -> "Physics":
-    """A dm_control `Physics` of the scene, driven by joint torques.
+def make_physics(scene: Scene, has_actuators: bool) -> "Physics":
+    """A dm_control `Physics` of the scene, see `engine_model`.
 
     dm_control is imported here, on first use: it looks for a display and says so.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from dm_control.mujoco import Physics, wrapper
-    return Physics.from_model(wrapper.MjModel(torque_model(scene)))
+    return Physics.from_model(wrapper.MjModel(engine_model(scene, has_actuators)))
 
 
 class DMControlDynamics:
@@ -44,17 +45,21 @@ class DMControlDynamics:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
+        self._has_actuators = isinstance(scene.controller, ActuatorController)
         self._rows: list[Physics] = []
 
     def __getstate__(self) -> dict:
         """A copy in another process builds its own `Physics` objects."""
-        return {"scene": self.scene, "_rows": []}
+        return self.__dict__ | {"_rows": []}
+
+    def _new(self) -> "Physics":
+        return make_physics(self.scene, self._has_actuators)
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Return the `Physics` of ``rows (num_envs,)`` to the state a new one has."""
         count = state[QPOS].shape[0]
         if len(self._rows) != count:
-            self._rows = [make_physics(self.scene) for _ in range(count)]
+            self._rows = [self._new() for _ in range(count)]
             return
         for row, physics in enumerate(self._rows):
             if rows is None or rows[row]:
@@ -70,26 +75,34 @@ class DMControlDynamics:
             if history:  # which may be restored again
                 self._rows[row] = history[row].copy(share_model=True)
             else:
-                self._rows[row] = make_physics(self.scene)
+                self._rows[row] = self._new()
 
     @uncompiled
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs on which MuJoCo gave up come back as NaN."""
-        check_step(self.scene, state, joint_torque, terrain)
+        check_step(self.scene, state, joint_torque, terrain, ctrl)
+        if self._has_actuators != (ctrl is not None):
+            self._has_actuators, self._rows = ctrl is not None, []
         if len(self._rows) != len(joint_torque):
             self.reset(state)
-        qpos, qvel, force = (
-            as_numpy(x) for x in (state[QPOS], state[QVEL], joint_torque)
-        )
+        command = joint_torque if ctrl is None else ctrl
+        qpos, qvel, told = (as_numpy(x) for x in (state[QPOS], state[QVEL], command))
         pose = ground_pose(self.scene, terrain)
         poses = [None] * len(qpos) if pose is None else as_numpy(pose)
         next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
         felt = np.empty((len(qpos), self.scene.model.nsensordata))
         for row, physics in enumerate(self._rows):
             _place(physics, qpos[row], qvel[row], poses[row])
-            physics.data.qfrc_applied[self.scene.actuated] = force[row]
+            if self._has_actuators:
+                physics.set_control(told[row])
+            else:
+                physics.data.qfrc_applied[self.scene.actuated] = told[row]
             with physics.suppress_physics_errors():
                 physics.step(self.scene.substeps)
             is_broken = physics.data.warning.number.any()

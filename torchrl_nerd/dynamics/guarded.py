@@ -76,14 +76,18 @@ class GuardedDynamics:
             self._calm = torch.where(rows, known, self._calm)
 
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`; the next state also holds ``trust (num_envs, 1)``.
 
         Raises:
             UntrustedError: with the guard ``"raise"``, naming the envs.
         """
-        after, distance = self.learned.scored_step(state, joint_torque, terrain)
+        after, distance = self.learned.scored_step(state, joint_torque, terrain, ctrl)
         assert distance is not None  # for the type checker: it was asked for
         trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
         rows = trust < 1.0
@@ -94,10 +98,10 @@ class GuardedDynamics:
                 f"least trust {float(trust.min()):.2g}"
             )
         if self.ground_truth is not None and (rows := self._not_yet_calm(rows)).any():
-            ground = None if terrain is None else terrain[rows]
+            ground, told = (None if x is None else x[rows] for x in (terrain, ctrl))
             some = state.select(QPOS, QVEL)[rows]
             self.ground_truth.reset(some)  # no warm start of other envs
-            exact = self.ground_truth.step(some, joint_torque[rows], ground)
+            exact = self.ground_truth.step(some, joint_torque[rows], ground, told)
             for key in (QPOS, QVEL):
                 after[key] = after[key].index_put((rows,), exact[key])
         return after.set(TRUST, trust[:, None].to(torch.float32))

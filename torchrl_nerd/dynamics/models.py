@@ -15,6 +15,7 @@ from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD, Network
 from torchrl_nerd.modules.window import WindowNetwork
+from torchrl_nerd.scenes.commands import drive_of
 
 Inference = Literal["streaming", "window"]
 
@@ -109,10 +110,15 @@ class TorchDynamics:
                 self._memory.clear(rows.to(self.device))
 
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`."""
-        return self.scored_step(state, joint_torque, terrain, is_scored=False)[0]
+        given = state, joint_torque, terrain, ctrl
+        return self.scored_step(*given, is_scored=False)[0]
 
     @unaffected
     def scored_step(
@@ -120,19 +126,30 @@ class TorchDynamics:
         state: TensorDictBase,
         joint_torque: Tensor,
         terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
         is_scored: bool = True,
     ) -> tuple[TensorDictBase, Tensor | None]:
         """`step`, and the out-of-distribution score ``(num_envs,)`` of its input.
 
         The score is None where it was not asked for or the dynamics has none.
+
+        Raises:
+            ValueError: servos without ``ctrl``.
         """
-        check_step(self.scene, state, joint_torque, terrain)
+        check_step(self.scene, state, joint_torque, terrain, ctrl)
+        if ctrl is None and self.scene.servos is not None:
+            raise ValueError(
+                f"scene '{self.scene.name}' has servos, which a model knows by their "
+                "ctrl: got none"
+            )
         there, here = state[QPOS].device, self.device
         qpos, qvel = (state[key].to(here, self.state_dtype) for key in (QPOS, QVEL))
         qpos = normalize_pos(self.scene.layout, qpos)
         ground = None if terrain is None else terrain.to(qpos)
         self._prepare(len(qpos))
-        given = qpos, qvel, joint_torque.to(qpos), ground, self._memory, is_scored
+        told = None if self.scene.servos is None or ctrl is None else ctrl.to(qpos)
+        drive = drive_of(joint_torque.to(qpos), told)
+        given = qpos, qvel, drive, ground, self._memory, is_scored
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel, score = self._run(given)
         after = TensorDict(
@@ -154,7 +171,7 @@ class TorchDynamics:
         return self._in_parts(parts, *given) if parts > 1 else self._compiled(*given)
 
     def _predict(self, *args: Any, **kwargs: Any) -> Prediction:
-        """From qpos, qvel, joint torque, terrain, memory (advanced) and ``is_scored``."""
+        """From qpos, qvel, drive, terrain, memory (advanced) and ``is_scored``."""
         raise NotImplementedError
 
 
@@ -218,7 +235,7 @@ class NeRDDynamics(TorchDynamics):
         self,
         qpos: Tensor,
         qvel: Tensor,
-        joint_torque: Tensor,
+        drive: Tensor,
         terrain: Tensor | None,
         memory: Any,
         is_scored: bool,
@@ -228,7 +245,7 @@ class NeRDDynamics(TorchDynamics):
 
         model = self.model
         next_qpos, next_qvel, features = model.step(
-            (qpos, qvel), joint_torque, terrain, network_step
+            (qpos, qvel), drive, terrain, network_step
         )
         score = model.ood_score(features) if is_scored else None
         return next_qpos, next_qvel, score

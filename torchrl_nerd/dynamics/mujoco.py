@@ -15,20 +15,21 @@ from torch import Tensor
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import silence_mujoco
 from torchrl_nerd.settings import expect_count
 
 
-def torque_model(scene: Scene) -> mujoco.MjModel:
-    """The scene's model driven by joint torques alone.
+def engine_model(scene: Scene, has_actuators: bool) -> mujoco.MjModel:
+    """The scene's model, driven by its own actuators or by joint torques alone.
 
-    Its own actuators are off, since the controller already turned actions into torques;
-    no silent reset on bad numbers.
+    No silent reset on bad numbers.
     """
     model = copy.copy(scene.model)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if not has_actuators:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     return model
 
 
@@ -57,7 +58,9 @@ def default_threads() -> int:
 class MujocoDynamics:
     """MuJoCo itself, substeps and threads in C, no Python loop over envs.
 
-    The solver's warm start is carried from step to step, as ``mj_step`` does (it changes
+    With ``ctrl`` a step is ``mj_step`` itself, substep by substep, to the last bit: the
+    robot's own actuators act. Without it they are off, and the joint torque is held. The
+    solver's warm start is carried from step to step, as ``mj_step`` does (it changes
     results by less than the solver's tolerance), and cleared for envs that are reset.
 
     Args:
@@ -75,11 +78,12 @@ class MujocoDynamics:
         self.scene = scene
         self.num_threads = default_threads() if num_threads is None else num_threads
         expect_count(1, num_threads=self.num_threads)
-        self._model = torque_model(scene)
+        self._has_actuators = isinstance(scene.controller, ActuatorController)
         self._start(np.zeros((0, scene.model.nv)))
 
     def _start(self, warmstart: np.ndarray) -> None:
         """Simulations, one for each row of the warm start ``(rows, nv)``."""
+        self._model = engine_model(self.scene, self._has_actuators)
         self._batch: Batch | None = None
         self._warmstart = warmstart
         if len(warmstart):
@@ -116,10 +120,15 @@ class MujocoDynamics:
 
     @uncompiled
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
-        states = self.rollout(state, joint_torque[:, None], terrain)
+        controls = None if ctrl is None else ctrl[:, None]
+        states = self.rollout(state, joint_torque[:, None], terrain, controls)
         last = TensorDict(
             {key: x[:, 0] for key, x in states.items()}, len(joint_torque)
         )
@@ -131,14 +140,20 @@ class MujocoDynamics:
         return last.to(state[QPOS].device)
 
     def rollout(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor | None,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDict:
         """Many control steps in one call: what `step` gives one after the other.
 
         Args:
             state: ``qpos (rows, nq)``, ``qvel (rows, nv)``.
-            joint_torque: ``(rows, T, num_actuated)``, each held over its control step.
+            joint_torque: ``(rows, T, num_actuated)``, each held over its control step;
+                with ``ctrl`` it is not used, and may be None.
             terrain: ``(rows, terrain.size)`` where the ground varies.
+            ctrl: ``(rows, T, nu)``, each held: MuJoCo's actuators act in every substep.
 
         Returns:
             ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo
@@ -147,9 +162,16 @@ class MujocoDynamics:
         Raises:
             ValueError: a shape that is not the scene's, or a ground that is not finite.
         """
-        rows, length = joint_torque.shape[:2]
+        command = joint_torque if ctrl is None else ctrl
+        if command is None:
+            raise ValueError("expected a joint torque or ctrl, got neither")
+        rows, length = command.shape[:2]
         if length:
-            check_step(self.scene, state, joint_torque[:, 0], terrain)
+            torque, now = (None if x is None else x[:, 0] for x in (joint_torque, ctrl))
+            check_step(self.scene, state, torque, terrain, now)
+        if self._has_actuators != (ctrl is not None):
+            self._has_actuators = ctrl is not None
+            self._start(self._warmstart.copy())
         if len(self._warmstart) != rows:
             self.reset(state)
         qpos = np.empty((rows, length, self._model.nq))
@@ -158,9 +180,9 @@ class MujocoDynamics:
         if batch is not None and length:
             pose = ground_pose(self.scene, terrain)
             self._place(batch, as_numpy(state[QPOS]), as_numpy(state[QVEL]), pose)
-            torque, is_whole = as_numpy(joint_torque), np.ones(rows, bool)
+            commands, is_whole = as_numpy(command), np.ones(rows, bool)
             for t in range(length):
-                self._advance(batch, torque[:, t], is_whole)
+                self._advance(batch, commands[:, t], is_whole)
                 qpos[:, t], qvel[:, t] = batch.bind(QPOS), batch.bind(QVEL)
         values = {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
         return TensorDict(values, [rows, length]).to(state[QPOS].device)
@@ -177,9 +199,12 @@ class MujocoDynamics:
                 target = batch.bind(key)
                 target[:] = value.reshape(target.shape)
 
-    def _advance(self, batch: Batch, torque: np.ndarray, is_whole: np.ndarray) -> None:
+    def _advance(self, batch: Batch, command: np.ndarray, is_whole: np.ndarray) -> None:
         """One control step; a simulation with a warning is NaN, and whole no longer."""
-        batch.bind("qfrc_applied")[:, self.scene.actuated] = torque
+        if self._has_actuators:
+            batch.bind("ctrl")[:] = command
+        else:
+            batch.bind("qfrc_applied")[:, self.scene.actuated] = command
         counts = batch.warning[..., 1]  # (rows, kinds of warning), as they stand now
         before = counts.copy()
         ids = None if is_whole.all() else np.flatnonzero(is_whole)

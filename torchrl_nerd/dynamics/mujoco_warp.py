@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import check_step, ground_pose
-from torchrl_nerd.dynamics.mujoco import feels_forces, torque_model
+from torchrl_nerd.dynamics.mujoco import engine_model, feels_forces
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 
 LARGEST = 1e10  # m, rad, m/s, rad/s: MuJoCo's mjMAXVAL, beyond which it gives up
@@ -54,6 +55,7 @@ class MujocoWarpDynamics:
     ) -> None:
         self.scene, self.device = scene, torch.device(device)
         self.max_contacts, self.is_capturing = max_contacts, is_capturing
+        self.has_actuators = isinstance(scene.controller, ActuatorController)
         self._start()
 
     def _start(self) -> None:
@@ -64,7 +66,7 @@ class MujocoWarpDynamics:
             raise ValueError(
                 f"MuJoCo Warp finds no device '{self.device}' here"
             ) from error
-        self._source = torque_model(self.scene)
+        self._source = engine_model(self.scene, self.has_actuators)
         # a flag that Warp does not know: it never resets an env by itself
         disabled = self._source.opt.disableflags
         no_reset = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -86,7 +88,7 @@ class MujocoWarpDynamics:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is on the device does not travel, but for the warm start."""
-        kept = ("scene", "device", "max_contacts", "is_capturing")
+        kept = ("scene", "device", "max_contacts", "is_capturing", "has_actuators")
         warmstart = self._view("qacc_warmstart").cpu() if self._rows else None
         return {name: self.__dict__[name] for name in kept} | {"warmstart": warmstart}
 
@@ -118,15 +120,23 @@ class MujocoWarpDynamics:
     @torch.no_grad()
     @uncompiled
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """See `Dynamics.step`. Envs that cannot be stepped come back as NaN."""
-        check_step(self.scene, state, joint_torque, terrain)
+        check_step(self.scene, state, joint_torque, terrain, ctrl)
+        if self.has_actuators != (ctrl is not None):
+            self.has_actuators = ctrl is not None
+            self._start()
         if len(joint_torque) != self._rows:
             self._allocate(len(joint_torque))
         if not self._rows:
             return TensorDict({key: state[key].double() for key in (QPOS, QVEL)}, [0])
-        is_broken = ~self._write(state, joint_torque, terrain)
+        command = joint_torque if ctrl is None else ctrl
+        is_broken = ~self._write(state, command, terrain)
         self._advance()
         moved = torch.cat((self._view(QPOS), self._view(QVEL)), -1)
         is_broken |= ~(moved.abs() <= LARGEST).all(-1) | self._has_overflown()
@@ -140,23 +150,26 @@ class MujocoWarpDynamics:
         return TensorDict(values, [self._rows]).to(state[QPOS].device)
 
     def _write(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None
+        self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """Put envs where they should be; bool ``(rows,)``: those that can be stepped.
 
         The others stand at rest meanwhile, so that their numbers cost no other env.
         """
-        qpos, qvel, force = (
+        qpos, qvel, told = (
             value.to(self.device, torch.float32)
-            for value in (state[QPOS], state[QVEL], joint_torque)
+            for value in (state[QPOS], state[QVEL], command)
         )
         is_sound = (torch.cat((qpos, qvel), -1).abs() <= LARGEST).all(-1)
-        is_sound &= force.isfinite().all(-1)
+        is_sound &= told.isfinite().all(-1)
+        told = torch.where(is_sound[:, None], told, 0.0)
         rest = torch.as_tensor(self._source.qpos0, device=self.device).to(qpos)
         self._view("qpos").copy_(torch.where(is_sound[:, None], qpos, rest))
         self._view("qvel").copy_(torch.where(is_sound[:, None], qvel, 0.0))
-        applied = self._view("qfrc_applied").zero_()
-        applied[:, self.scene.actuated] = torch.where(is_sound[:, None], force, 0.0)
+        if self.has_actuators:
+            self._view("ctrl").copy_(told)
+        else:
+            self._view("qfrc_applied")[:, self.scene.actuated] = told
         self._view("overflow").zero_()
         pose = ground_pose(self.scene, terrain)
         if pose is not None:

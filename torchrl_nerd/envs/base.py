@@ -19,7 +19,7 @@ from torchrl_nerd.envs.pixels import RenderedEnv
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
-from torchrl_nerd.envs.transition import Transition, given_state
+from torchrl_nerd.envs.transition import Transition, drive_sizes, given_state
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import ACTION, FAULT, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
@@ -34,10 +34,10 @@ class SceneEnv(RenderedEnv):
     """A task in any dynamics: everything around the solver, written once.
 
     Per env: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
-    parameters such as ``terrain``, and ``joint_torque``, what the controller applied over
-    the last control step (zero after a reset). Random numbers are each env's own, so its
-    episodes do not depend on how many envs there are. ``reset(td, set_state=True)``
-    starts from the ``qpos``, ``qvel`` and parameters in ``td``.
+    parameters such as ``terrain``, and ``joint_torque``, the controller's over the last
+    control step, and of servos ``ctrl`` (zero after a reset). Random numbers are each
+    env's own, so its episodes do not depend on how many envs there are.
+    ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel`` and parameters in it.
 
     An env whose action or next state is not finite, or that runs away, keeps its last state
     and ends as ``terminated``; no other env notices. ``fault`` says why, see
@@ -268,7 +268,8 @@ class SceneEnv(RenderedEnv):
         """
         none, streams = rows & False, (self._keys, self._episode, self._offsets)
         shown = self._restart(self._state(), none, streams, {})
-        for key in ("joint_torque", FAULT, TRUST, "done", "terminated", "truncated"):
+        flags = (FAULT, TRUST, "done", "terminated", "truncated")
+        for key in (*drive_sizes(self.task), *flags):
             shown[key] = tensordict.get(key, shown[key])
         held = rows[:, None]
         return {k: torch.where(held, shown.get(k, 0.0), v) for k, v in found.items()}

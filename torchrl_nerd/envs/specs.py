@@ -6,6 +6,7 @@ import torch
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from torchrl_nerd.envs.faults import REASONS
+from torchrl_nerd.envs.transition import drive_sizes
 from torchrl_nerd.keys import FAULT, OBSERVATION, TRUST
 from torchrl_nerd.tasks import Task
 
@@ -35,7 +36,7 @@ def make_specs(
     def column(num_values: int, dtype: torch.dtype) -> TensorSpec:
         return Categorical(num_values, shape(1), device, dtype)
 
-    sizes = {**state_sizes, "joint_torque": len(task.scene.actuated)}
+    sizes = {**state_sizes, **drive_sizes(task)}
     state: dict[str, TensorSpec] = {
         key: Unbounded(shape(size), device, state_dtype) for key, size in sizes.items()
     }

@@ -25,9 +25,18 @@ from torchrl_nerd.keys import (
     TERRAIN,
     TRUST,
 )
+from torchrl_nerd.scenes.commands import actuate, num_ctrl
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
+
+
+def drive_sizes(task: Task) -> dict[str, int]:
+    """Width of ``joint_torque`` and, where a task drives servos, of ``ctrl``."""
+    sizes, controls = {"joint_torque": len(task.scene.actuated)}, num_ctrl(task.scene)
+    is_own = isinstance(task.controller, ActuatorController)
+    return sizes | {"ctrl": controls} if is_own and controls else sizes
 
 
 class Transition:
@@ -59,19 +68,19 @@ class Transition:
             age: ``(num_envs,)`` actions before this one.
 
         Returns:
-            The next state and what an env hands out beside it: ``joint_torque``,
-            ``observation``, ``reward``, ``fault``, the flags, and ``trust`` where the
-            dynamics has one.
+            The next state and what an env hands out beside it: ``joint_torque``, of servos
+            ``ctrl``, ``observation``, ``reward``, ``fault``, the flags, and ``trust`` where
+            the dynamics has one.
         """
         # an action that is not finite is a fault, found below; the physics gets zeros
         given = torch.where(action.isfinite().all(-1, keepdim=True), action, 0.0)
         terrain = state.get(TERRAIN)
-        moved, torque = self._control_step(state, given, terrain)
+        moved, drive = self._control_step(state, given, terrain)
         trust = moved.get(TRUST)
         for _ in range(self.task.frame_skip - 1):
             if not self.is_whole:
                 graph_break()  # two in one piece take minutes to compile
-            moved, torque = self._control_step(moved, given, terrain)
+            moved, drive = self._control_step(moved, given, terrain)
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])
         fault = find_faults(action, state, moved)  # (num_envs, 1)
         is_good = fault == 0
@@ -92,7 +101,7 @@ class Transition:
         earned = self.task.reward(state, given, shown)
         reward = self._per_env("reward", earned, action)
         return after | {
-            "joint_torque": torque,
+            **{key: drive[key] for key in drive_sizes(self.task)},
             FAULT: fault,
             OBSERVATION: self.task.observation(shown).to(torch.float32),
             "reward": reward.to(torch.float32),
@@ -112,18 +121,25 @@ class Transition:
 
     def _control_step(
         self, moving: Tensors, action: Tensor, terrain: Tensor | None
-    ) -> tuple[Tensors, Tensor]:
-        """The state one control step later, and the torque that took it there."""
+    ) -> tuple[Tensors, Tensors]:
+        """The state one control step later, and what drove it: torque and ``ctrl``."""
         qpos, qvel = moving[QPOS], moving[QVEL]
-        torque = self.task.controller(action, qpos, qvel)
+        torque, ctrl = actuate(self.task.controller, action, qpos, qvel)
         move = self._move_apart if self.is_round else self._move
-        return move(qpos, qvel, torque, terrain), torque
+        moved = move(qpos, qvel, torque, terrain, ctrl)
+        drive = {"joint_torque": torque}
+        return moved, drive if ctrl is None else {**drive, "ctrl": ctrl}
 
     def _move(
-        self, qpos: Tensor, qvel: Tensor, torque: Tensor, terrain: Tensor | None
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        torque: Tensor,
+        terrain: Tensor | None,
+        ctrl: Tensor | None,
     ) -> Tensors:
         state = TensorDict({QPOS: qpos, QVEL: qvel}, qpos.shape[:1], device=qpos.device)
-        moved = dict(self.dynamics.step(state, torque, terrain).items())
+        moved = dict(self.dynamics.step(state, torque, terrain, ctrl).items())
         return moved | {key: moved[key].to(qpos.dtype) for key in (QPOS, QVEL)}
 
     @uncompiled
@@ -146,19 +162,23 @@ class Transition:
             given: what of a start is not left to chance.
 
         Returns:
-            As `step`, without reward: zero torque, no fault, full trust, not done.
+            As `step`, without reward: zero torque and control, no fault, full trust, not
+            done.
         """
         # drawn for all envs, then selected: shapes stay the same
         drawn = uniforms(*streams, state[QPOS].dtype)
         fresh = self.task.initial_state(drawn) | given
-        column, num_torques = rows[:, None], len(self.task.scene.actuated)
+        column = rows[:, None]
         start = {
             key: torch.where(column, fresh[key].to(now.dtype), now)
             for key, now in state.items()
         }
         flags = ("done", "terminated", "truncated")
         return start | {
-            "joint_torque": start[QPOS].new_zeros(len(rows), num_torques),
+            **{
+                key: start[QPOS].new_zeros(len(rows), size)
+                for key, size in drive_sizes(self.task).items()
+            },
             FAULT: torch.zeros_like(column, dtype=torch.long),
             TRUST: torch.ones_like(column, dtype=torch.float32),
             OBSERVATION: self.task.observation(start).to(torch.float32),

@@ -15,19 +15,22 @@ from torchrl_nerd.keys import (
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
     QPOS,
+    ROBOT_CTRL,
     ROBOT_STATE,
     ROBOT_TORQUE,
 )
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, own_contacts
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.penetration import count_touching
 from torchrl_nerd.scenes.symmetries import Effect, base_effects
 from torchrl_nerd.scenes.terrain import PLANE
 
 TRAJECTORIES = 64, 20  # and their steps: what self-contacts are counted in
 MEANINGS = {
-    ROBOT_TORQUE: "joint torque, N and N m",
+    ROBOT_TORQUE: "joint torque at the start of the step, N and N m",
+    ROBOT_CTRL: "control of every servo, held over the step",
     CONTACT_DISTANCE: "clearance to the ground minus the margin, m; 0 beyond the margin",
     CONTACT_VELOCITY: "velocity along and across the ground's normal, m/s",
     CONTACT_DEPTH: "predicted penetration at several times of the step, m",
@@ -149,7 +152,8 @@ def explain(scene: Scene) -> SceneReport:
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
     found, kept = scene.contacts.stands_for, len(scene.contacts)
     fixed = found.count(-1)
-    effects = base_effects(model, scene.base, scene.substeps)
+    servos = scene.servos is not None
+    effects = base_effects(model, scene.base, scene.substeps, servos)
 
     step, reason = _analytic_step(scene)
     controller = scene.controller
@@ -171,7 +175,8 @@ def explain(scene: Scene) -> SceneReport:
             for (low, high), share in _self_contacts(scene)
         ),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
-        controller=f"{type(controller).__name__}, {controller.num_actions} actions",
+        controller=f"{type(controller).__name__}, {controller.num_actions} actions"
+        + _who_drives(scene),
         analytic_step=step,
         why_no_step=reason,
     )
@@ -200,6 +205,17 @@ def _state_meaning(scene: Scene) -> str:
     if scene.model.jnt_limited.any():
         parts.append("gaps to joint limits")
     return ", ".join(parts)
+
+
+def _who_drives(scene: Scene) -> str:
+    """What holds over a control step in the ground truth."""
+    if scene.servos is not None:
+        return (
+            "; MuJoCo's servos: their control is held, their torque follows the state"
+        )
+    if isinstance(scene.controller, ActuatorController):
+        return "; MuJoCo's motors: their control is held, and so is their torque"
+    return "; its torque is held over the control step"
 
 
 def _terrain(scene: Scene, has_normal: bool) -> str:

@@ -12,7 +12,7 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.analytic import make_step
-from torchrl_nerd.data.recorded import TORQUE, Recording
+from torchrl_nerd.data.recorded import Recording, command_of
 from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import NoMotion, has_step
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
@@ -43,7 +43,7 @@ def window_errors(
     found = []
     for part in starts.split(PART):
         window = recording.windows(part, states)  # [windows, states]
-        path = open_loop(dynamics, window[:, 0], states - 1, window[TORQUE])
+        path = open_loop(dynamics, window[:, 0], states - 1, command_of(window))
         measured = window[QPOS][:, 1:]  # (windows, states - 1, nq)
         found.append(position_errors(dynamics.scene, measured, path))
     return {name: torch.cat([part[name] for part in found]) for name in found[0]}

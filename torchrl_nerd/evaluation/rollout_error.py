@@ -20,9 +20,10 @@ from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import actuate, drive, idle
 
-Drive = Callable[[int, TensorDictBase], Tensor]
-"""``(step, state [n]) -> joint torque (n, num_actuated)``, N and N m."""
+Drive = Callable[[int, TensorDictBase], tuple[Tensor, Tensor | None]]
+"""``(step, state [n]) -> joint torque (n, num_actuated), N and N m, and ctrl (n, nu)``."""
 
 
 def scene_of(source: Source) -> Scene:
@@ -80,18 +81,18 @@ def action_drive(
     # (steps, n, num_actions), the same for every dynamics
     actions = 2.0 * draw - 1.0 if random_actions else torch.zeros_like(draw)
 
-    def drive(step: int, state: TensorDictBase) -> Tensor:
+    def told(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         qpos, qvel = state[QPOS], state[QVEL]
-        return source.controller(actions[step].to(qpos.device), qpos, qvel)
+        return actuate(source.controller, actions[step].to(qpos.device), qpos, qvel)
 
-    return drive
+    return told
 
 
 def open_loop(
     dynamics: Dynamics,
     start: TensorDict,
     steps: int,
-    joint_torque: Tensor | Drive | None = None,
+    command: Tensor | Drive | None = None,
     stop_at_nan: bool = False,
 ) -> Tensor:
     """Positions after each step, ``(n, steps, nq)``.
@@ -100,14 +101,14 @@ def open_loop(
         dynamics: any.
         start: ``qpos``, ``qvel`` and, where the terrain varies, ``terrain``, ``[n]``.
         steps: control steps.
-        joint_torque: ``(n, steps, num_actuated)``, or a function of step and state;
-            None for none (passive motion).
+        command: ``(n, steps, m)``, torques or servos' controls; or a function of step and
+            state; None for no torque (passive motion), or servos in mid range.
         stop_at_nan: stop once a trajectory is not finite; what is left is NaN. An engine
             takes long over states that diverge.
     """
     shape = (len(start), steps, start[QPOS].shape[1])
     positions = torch.full(shape, torch.nan).to(start[QPOS])
-    for step, state in enumerate(_states(dynamics, start, steps, joint_torque)):
+    for step, state in enumerate(_states(dynamics, start, steps, command)):
         positions[:, step] = state[QPOS]
         if stop_at_nan and not state[QPOS].isfinite().all():
             break
@@ -118,7 +119,7 @@ def rollout(
     dynamics: Dynamics,
     start: TensorDict,
     steps: int,
-    joint_torque: Tensor | Drive | None = None,
+    command: Tensor | Drive | None = None,
     every: int = 1,
 ) -> TensorDict:
     """``qpos`` and ``qvel``, ``[n, 1 + steps // every]``, the start first.
@@ -127,12 +128,11 @@ def rollout(
         dynamics: any.
         start: see `open_loop`.
         steps: control steps.
-        joint_torque: ``(n, T, num_actuated)``, repeated after T steps; a function of step
-            and state; or None for none.
+        command: ``(n, T, m)``, repeated after T steps; else as of `open_loop`.
         every: steps between two states that are kept.
     """
     kept: list[TensorDictBase] = [start.select(QPOS, QVEL)]
-    for step, state in enumerate(_states(dynamics, start, steps, joint_torque), 1):
+    for step, state in enumerate(_states(dynamics, start, steps, command), 1):
         if step % every == 0:
             kept.append(state.select(QPOS, QVEL))
     return cast(TensorDict, TensorDict.stack(kept, 1))
@@ -142,20 +142,20 @@ def _states(
     dynamics: Dynamics,
     start: TensorDict,
     steps: int,
-    joint_torque: Tensor | Drive | None,
+    command: Tensor | Drive | None,
 ) -> Iterator[TensorDictBase]:
     """The state after each step."""
     terrain, state = start.get(TERRAIN, None), start.select(QPOS, QVEL)
-    if joint_torque is None:
-        idle = torch.zeros(len(start), 1, len(dynamics.scene.actuated))
-        joint_torque = idle.to(start[QPOS])
+    if command is None:
+        command = idle(dynamics.scene, len(start), 1).to(start[QPOS])
     dynamics.reset(state)
     for step in range(steps):
-        if callable(joint_torque):
-            torque = joint_torque(step, state)  # (n, num_actuated)
+        if callable(command):
+            torque, ctrl = command(step, state)
         else:
-            torque = joint_torque[:, step % joint_torque.shape[1]]
-        state = dynamics.step(state, torque, terrain)
+            now = command[:, step % command.shape[1]]
+            torque, ctrl = drive(dynamics.scene, now, state[QPOS], state[QVEL])
+        state = dynamics.step(state, torque, terrain, ctrl)
         yield state
 
 

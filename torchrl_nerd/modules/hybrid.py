@@ -61,11 +61,11 @@ class HybridNeRD(NeRD):
         return self.scene_features.size + self._num_defects + self.state_delta.size
 
     def encode(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Encoded:
         """See `NeRD.encode`; the base is the step's change, the gate follows its defect."""
-        features = self.features(qpos, qvel, joint_torque, terrain)
-        result = self.analytic_step(qpos, qvel, joint_torque, terrain)
+        features = self.features(qpos, qvel, drive, terrain)
+        result = self.analytic_step(qpos, qvel, drive, terrain)  # no servos: a torque
         change = self.state_delta.delta(qpos, qvel, result.qpos, result.qvel)
         change = _finite(self.normalize.normalize(TARGET, change))
         scale = self.normalize.std(TARGET)[: self.scene.layout.nv]

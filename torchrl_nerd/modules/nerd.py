@@ -1,13 +1,13 @@
 """Neural Robot Dynamics: a network predicts the change of a robot's state.
 
-    qpos, qvel, torque, terrain
-      -> features        robot-centric state, contacts, torques       (*batch, F)
+    qpos, qvel, drive, terrain
+      -> features        robot-centric state, contacts, drive         (*batch, F)
       -> normalise, clamp to the training range
       -> network         causal transformer, MLP or GRU               (*batch, D)
       -> denormalise     velocity change and position residual, D = 2 nv
       -> integrate       next qpos, qvel
 
-NeRD (Xu et al., CoRL 2025), sections 3.2 to 3.4.
+The drive is the joint torque and servos' controls. NeRD (CoRL 2025), sections 3.2 to 3.4.
 """
 
 from collections.abc import Callable, Mapping
@@ -75,7 +75,7 @@ class Encoded(NamedTuple):
 
 
 class SceneFeatures(nn.Module):
-    """`RobotCentric`, joint torques and `ContactFeatures` of a state, concatenated."""
+    """`RobotCentric`, drive and `ContactFeatures` of a state, concatenated."""
 
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
         super().__init__()
@@ -85,12 +85,12 @@ class SceneFeatures(nn.Module):
         self.size = sum((*self.robot.sizes.values(), *self.contact.sizes.values()))
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """Raw features ``(*batch, F)`` in the dtype of the state."""
         state = self.robot.state_features(qpos, qvel)
-        contacts = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
-        return torch.cat((state, joint_torque, *contacts), -1)
+        contacts = self.contact.contact_features(qpos, qvel, terrain, drive)
+        return torch.cat((state, drive, *contacts), -1)
 
 
 class NeRD(nn.Module):
@@ -143,17 +143,17 @@ class NeRD(nn.Module):
         return self.scene_features.size
 
     def features(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """Normalised features ``(*batch, F)``, float64, unclamped."""
-        raw = self.scene_features(qpos, qvel, joint_torque, terrain)
+        raw = self.scene_features(qpos, qvel, drive, terrain)
         return self.normalize.normalize(TOKEN, raw)
 
     def encode(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Encoded:
-        """The network's input for float64 states and torques, and what it adds to."""
-        features = self.features(qpos, qvel, joint_torque, terrain)
+        """The network's input for float64 states and drives, and what it adds to."""
+        features = self.features(qpos, qvel, drive, terrain)
         token = self.training_range.clamp_features(features).to(self.dtype)
         return Encoded(features, token, self.zero, self.one)
 
@@ -176,7 +176,7 @@ class NeRD(nn.Module):
     def step(
         self,
         state: State,
-        joint_torque: Tensor,
+        drive: Tensor,
         terrain: Tensor | None,
         network_step: Callable[[Tensor], Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -184,11 +184,11 @@ class NeRD(nn.Module):
 
         Args:
             state: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
-            joint_torque: ``(*batch, num_actuated)``, N m and N.
+            drive: ``(*batch, num_actuated + num_ctrl)``, see `drive_of`.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
             network_step: ``(*batch, token_size) -> (*batch, D)``: keeps the history.
         """
-        encoded = self.encode(*state, joint_torque, terrain)
+        encoded = self.encode(*state, drive, terrain)
         after = self.decode(state, encoded, network_step(encoded.token))
         return *after, encoded.features
 

@@ -10,10 +10,18 @@ from typing import Protocol
 import mujoco
 import numpy as np
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 from torchrl_nerd.geometry.constants import constant, take
-from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import BALL, HINGE, SLIDE
+
+JOINT, IN_PARENT, TENDON = (
+    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}"))
+    for kind in ("JOINT", "JOINTINPARENT", "TENDON")
+)
+WRAP_JOINT = mujoco.mjtWrap.mjWRAP_JOINT
+FIXED, AFFINE = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE
+NO_BIAS, AFFINE_BIAS = mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE
 
 Row = tuple[float, ...]
 UNLIMITED = 1e300  # N or N m: finite, so that the card of a data set can hold it
@@ -108,17 +116,19 @@ class PDController:
 
 @dataclass(frozen=True)
 class ActuatorController:
-    """The actuators of a MuJoCo model: motors, position and velocity servos.
+    """The actuators of a MuJoCo model, whose ``ctrl`` is held over the control step.
 
     An action of -1 to 1 spans an actuator's control range (-1 to 1 where it has none).
-    With the lengths l = ``length`` q and speeds v = ``moment`` qvel of the actuators,
+    The ground truth gives ``ctrl`` to MuJoCo, which evaluates its own law at every substep.
+    The torque here is that of the step's start. With the lengths l = ``length`` q and
+    speeds v = ``moment`` qvel of actuators on joints and fixed tendons,
 
         force = clip((g0 + g1 l + g2 v) ctrl + b0 + b1 l + b2 v, force range)
         torque = clip(moment^T force, torque range)
 
-    so several actuators on one joint add up. The torque is computed once and then held
-    over the control step; MuJoCo computes a servo's again at every substep. For motors
-    this is the same.
+    so several actuators on one joint add up. Other actuators (on a site, a body, a
+    slider-crank, a spatial tendon, a muscle) have no torque here: they are told by
+    ``ctrl`` alone.
     Source: https://mujoco.readthedocs.io/en/stable/computation/#actuation-model
     """
 
@@ -134,18 +144,20 @@ class ActuatorController:
     force_high: Row
     torque_low: Row  # of each dof, N and N m
     torque_high: Row
+    is_motor: bool  # no force depends on the state: the torque tells all
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel) -> "ActuatorController":
         """Read the actuators of a model that `check_supported` let pass."""
-        dofs = driven_dofs(model)
+        dofs, has_torque = driven_dofs(model), has_closed_form(model)
         joints = model.dof_jntid[dofs]
         moment = _actuator_moments(model)[:, dofs]
         is_scalar = np.isin(model.jnt_type[joints], (HINGE, SLIDE))
         gain, bias = model.actuator_gainprm[:, :3].copy(), model.actuator_biasprm[:, :3]
-        gain[model.actuator_gaintype != mujoco.mjtGain.mjGAIN_AFFINE, 1:] = 0.0
-        has_bias = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+        gain[model.actuator_gaintype != AFFINE, 1:] = 0.0
+        has_bias = model.actuator_biastype == AFFINE_BIAS
         bias = np.where(has_bias[:, None], bias, 0.0)
+        is_constant = has_torque & ~gain[:, 1:].any(1) & ~bias.any(1)
         is_torque_limited = model.jnt_actfrclimited[joints] * is_scalar
         control = _ranges(model.actuator_ctrllimited, model.actuator_ctrlrange, 1.0)
         force = model.actuator_forcelimited, model.actuator_forcerange
@@ -160,6 +172,7 @@ class ActuatorController:
             _rows(bias),
             *_ranges(*force, UNLIMITED),
             *_ranges(*torque, UNLIMITED),
+            bool(is_constant.all() and not model.jnt_actgravcomp.any()),
         )
 
     @property
@@ -167,19 +180,17 @@ class ActuatorController:
         """One per actuator."""
         return len(self.ctrl_low)
 
-    @property
-    def is_motor(self) -> bool:
-        """True where no force depends on the state."""
-        pairs = zip(self.gain, self.bias, strict=True)
-        return not any(any(gain[1:] + bias) for gain, bias in pairs)
-
     def ctrl(self, action: Tensor) -> Tensor:
-        """What MuJoCo's ``data.ctrl`` would be at an action, ``(*batch, A)``."""
+        """What MuJoCo's ``data.ctrl`` is at an action, ``(*batch, A)``."""
         low, high = constant(action, (self.ctrl_low, self.ctrl_high))
         return torch.lerp(low, high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
 
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, D)``, in the dtype of qpos."""
+        return self.torque(self.ctrl(action.to(qpos.dtype)), qpos, qvel)
+
+    def torque(self, ctrl: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
+        """Joint torques ``(*batch, D)`` at a control ``(*batch, A)`` within its range."""
         shape = (self.num_actions, len(self.dof_addresses))
         length, moment = (
             constant(qpos, x).reshape(shape) for x in (self.length, self.moment)
@@ -188,7 +199,6 @@ class ActuatorController:
             constant(qpos, x).reshape(self.num_actions, 3).unbind(-1)
             for x in (self.gain, self.bias)
         )
-        ctrl = self.ctrl(action.to(qpos.dtype))
         stretch = take(qpos, self.qpos_addresses) @ length.mT  # (*batch, A)
         speed = take(qvel, self.dof_addresses) @ moment.mT
         force = (gain[0] + gain[1] * stretch + gain[2] * speed) * ctrl
@@ -196,32 +206,47 @@ class ActuatorController:
         force = _clip(force, self.force_low, self.force_high)
         return _clip(force @ moment, self.torque_low, self.torque_high)
 
-    def drive(
-        self, qpos: Tensor, qvel: Tensor, scale: Tensor, generator: Generator
-    ) -> Tensor:
-        """Torques ``(rows, D)`` of uniform actions, times each row's scale ``(rows, 1)``.
-
-        For training trajectories of servos: uniform torques as large as a stiff servo's
-        would throw the robot about as no servo does.
-        """
-        size = (len(qpos), self.num_actions)
-        u = torch.rand(size, dtype=torch.float64, generator=generator)
-        return scale * self(2.0 * u - 1.0, qpos, qvel)
-
 
 def driven_dofs(model: mujoco.MjModel) -> list[int]:
-    """Distinct dofs that actuators act on, in the order of the actuators."""
+    """Distinct dofs of `has_closed_form` actuators, in the order of the actuators."""
     _, dofs = np.nonzero(_actuator_moments(model))
     return list(dict.fromkeys(dofs.tolist()))
 
 
+def has_closed_form(model: mujoco.MjModel) -> np.ndarray:
+    """Which actuators ``(A,)`` have a torque that an `ActuatorController` computes.
+
+    Fixed or affine laws on hinges, slides and fixed tendons, and on ball joints whose angle
+    they do not read.
+    """
+    gain, bias = model.actuator_gaintype, model.actuator_biastype
+    is_known = np.isin(gain, (FIXED, AFFINE)) & np.isin(bias, (NO_BIAS, AFFINE_BIAS))
+    reads_angle = (gain == AFFINE) & (model.actuator_gainprm[:, 1] != 0.0)
+    reads_angle |= (bias == AFFINE_BIAS) & (model.actuator_biasprm[:, 1] != 0.0)
+
+    def has_constant_moment(i: int) -> bool:
+        kind, target = model.actuator_trntype[i], model.actuator_trnid[i, 0]
+        if kind == TENDON:
+            is_fixed = model.wrap_type[model.tendon_adr[target]] == WRAP_JOINT
+            return bool(is_fixed and not model.tendon_actfrclimited[target])
+        if kind not in (JOINT, IN_PARENT):
+            return False
+        is_ball = model.jnt_type[target] == BALL
+        is_scalar = model.jnt_type[target] in (HINGE, SLIDE)
+        return bool(is_scalar or (is_ball and kind == JOINT and not reads_angle[i]))
+
+    is_constant = [has_constant_moment(i) for i in range(model.nu)]
+    return is_known & np.array(is_constant, bool)
+
+
 def _actuator_moments(model: mujoco.MjModel) -> np.ndarray:
-    """Generalised force per unit of actuator force ``(A, nv)``, at ``qpos0``."""
+    """Generalised force per unit of force ``(A, nv)`` of actuators with a closed form."""
     data, dense = mujoco.MjData(model), np.zeros((model.nu, model.nv))
     mujoco.mj_fwdPosition(model, data)
     if model.nu:
         rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
         mujoco.mju_sparse2dense(dense, data.actuator_moment, *rows)
+    dense[~has_closed_form(model)] = 0.0
     return dense
 
 

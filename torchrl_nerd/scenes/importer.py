@@ -167,6 +167,7 @@ def default_sampling(
     low, high = (tuple(x.tolist()) for x in _positions(model))
     torque = _largest_torques(model, controller, low, high)
     speed = _speeds(model, controller, torque).tolist()
+    controls = controller.ctrl_low, controller.ctrl_high
     sampling = Sampling(
         qpos_low=low[skipped_q:],
         qpos_high=high[skipped_q:],
@@ -174,7 +175,7 @@ def default_sampling(
         qvel_high=tuple(speed[skipped_v:]),
         torque=tuple(torque),
         base=_base_sampling(model, speed) if base.is_floating else None,
-        drive=None if controller.is_motor else controller.drive,
+        ctrl=None if controller.is_motor else controls,
         clearance=0.0 if len(contact_points(model, base)) else None,
         penetration=START_PENETRATION,
     )

@@ -24,7 +24,7 @@ def deepest_contacts(model: mujoco.MjModel, qpos: Tensor) -> Tensor:
 
 
 def count_touching(model: mujoco.MjModel, qpos: Tensor) -> Counter[tuple[int, int]]:
-    """In how many of the states ``(rows, nq)`` two bodies touch, by their ids, low first."""
+    """In how many of the states ``(rows, nq)`` two bodies touch; ids, the low first."""
     counts: Counter[tuple[int, int]] = Counter()
     for geoms, dist in _contacts(model, qpos):
         bodies = np.sort(model.geom_bodyid[geoms[dist <= 0.0]])

@@ -71,6 +71,7 @@ class Sampling:
     | ``ground`` | draws each row's ground, where it varies |
     | ``level_ground`` | draws grounds that the robot hits head-on, see `strategies` |
     | ``drive`` | torques that depend on the state, in place of uniform ones |
+    | ``ctrl`` | lowest and highest control of each servo, drawn in place of torques |
     | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
     | ``penetration`` | starts with a contact deeper than this (m), of the robot with the
       ground or with itself, are drawn again; the least deep draw of a row stays if all of
@@ -104,6 +105,7 @@ class Sampling:
     starts: Starts | None = None
     min_torque_scale: float | None = None
     correlation_time: tuple[float, float] | None = None
+    ctrl: tuple[Row, Row] | None = None
 
     def __post_init__(self) -> None:
         least, times = self.min_torque_scale, self.correlation_time
@@ -124,6 +126,15 @@ class Sampling:
                 "expected a correlation time or a drive, got both: a drive's torques "
                 "follow the state"
             )
+
+    @property
+    def commands(self) -> tuple[Tensor, Tensor]:
+        """Middle and half width ``(m,)`` of what is drawn: torques, or servos' controls."""
+        if self.ctrl is None:
+            half = torch.tensor(self.torque, dtype=torch.float64)
+            return torch.zeros_like(half), half
+        low, high = torch.tensor(self.ctrl, dtype=torch.float64)
+        return 0.5 * (low + high), 0.5 * (high - low)
 
     def ranges(self) -> dict[str, Any]:
         """What cards say: every field that is set, but for functions."""
@@ -228,39 +239,44 @@ def log_uniform(low: float, high: float, rows: int, generator: Generator) -> Ten
     return low * torch.exp(u * log(high / low))
 
 
-def sample_torque(
+def sample_commands(
     sampling: Sampling, scale: Tensor, steps: int, generator: Generator
 ) -> Tensor:
-    """Uniform torques ``(rows, steps, num_actuated)`` times each row's scale."""
-    rows, high = len(scale), sampling.torque
-    low = tuple(-t for t in high)
-    torque = uniform(low, high, steps * rows, generator)
-    return scale[:, None] * torque.unflatten(0, (steps, rows)).transpose(0, 1)
+    """Uniform torques or controls ``(rows, steps, m)``, see `Sampling.commands`.
+
+    Their distance from the middle is times each row's scale ``(rows, 1)``.
+    """
+    rows, (middle, half) = len(scale), sampling.commands
+    high = tuple(half.tolist())
+    low = tuple(-x for x in high)
+    draw = uniform(low, high, steps * rows, generator)
+    return middle + scale[:, None] * draw.unflatten(0, (steps, rows)).transpose(0, 1)
 
 
-def sample_torques(
+def sample_correlated_commands(
     sampling: Sampling,
     scale: Tensor,
     steps: int,
     control_step: float,
     generator: Generator,
 ) -> Tensor:
-    """Torques of trajectories ``(rows, steps, num_actuated)``, correlated where asked.
+    """Commands of trajectories ``(rows, steps, m)``, correlated in time where asked.
 
     An Ornstein-Uhlenbeck process of each row's correlation time, put through its own
-    distribution function: at every single step a torque is as uniform as without.
+    distribution function: at every single step a command is as uniform as without.
     """
     if sampling.correlation_time is None:
-        return sample_torque(sampling, scale, steps, generator)
+        return sample_commands(sampling, scale, steps, generator)
     time = log_uniform(*sampling.correlation_time, len(scale), generator)
     keep = torch.exp(-control_step / time)
-    size = (steps, len(scale), len(sampling.torque))
+    middle, half = sampling.commands
+    size = (steps, len(scale), len(half))
     noise = torch.randn(size, dtype=torch.float64, generator=generator)
     walk = [noise[0]]
     for kick in noise[1:]:
         walk.append(keep * walk[-1] + (1.0 - keep**2).sqrt() * kick)
-    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)  # (rows, steps, num_actuated)
-    return scale[:, None] * share * share.new_tensor(sampling.torque)
+    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)  # (rows, steps, m)
+    return middle + scale[:, None] * share * half
 
 
 def sample_scale(

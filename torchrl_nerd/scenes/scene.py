@@ -186,8 +186,14 @@ class Scene:
 
     @cached_property
     def actuated(self) -> list[int]:
-        """Distinct dofs that actuators act on, in the order of the actuators."""
+        """Distinct dofs with a joint torque, in the order of the actuators."""
         return driven_dofs(self.model)
+
+    @property
+    def servos(self) -> ActuatorController | None:
+        """The robot's own actuators where a force depends on the state, else None."""
+        own = self.controller
+        return own if isinstance(own, ActuatorController) and not own.is_motor else None
 
     @cached_property
     def contacts(self) -> ContactPoints:
@@ -213,7 +219,7 @@ class Scene:
     @cached_property
     def symmetries(self) -> Symmetries:
         """Coordinates that the dynamics do not depend on."""
-        return find_symmetries(self.model, self.substeps)
+        return find_symmetries(self.model, self.substeps, self.servos is not None)
 
     @cached_property
     def hash(self) -> str:
@@ -234,11 +240,8 @@ class Scene:
             ``qpos (rows, nq)``, ``qvel (rows, nv)`` and, where the ground varies,
             ``terrain (rows, terrain.size)``, all float64.
         """
-        ranges, depths = (
-            (self.sampling, self.layout),
-            partial(deepest_contacts, self.model),
-        )
-        return draw_initial(*ranges, rows, generator, self.clearances, depths)
+        how = rows, generator, self.clearances, partial(deepest_contacts, self.model)
+        return draw_initial(self.sampling, self.layout, *how)
 
     def clearances(self, qpos: Tensor, terrain: Tensor | None = None) -> Tensor:
         """Gap between every contact point's shape and the ground, m, ``(*batch, P)``.

@@ -1,10 +1,10 @@
 """What a model may have that no NeRD can learn yet, refused by name.
 
-A NeRD sees joints, joint torques and contact with the ground. Refused is what has a
-memory of its own, what acts through something else, and what makes a floating base move
-otherwise here than there. Left in is what the state alone decides although no feature
-names it: damping and springs, dry friction, still air or water, equality constraints,
-tendons, contact between the robot's own bodies.
+A NeRD sees joints, joint torques or controls, and contact with the ground. Refused is
+what has a memory of its own, what acts through something else, and what makes a floating
+base move otherwise here than there. Left in is what the state alone decides although no
+feature names it: damping and springs, dry friction, still air or water, equality
+constraints, tendons, contact between the robot's own bodies.
 """
 
 import copy
@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 
 from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes.contact_points import (
     body_label,
@@ -25,16 +24,9 @@ from torchrl_nerd.scenes.contact_points import (
 )
 from torchrl_nerd.scenes.shapes import geom_kind
 
-JOINT, IN_PARENT, TENDON = (
-    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}"))
-    for kind in ("JOINT", "JOINTINPARENT", "TENDON")
-)
-GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
-BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 DISABLE = mujoco.mjtDisableBit
 ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 MOST_NAMED = 3  # elements of one kind in a message
-NOTHING = -1  # where another has the type of a joint
 
 Refusal = tuple[str, Any, Callable[[int], Any] | None]
 """What, a flag of the model or one per object, and how to get an object by its index."""
@@ -85,7 +77,7 @@ def check_supported(name: str, model: mujoco.MjModel) -> None:
         if base.is_floating and not _moves_alike_everywhere(model, base):
             reasons.append(
                 "a floating base whose motion depends on where it is or faces (wind, a "
-                "spring, a constraint)"
+                "spring, a constraint, an actuator)"
             )
     if reasons:
         raise ValueError(
@@ -124,46 +116,20 @@ def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
 
 
 def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
-    """What an `ActuatorController` does not do."""
+    """Actuators whose force a state and a held control do not tell."""
     get = model.actuator
     has_state = model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE
     yield "an actuator with a state of its own", has_state, get
     yield "a delayed actuator", model.actuator_delay, get
-    is_plain = np.isin(model.actuator_gaintype, GAINS)
-    is_plain &= np.isin(model.actuator_biastype, BIASES)
-    yield "an actuator that is no motor, position or velocity servo", ~is_plain, get
+    is_called = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER
+    is_called |= model.actuator_biastype == mujoco.mjtBias.mjBIAS_USER
+    yield "an actuator whose force a callback computes", is_called, get
     is_single = (model.actuator_ctrlnum == 1) & (model.actuator_outnum == 1)
     yield "an actuator of several controls", ~is_single, get
-    own = model.actuator_damping + model.actuator_armature
-    own = own + abs(model.actuator_dampingpoly).sum(-1)
-    yield "an actuator with damping or armature of its own", own, get
-    joint_kind = np.array([_kind_of_joint(model, i) for i in range(model.nu)], int)
-    yield "an actuator on no joint or fixed tendon", joint_kind == NOTHING, get
-    yield "an actuator on its free joint", joint_kind == FREE, get
-    reads_angle = model.actuator_trntype == IN_PARENT
-    for types, affine, slopes in (
-        (model.actuator_gaintype, GAINS[1], model.actuator_gainprm[:, 1]),
-        (model.actuator_biastype, BIASES[1], model.actuator_biasprm[:, 1]),
-    ):
-        reads_angle = reads_angle | ((types == affine) & (slopes != 0.0))
-    reads_angle = reads_angle & (joint_kind == BALL)
-    yield "an actuator that reads the angle of a ball joint", reads_angle, get
     is_off = [bool(model.opt.disableactuator & 1 << g) for g in model.actuator_group]
     yield "a disabled actuator", is_off, get
     all_off = model.nu and model.opt.disableflags & DISABLE.mjDSBL_ACTUATION
     yield "actuators that are disabled", all_off, None
-    yield "gravity compensation by actuators", model.jnt_actgravcomp, model.joint
-
-
-def _kind_of_joint(model: mujoco.MjModel, actuator: int) -> int:
-    """Joint type that an actuator drives; a hinge stands for those of a fixed tendon."""
-    kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
-    if kind in (JOINT, IN_PARENT):
-        return int(model.jnt_type[target])
-    if kind != TENDON:
-        return NOTHING
-    wrap = model.wrap_type[model.tendon_adr[target]]
-    return HINGE if wrap == mujoco.mjtWrap.mjWRAP_JOINT else NOTHING
 
 
 def unit_gravity(model: mujoco.MjModel) -> np.ndarray:
@@ -175,13 +141,14 @@ def unit_gravity(model: mujoco.MjModel) -> np.ndarray:
 def _moves_alike_everywhere(model: mujoco.MjModel, base: Base) -> bool:
     """True where a free flight, moved and turned about gravity, stays the same."""
     flight = copy.copy(model)
-    flight.opt.disableflags |= DISABLE.mjDSBL_CONTACT | DISABLE.mjDSBL_ACTUATION
+    flight.opt.disableflags |= DISABLE.mjDSBL_CONTACT
     rng, yaw = np.random.default_rng(0), np.append(0.8, 0.6 * unit_gravity(model))
     q, v = base.qpos_address, base.dof_address
     data = mujoco.MjData(flight)
     mujoco.mj_integratePos(flight, data.qpos, rng.normal(size=model.nv), 1.0)
     data.qpos[q : q + 3] = rng.normal(size=3)  # far off, digits are lost
     data.qvel = rng.normal(size=model.nv)
+    data.ctrl = rng.normal(size=model.nu)
     moved = copy.copy(data)
     moved.qpos[q : q + 3] += 10.0 * rng.normal(size=3)
     mujoco.mju_mulQuat(moved.qpos[q + 3 : q + 7], yaw, data.qpos[q + 3 : q + 7])

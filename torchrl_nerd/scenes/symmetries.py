@@ -60,17 +60,20 @@ class Symmetries:
         return {e.address for e in self.effects if e.key == QVEL and e.is_ignored}
 
 
-def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
+def find_symmetries(
+    model: mujoco.MjModel, substeps: int, has_servos: bool = False
+) -> Symmetries:
     """Perturb every hinge and slide of a compiled model and compare one control step.
 
     One coordinate is moved and nothing else, so that only invariances of the
     dynamics pass; the ground stays where it is. Nothing is dropped where a few states do
-    not show what matters: limited tendons, and static shapes without features.
+    not show what matters: limited tendons, and static shapes without features. Servos act
+    in every substep; without them a torque is a torque.
     """
     unseen = set(ground_geoms(model)) - set(terrain_geoms(model))
     if model.tendon_limited.any() or unseen:
         return Symmetries(())
-    free, rng = _without(model, LIMIT), np.random.default_rng(0)
+    free, rng = _without(model, LIMIT, has_servos), np.random.default_rng(0)
     effects: list[Effect] = []
     for joint in np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE))).tolist():
         name = joint_label(model, joint)
@@ -82,7 +85,7 @@ def find_symmetries(model: mujoco.MjModel, substeps: int) -> Symmetries:
 
 
 def base_effects(
-    model: mujoco.MjModel, base: Base, substeps: int
+    model: mujoco.MjModel, base: Base, substeps: int, has_servos: bool = False
 ) -> tuple[Effect, ...]:
     """Effect of a floating base's position and heading, measured in its own frame.
 
@@ -91,7 +94,7 @@ def base_effects(
     """
     if not base.is_floating:
         return ()
-    free = _without(model, LIMIT | CONTACT)
+    free = _without(model, LIMIT | CONTACT, has_servos)
     rng, q = np.random.default_rng(0), base.qpos_address
     moves = {
         f"base {axis}": (q + i, _shift(QPOS, q + i)) for i, axis in enumerate("xyz")
@@ -103,10 +106,12 @@ def base_effects(
     )
 
 
-def _without(model: mujoco.MjModel, flags: int) -> mujoco.MjModel:
-    """The model without some forces and without actuators: a torque is a torque."""
+def _without(model: mujoco.MjModel, flags: int, has_servos: bool) -> mujoco.MjModel:
+    """The model without some forces, and without actuators that are no servos."""
     free = copy.copy(model)
-    free.opt.disableflags |= flags | DISABLE.mjDSBL_ACTUATION
+    free.opt.disableflags |= flags
+    if not has_servos:
+        free.opt.disableflags |= DISABLE.mjDSBL_ACTUATION
     return free
 
 
@@ -156,6 +161,8 @@ def _largest_change(
             data.qpos[q : q + 3] = rng.normal(size=3)  # far off, digits are lost
             # a force in world axes would not turn with the robot
             data.qfrc_applied[v : v + 3] = 0.0
+        if not model.opt.disableflags & DISABLE.mjDSBL_ACTUATION:
+            data.ctrl = rng.normal(size=model.nu)
         moved = copy.copy(data)
         move(moved, rng)
         size = abs(data.qvel).max()

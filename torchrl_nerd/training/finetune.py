@@ -20,7 +20,7 @@ from torchrl_nerd.analytic import FreeBodyPenaltyStep
 from torchrl_nerd.analytic.free_body import PARAMETERS
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import FinetuneConfig
-from torchrl_nerd.data.recorded import TORQUE, Recording
+from torchrl_nerd.data.recorded import Recording, command_of
 from torchrl_nerd.dynamics import Model, dynamics_of
 from torchrl_nerd.evaluation.recorded_error import Errors, error_key, window_errors
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
@@ -228,7 +228,7 @@ def rollout_error(model: Model, window: TensorDict) -> Tensor:
     """`weighted_error` of a rollout from the first state of ``[rows, steps + 1]``."""
     steps = window.batch_size[1] - 1
     dynamics = dynamics_of(model, differentiable=True)
-    path = open_loop(dynamics, window[:, 0], steps, window[TORQUE])
+    path = open_loop(dynamics, window[:, 0], steps, command_of(window))
     errors = position_errors(model.scene, window[QPOS][:, 1:], path)
     return weighted_error(model.scene, errors)
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.nerd import TARGET, NeRD, Network
+from torchrl_nerd.scenes.commands import drive, drive_of
 
 RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root smooth
 
@@ -40,7 +41,7 @@ def rollout_loss(
     model: NeRD,
     qpos: Tensor,
     qvel: Tensor,
-    joint_torque: Tensor,
+    command: Tensor,
     terrain: Tensor | None,
     loss_eps: float,
 ) -> Tensor:
@@ -53,7 +54,7 @@ def rollout_loss(
         model: in training mode.
         qpos: true positions ``(rows, K + 1, nq)``, float64.
         qvel: true velocities ``(rows, K + 1, nv)``.
-        joint_torque: ``(rows, K, num_actuated)``.
+        command: ``(rows, K, m)``, torques or servos' controls.
         terrain: ``(rows, terrain.size)`` or None.
         loss_eps: see `relative_error`.
     """
@@ -63,10 +64,11 @@ def rollout_loss(
     memory = network.empty_memory(len(qpos))
     position, velocity = qpos[:, 0], qvel[:, 0]
     errors = []
-    for step in range(joint_torque.shape[1]):
+    for step in range(command.shape[1]):
+        driven = drive(model.scene, command[:, step], position, velocity)
         position, velocity, _ = model.step(
             (position, velocity),
-            joint_torque[:, step],
+            drive_of(*driven),
             terrain,
             lambda token: network.step(token, memory),
         )

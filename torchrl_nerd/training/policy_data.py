@@ -22,6 +22,7 @@ from torchrl_nerd.evaluation.policy import (
 )
 from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import actuate
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
 
@@ -59,7 +60,7 @@ def policy_data(
     dynamics.reset(row)
     state: TensorDictBase = row.select(QPOS, QVEL)
     action = torch.zeros(rows, controller.num_actions, dtype=torch.float64)
-    states, torques, recent = [state[:, None]], [], None
+    states, commands, recent = [state[:, None]], [], None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for step in range(steps):
             if step % task.frame_skip == 0:
@@ -69,11 +70,12 @@ def policy_data(
                 mean = actor(shown)[ACTION].double()
                 kick = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
                 action = (mean + spread * kick).clamp(-1.0, 1.0)
-            torque = controller(action, state[QPOS], state[QVEL])
-            state = dynamics.step(state, torque, terrain)
+            torque, ctrl = actuate(controller, action, state[QPOS], state[QVEL])
+            state = dynamics.step(state, torque, terrain, ctrl)
             states.append(state[:, None])
-            torques.append(torque[:, None])
-    return as_transitions(states, torques, terrain)
+            command = torque if scene.servos is None or ctrl is None else ctrl
+            commands.append(command[:, None])
+    return as_transitions(scene, states, commands, terrain)
 
 
 def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, Draw]:

@@ -8,9 +8,18 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
-from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import (
+    CTRL,
+    JOINT_TORQUE,
+    NEXT_QPOS,
+    NEXT_QVEL,
+    QPOS,
+    QVEL,
+    TERRAIN,
+)
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import drive_of
 from torchrl_nerd.transforms import StateDelta, Stats
 
 PART = 1024  # trajectories turned into tokens at a time
@@ -21,7 +30,8 @@ def raw_tokens(
 ) -> tuple[Tensor, Tensor]:
     """Unnormalised tokens ``(*batch, F)`` and targets ``(*batch, D)``, float64."""
     state, terrain = (data[QPOS], data[QVEL]), data.get(TERRAIN, None)
-    token = tokens(*state, data[JOINT_TORQUE], terrain)
+    drive = drive_of(data[JOINT_TORQUE], data.get(CTRL, None))
+    token = tokens(*state, drive, terrain)
     return token, state_delta.delta(*state, data[NEXT_QPOS], data[NEXT_QVEL])
 
 

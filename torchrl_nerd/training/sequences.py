@@ -9,6 +9,7 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.scenes.commands import command_of
 from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.samples import normalised
 
@@ -62,7 +63,7 @@ class Sequences:
         self.inputs = Inputs(*(x.to(device) for x in Inputs.of(model, data, features)))
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
-        self.steps = data.batch_size[1]
+        self.scene, self.steps = model.scene, data.batch_size[1]
 
     def pick(
         self, rows: int, length: int, generator: Generator
@@ -95,7 +96,7 @@ class Sequences:
     def rollout(
         self, rows: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """True ``qpos``, ``qvel (rows, length + 1, ...)``, torques and ground."""
+        """True ``qpos``, ``qvel (rows, length + 1, ...)``, commands and ground."""
         row, time_index = self.pick(rows, length, generator)
         batch = cast(TensorDict, self.data[row, time_index])
         if self.symmetry is not None:  # the rows are in no order: a part for each
@@ -108,4 +109,4 @@ class Sequences:
         terrain = batch.get(TERRAIN, None)
         if terrain is not None:
             terrain = terrain[:, 0]  # the same at all times: (rows, terrain.size)
-        return qpos, qvel, batch[JOINT_TORQUE], terrain
+        return qpos, qvel, command_of(self.scene, batch), terrain

@@ -21,7 +21,7 @@ from torchrl_nerd.geometry.manifold import FREE, SLIDE
 from torchrl_nerd.geometry.rotations import quat_multiply
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.sampling import sample_torque
+from torchrl_nerd.scenes.sampling import sample_commands
 
 PLACE_TOL = 1e-6  # m, and of a unit vector
 STEP_RTOL = 1e-6  # the solver's own tolerance is 1e-8
@@ -100,14 +100,15 @@ def find_isometries(scene: Scene) -> list[Isometry]:
     """The symmetry group of a robot on its ground, the identity first.
 
     Raises:
-        ValueError: a fixed base, a ball joint, or a ground that varies.
+        ValueError: a fixed base, a ball joint, servos, or a ground that varies.
     """
     model, ground = scene.model, scene.terrain
     is_legged = scene.base.is_floating and model.nv == model.njnt + 5
-    if not is_legged or (ground is not None and ground.is_per_row):
+    is_varied = ground is not None and ground.is_per_row
+    if not is_legged or is_varied or scene.servos is not None:
         raise ValueError(
-            f"expected a floating base, hinges or slides and one ground to train with "
-            f"use_symmetry, got '{scene.name}': train without it"
+            f"expected a floating base, hinges or slides, motors and one ground to train "
+            f"with use_symmetry, got '{scene.name}': train without it"
         )
     identity, *others = _candidates(scene)
     return [identity, *(other for other in others if _solver_agrees(scene, other))]
@@ -169,5 +170,5 @@ def states_in_contact(scene: Scene, rows: int, max_depth: float) -> TensorDict:
     state, scale = scene.sample_initial(rows, generator)
     draw = torch.rand(rows, dtype=torch.float64, generator=generator)
     scene.place_on_terrain(state, -max_depth * draw)
-    torque = sample_torque(scene.sampling, scale, 1, generator)
+    torque = sample_commands(scene.sampling, scale, 1, generator)
     return TensorDict(state, [rows]).set(JOINT_TORQUE, torque[:, 0])

@@ -93,7 +93,7 @@ class ContactFeatures(FeatureTransform):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
-        self.step_size = scene.control_step
+        self.step_size, self.num_torques = scene.control_step, len(scene.actuated)
         if terrain is None:
             return
         points = scene.contacts
@@ -124,7 +124,7 @@ class ContactFeatures(FeatureTransform):
         qpos: Tensor,
         qvel: Tensor,
         terrain: Tensor | None = None,
-        joint_torque: Tensor | None = None,
+        drive: Tensor | None = None,
     ) -> list[Tensor]:
         """The outputs in the order of ``out_keys``, in the dtype of the inputs.
 
@@ -132,7 +132,8 @@ class ContactFeatures(FeatureTransform):
             qpos: ``(*batch, nq)``.
             qvel: ``(*batch, nv)``.
             terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
-            joint_torque: ``(*batch, num_actuated)`` of the coming step; None if unknown.
+            drive: joint torques ``(*batch, num_actuated)`` of the coming step, and servos'
+                controls after them; None if unknown.
         """
         if self.terrain is None:
             return []
@@ -151,7 +152,8 @@ class ContactFeatures(FeatureTransform):
         gain = None
         if self.rigid_body is not None:
             where = pose[1], corners, places
-            gain = self.rigid_body(qpos, qvel, joint_torque, *where, self.step_size)
+            torque = None if drive is None else drive[..., : self.num_torques]
+            gain = self.rigid_body(qpos, qvel, torque, *where, self.step_size)
             gain = self.step_size * gain
         motion = qpos, qvel, terrain, gain, self.radii - distance, speed
         depth = gate * self.predicted_penetration(*motion)  # (*batch, P, K)

@@ -15,7 +15,16 @@ from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.constants import constant, take
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
-from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, ROBOT_STATE, ROBOT_TORQUE
+from torchrl_nerd.keys import (
+    CTRL,
+    JOINT_TORQUE,
+    QPOS,
+    QVEL,
+    ROBOT_CTRL,
+    ROBOT_STATE,
+    ROBOT_TORQUE,
+)
+from torchrl_nerd.scenes.commands import num_ctrl
 from torchrl_nerd.scenes.penalty_law import limit_forces, limit_stiffness
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
@@ -26,7 +35,7 @@ NUM_TIMES = 5  # intervals of a step at whose ends limit torques are predicted
 
 
 class RobotCentric(FeatureTransform):
-    """Base velocity and gravity in B_t, joint features, joint torques.
+    """Base velocity and gravity in B_t, joint features, joint torques, servos' controls.
 
     | out key | what | width |
     |---|---|---|
@@ -39,6 +48,7 @@ class RobotCentric(FeatureTransform):
     | | limited joint, with ``predicted_force``: mean torque of the limit's spring and
       damper over the step at constant velocity | 1 |
     | ``robot_torque`` | ``("next", "joint_torque")``, where there is one | actuated dofs |
+    | ``robot_ctrl`` | of servos: ``("next", "ctrl")``, where there is one | actuators |
 
     Examples:
         >>> transform = RobotCentric(load_scene("cartpole"))
@@ -55,6 +65,8 @@ class RobotCentric(FeatureTransform):
         sizes: dict[NestedKey, int] = {ROBOT_STATE: state_size}
         if scene.actuated:
             sizes[ROBOT_TORQUE] = len(scene.actuated)
+        if num_ctrl(scene):
+            sizes[ROBOT_CTRL] = num_ctrl(scene)
         super().__init__([QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
         self.base = scene.base
         self.joints = joints
@@ -77,9 +89,10 @@ class RobotCentric(FeatureTransform):
     def _features(self, tensordict: TensorDictBase) -> dict:
         state = self.state_features(tensordict[QPOS], tensordict[QVEL])
         features = {ROBOT_STATE: state}
-        torque = tensordict.get(JOINT_TORQUE, None)
-        if torque is not None and ROBOT_TORQUE in self.sizes:
-            features[ROBOT_TORQUE] = torque
+        for key, source in ((ROBOT_TORQUE, JOINT_TORQUE), (ROBOT_CTRL, CTRL)):
+            value = tensordict.get(source, None)
+            if value is not None and key in self.sizes:
+                features[key] = value
         return features
 
 

@@ -221,7 +221,7 @@ def test_a_rollout_that_diverges_is_not_rolled_out_further(seed):
     steps = []
 
     class Diverging(NoMotion):
-        def step(self, state, joint_torque, terrain=None):
+        def step(self, state, joint_torque, terrain=None, ctrl=None):
             steps.append(1)
             state = super().step(state, joint_torque, terrain).clone()
             if len(steps) == 3:

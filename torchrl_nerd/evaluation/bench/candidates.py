@@ -54,7 +54,11 @@ class NoMotion(Memoryless):
     kind = "baseline"
 
     def step(
-        self, state: TensorDictBase, joint_torque: Tensor, terrain: Tensor | None = None
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
     ) -> TensorDictBase:
         """The same state."""
         return state.select(QPOS, QVEL)

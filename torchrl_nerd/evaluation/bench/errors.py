@@ -46,7 +46,7 @@ class EvaluationSet:
     | ``case`` | its name |
     | ``source`` | whose initial states and controller |
     | ``start`` | initial states, ``[n]`` |
-    | ``drive`` | joint torques |
+    | ``drive`` | joint torques and controls |
     | ``solver`` | name of the MuJoCo that made the ground truth, see `mujoco_name` |
     | ``ground_truth`` | positions after each step, ``(n, steps, nq)`` |
     """

@@ -14,6 +14,7 @@ from torchrl_nerd.evaluation.bench.candidates import Candidate
 from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
+from torchrl_nerd.scenes.commands import drive, held, idle
 
 SAMPLE_SECONDS = 0.1  # one sample lasts about as long
 MAX_STEP = 64  # control steps to the latest moment that states are taken at
@@ -73,8 +74,9 @@ def mid_states(source: Source, batch: int, seed: int) -> TensorDict:
     """States ``[batch]`` at random moments of passive motion, with their terrain."""
     start, scene = initial_states(source, batch, seed), scene_of(source)
     terrain = start.get(TERRAIN, None)
-    torque = torch.zeros(batch, MAX_STEP, len(scene.actuated), dtype=torch.float64)
-    path = MujocoDynamics(scene).rollout(start.select(QPOS, QVEL), torque, terrain)
+    torque, ctrl = held(scene, idle(scene, batch, MAX_STEP))
+    first = start.select(QPOS, QVEL)
+    path = MujocoDynamics(scene).rollout(first, torque, terrain, ctrl)
     generator = torch.Generator().manual_seed(seed)
     moment = torch.randint(MAX_STEP, (batch,), generator=generator)
     # one moment of each trajectory: [batch]
@@ -87,13 +89,14 @@ def mid_states(source: Source, batch: int, seed: int) -> TensorDict:
 def stepper(dynamics: Dynamics, state: TensorDict) -> Callable[[int], None]:
     """A function that makes so many steps from ``state`` ``[batch]``, without torque."""
     start, terrain = state.select(QPOS, QVEL), state.get(TERRAIN, None)
-    torque = torch.zeros(len(state), len(dynamics.scene.actuated)).to(state[QPOS])
+    command = idle(dynamics.scene, len(state)).to(state[QPOS])
 
     def run(steps: int) -> None:
         now = start
         dynamics.reset(now)
         for _ in range(steps):
-            now = dynamics.step(now, torque, terrain)
+            torque, ctrl = drive(dynamics.scene, command, now[QPOS], now[QVEL])
+            now = dynamics.step(now, torque, terrain, ctrl)
 
     return run
 

@@ -17,7 +17,7 @@ from torchrl_nerd.evaluation.stability import states
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.sampling import sample_torque
+from torchrl_nerd.scenes.sampling import sample_commands
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,10 @@ class Trial:
         start = states.clear_of_ground(self.scene, self.starts(count))
         return start.set(QVEL, speed * start[QVEL])
 
-    def torques(self, count: int, steps: int) -> Tensor:
-        """Torques in the training range, ``(count, steps, num_actuated)``."""
+    def commands(self, count: int, steps: int) -> Tensor:
+        """Torques, or servos' controls, in the training range, ``(count, steps, m)``."""
         scale = torch.ones(count, 1, dtype=torch.float64)
-        return sample_torque(self.scene.sampling, scale, steps, self.generator)
+        return sample_commands(self.scene.sampling, scale, steps, self.generator)
 
     def normal(self, *shape: int) -> Tensor:
         """Standard normal numbers, float64."""

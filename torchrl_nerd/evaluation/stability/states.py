@@ -12,6 +12,7 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import held, idle
 
 SETTLE, AT_REST = 5.0, 1e-3  # s; m/s and rad/s
 TRIES = 8
@@ -56,8 +57,8 @@ def _drop(scene: Scene, count: int, generator: Generator) -> TensorDict:
     if scene.terrain is not None and scene.terrain.is_per_row:
         start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(count, -1)
     steps = round(SETTLE / scene.control_step)
-    torque = torch.zeros(count, steps, len(scene.actuated), dtype=torch.float64)
-    path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None))
+    torque, ctrl = held(scene, idle(scene, count, steps))
+    path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None), ctrl)
     for key in (QPOS, QVEL):
         start[key] = path[key][:, -1].clone()
     return cast(TensorDict, start[torch.amax(start[QVEL].abs(), -1) < AT_REST])

@@ -21,6 +21,7 @@ from torchrl_nerd.evaluation.stability.states import rotated
 from torchrl_nerd.geometry.manifold import HINGE
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import drive
 
 KEPT = 1000  # states of a long rollout
 ROUNDING = 1e-6
@@ -54,7 +55,7 @@ def _shifted(
 @hard_case(has_floating_base)
 def altitude(trial: Trial) -> Iterator[Metric]:
     """How far contact points are beyond their margin does not change the motion."""
-    start, torque = trial.in_air(8, speed=1.0), trial.torques(8, 10)
+    start, torque = trial.in_air(8, speed=1.0), trial.commands(8, 10)
     z = trial.scene.base.qpos_address + 2
     shifts = [_shifted(trial, start, z, by, torque) for by in (1.0, 1e3, 1e6)]
     name = "difference after 10 steps, 1 m to 1,000 km higher, m"
@@ -91,7 +92,7 @@ def yaw(trial: Trial) -> Iterator[Metric]:
 def quaternion_sign(trial: Trial) -> Iterator[Metric]:
     """A quaternion q and its negative -q are one orientation."""
     q = trial.scene.base.qpos_address + 3
-    start, torque = trial.starts(16), trial.torques(16, 10)
+    start, torque = trial.starts(16), trial.commands(16, 10)
     other = start.clone()
     other[QPOS][:, q : q + 4] *= -1.0
     paths = [trial.roll(s, 10, torque) for s in (start, other)]
@@ -110,7 +111,7 @@ def _free_hinges(scene: Scene) -> list[int]:
 @hard_case(lambda scene: bool(_free_hinges(scene)))
 def hinge_turns(trial: Trial) -> Iterator[Metric]:
     """A hundred turns of a hinge without limits change nothing."""
-    start, torque = trial.starts(16), trial.torques(16, 20)
+    start, torque = trial.starts(16), trial.commands(16, 20)
     turns, hinges = 200.0 * torch.pi, _free_hinges(trial.scene)
     shift = _shifted(trial, start, hinges, turns, torque, steps=20)
     yield Metric("difference after 100 turns and 20 steps, rad", shift, 1e-6)
@@ -119,11 +120,11 @@ def hinge_turns(trial: Trial) -> Iterator[Metric]:
 @hard_case(lambda scene: bool(len(scene.actuated)))
 def torques(trial: Trial) -> Iterator[Metric]:
     """Zero, largest, 1000-fold and alternating torques leave every state finite."""
-    high = torch.tensor(trial.scene.sampling.torque, dtype=torch.float64)
+    middle, high = trial.scene.sampling.commands
     sign = torch.tensor([1.0, -1.0], dtype=torch.float64)[:, None]
     zero, full = torch.zeros(2, len(high)).double(), high.expand(2, -1)
-    # (4, 2, num_actuated)
-    kinds = torch.stack((zero, full, 1000.0 * full, sign * full))
+    # (4, 2, m)
+    kinds = middle + torch.stack((zero, full, 1000.0 * full, sign * full))
     start = trial.starts(16)
     steps = trial.scaled(1000, 20)
     path = trial.roll(start, steps, kinds.repeat(4, 1, 1), steps // 20)
@@ -134,7 +135,7 @@ def torques(trial: Trial) -> Iterator[Metric]:
 def horizon(trial: Trial) -> Iterator[Metric]:
     """Over 100,000 steps states stay finite and move no farther than their speed allows."""
     scene, steps = trial.scene, trial.scaled(100_000, KEPT) // KEPT * KEPT
-    path = trial.roll(trial.starts(8), steps, trial.torques(8, 512), steps // KEPT)
+    path = trial.roll(trial.starts(8), steps, trial.commands(8, 512), steps // KEPT)
     yield from _finiteness(path, fastest=inf)
     leap = 0.0
     if scene.base.is_floating and isinstance(trial.dynamics, NeRDDynamics):
@@ -160,16 +161,16 @@ def _finiteness(path: TensorDict, fastest: float) -> Iterator[Metric]:
 def invalid_inputs(trial: Trial) -> Iterator[Metric]:
     """An invalid value in one of 4,096 trajectories changes no bit of another."""
     count = trial.scaled(BATCH, NUM_SINGLE)
-    start, torque = trial.starts(count), trial.torques(count, 3)
+    start, torque = trial.starts(count), trial.commands(count, 3)
     expected = trial.roll(start, 3, torque)
     changed = 0
     for value in INVALID:
         index = int(torch.randint(count, (), generator=trial.generator))
         others = torch.arange(count) != index
         for key in (QPOS, QVEL, "torque"):
-            bad, drive = start.clone(), torque.clone()
-            (drive if key == "torque" else bad[key])[index] = value
-            got = trial.roll(bad, 3, drive)
+            bad, told = start.clone(), torque.clone()
+            (told if key == "torque" else bad[key])[index] = value
+            got = trial.roll(bad, 3, told)
             for name in (QPOS, QVEL):
                 changed += int((got[name][others] != expected[name][others]).sum())
     yield Metric("changed values in other trajectories", float(changed), 0.0)
@@ -179,7 +180,7 @@ def invalid_inputs(trial: Trial) -> Iterator[Metric]:
 def batching(trial: Trial) -> Iterator[Metric]:
     """A trajectory does not depend on its batch but for the order of float32 sums."""
     count = trial.scaled(BATCH, NUM_SINGLE)
-    start, torque = trial.starts(count), trial.torques(count, 3)
+    start, torque = trial.starts(count), trial.commands(count, 3)
 
     def velocities(index: Tensor) -> Tensor:
         return trial.roll(cast(TensorDict, start[index]), 3, torque[index])[QVEL]
@@ -203,17 +204,18 @@ def gradients(trial: Trial) -> Iterator[Metric]:
         lying = trial.settled(8)
         lying[QVEL] += SLOW * start[QVEL][: len(lying)]
         start = lying
-    torque = trial.torques(len(start), 100)
+    commands = trial.commands(len(start), 100)
     model, dtype = trial.model, trial.model.dtype
     model.network.double()  # finite differences of float32 are noise
     dynamics = NeRDDynamics(model, differentiable=True)
 
     def end(first: list[Tensor], steps: int) -> Tensor:
-        """Sum of the final velocities, from first velocities and torques."""
+        """Sum of the final velocities, from first velocities and commands."""
         state = start.select(QPOS).set(QVEL, first[0])
         dynamics.reset(state)
-        for now in (first[1], *torque[:, 1:steps].unbind(1)):
-            state = dynamics.step(state, now, start.get(TERRAIN, None))
+        for now in (first[1], *commands[:, 1:steps].unbind(1)):
+            torque, ctrl = drive(trial.scene, now, state[QPOS], state[QVEL])
+            state = dynamics.step(state, torque, start.get(TERRAIN, None), ctrl)
         return state[QVEL].sum()
 
     def gradient(steps: int) -> tuple[Tensor, ...]:
@@ -222,7 +224,7 @@ def gradients(trial: Trial) -> Iterator[Metric]:
             end(leaves, steps), leaves, allow_unused=True, materialize_grads=True
         )
 
-    first, non_finite = [start[QVEL], torque[:, 0]], 0.0
+    first, non_finite = [start[QVEL], commands[:, 0]], 0.0
     try:
         for steps in (1, 32, 100):
             found = gradient(steps)

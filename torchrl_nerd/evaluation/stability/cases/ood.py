@@ -16,9 +16,10 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
 from torchrl_nerd.evaluation.stability.case import Metric, Trial, hard_case
-from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import command_of, drive, drive_of, idle
 
 COUNT, LENGTH, STEPS, DRIVEN = 200, 40, 60, 5
 FASTEST = 4.0  # speeds and torques relative to those of training, at most
@@ -60,7 +61,8 @@ def inputs(
     outside = outside.clone()
     factor = 1.0 + (FASTEST - 1.0) * torch.rand(len(outside), 1, generator=generator)
     kind = torch.randint(3, (len(outside), 1), generator=generator)
-    for unscaled, key in enumerate((QVEL, JOINT_TORQUE)):  # kind 2 scales both
+    command = JOINT_TORQUE if scene.servos is None else CTRL
+    for unscaled, key in enumerate((QVEL, command)):  # kind 2 scales both
         value = outside[key]
         outside[key] = torch.where(kind == unscaled, value, factor.double() * value)
     return inside, calibration, outside
@@ -70,8 +72,9 @@ def inputs(
 def ood_scores(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
     """Of inputs ``[n]``: their score, and whether a feature is outside the range."""
     data = data.to(model.device)
-    state = data[QPOS], data[QVEL], data[JOINT_TORQUE], data.get(TERRAIN, None)
-    features = model.encode(*state)[0]
+    state, command = (data[QPOS], data[QVEL]), command_of(model.scene, data)
+    driven = drive_of(*drive(model.scene, command, *state))
+    features = model.encode(*state, driven, data.get(TERRAIN, None))[0]
     is_outside = model.training_range.excess(features) > 0.0
     return model.ood_score(features).cpu(), is_outside.cpu()
 
@@ -79,12 +82,13 @@ def ood_scores(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
 def _rollout_error(dynamics: Dynamics, start: TensorDict) -> float:
     """Median over trajectories of the mean position error, m and rad.
 
-    Torques are held for some steps, then zero: states return to the training range.
+    Commands are held for some steps, then idle: states return to the training range.
     """
-    torque = start.get(JOINT_TORQUE)[:, None].repeat(1, STEPS, 1)  # (n, STEPS, m)
-    torque[:, DRIVEN:] = 0.0
+    scene = dynamics.scene
+    command = command_of(scene, start)[:, None].repeat(1, STEPS, 1)  # (n, STEPS, m)
+    command[:, DRIVEN:] = idle(scene, 1)
     start = start.select(QPOS, QVEL, TERRAIN, strict=False).clone()
-    both = MujocoDynamics(dynamics.scene), dynamics
-    paths = [open_loop(one, start, STEPS, torque) for one in both]
-    errors = position_errors(dynamics.scene, *paths)  # (n, STEPS) each
+    both = MujocoDynamics(scene), dynamics
+    paths = [open_loop(one, start, STEPS, command) for one in both]
+    errors = position_errors(scene, *paths)  # (n, STEPS) each
     return float(torch.stack(list(errors.values())).mean((0, 2)).nanmedian())

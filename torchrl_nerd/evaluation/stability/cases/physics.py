@@ -169,11 +169,11 @@ def _limited(scene: Scene) -> tuple[list[int], Tensor]:
 
 @hard_case(lambda scene: bool(len(scene.actuated) and _limited(scene)[0]))
 def joint_limits(trial: Trial) -> Iterator[Metric]:
-    """Full torque presses no joint farther beyond its limit than in MuJoCo."""
+    """Full torque or control presses no joint farther beyond its limit than in MuJoCo."""
     scene, start = trial.scene, trial.starts(16)
     addresses, ranges = _limited(scene)
-    high = torch.tensor(scene.sampling.torque, dtype=torch.float64)
-    torque = trial.normal(16, 1, len(high)).sign() * high
+    middle, half = scene.sampling.commands
+    command = middle + trial.normal(16, 1, len(half)).sign() * half
 
     def exceeded(path: TensorDict) -> Tensor:
         """How far beyond its limit each joint went, ``(n, joints)``."""
@@ -182,12 +182,12 @@ def joint_limits(trial: Trial) -> Iterator[Metric]:
         beyond = torch.maximum(low - position, position - high)
         return beyond.amax(1).clamp(min=0.0)
 
-    own, exact = exceeded(trial.roll(start, 200, torque)), []
+    own, exact = exceeded(trial.roll(start, 200, command)), []
     # a trajectory near a limit may miss it: MuJoCo's nearby ones count too
     for size in (0.0, *[PERTURBATION] * NUM_PERTURBED):
         nearby = start.clone()
         nearby[QVEL] += size * trial.normal(*nearby[QVEL].shape)
-        exact.append(exceeded(trial.roll_exactly(nearby, 200, torque)))
+        exact.append(exceeded(trial.roll_exactly(nearby, 200, command)))
     more = largest(own - torch.stack(exact).amax(0))
     yield Metric("limit exceeded by more than in MuJoCo, rad or m", more, 0.2, 1e-9)
     yield Metric("limit exceeded in MuJoCo, rad or m", largest(exact[0]))
