@@ -46,6 +46,7 @@ def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str,
         "scene_hash": scene.hash,
         "reference_ratio": scene.reference_ratio,
         "control_step": scene.control_step,
+        "variation": None if scene.variation is None else scene.variation.ranges,
         "network": None,
         "step": None,
     }

@@ -218,7 +218,8 @@ def _scene_of(card: dict[str, Any], folder: Path) -> Scene:
     if not isinstance(name, str):
         raise ValueError(f"the card in {folder} names an unknown scene: {name!r}")
     try:
-        return load_scene(name)
+        scene, ranges = load_scene(name), card.get("variation")
+        return scene.vary(ranges) if ranges else scene
     except ValueError as error:
         raise ValueError(f"the scene of the card in {folder}: {error}") from None
 

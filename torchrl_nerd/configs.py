@@ -16,7 +16,7 @@ Precision = Literal["float32", "float64"]
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Which predictions of the contact law are among a model's features.
+    """What is among a model's features beside state, torque and contacts.
 
     | field | meaning |
     |---|---|
@@ -24,10 +24,13 @@ class FeatureConfig:
       coming step, see `PredictedForce`; for scenes that follow it |
     | ``unconstrained_motion`` | contacts predicted along the motion that the robot has if
       nothing touches it, not at constant velocity; see `PredictedPenetration` |
+    | ``parameters`` | the row's parameters, for a model of a varied scene that is told what
+      others find in their history; see `Variation` |
     """
 
     predicted_force: bool = False
     unconstrained_motion: bool = False
+    parameters: bool = False
 
 
 NO_PREDICTIONS = FeatureConfig()
@@ -95,6 +98,7 @@ class TrainConfig:
     predicted_force: bool = False  # feature: contact forces by the penalty law
     # feature: contacts along the unconstrained motion in place of constant velocity
     unconstrained_motion: bool = False
+    parameters: bool = False  # feature: the row's parameters, of a varied scene
     steps: int = 20_000  # updates on one-step targets
     rollout_steps: int = 2_000  # further updates on the model's own rollouts
     batch_size: int = 64  # sequences per update
@@ -104,6 +108,7 @@ class TrainConfig:
     use_symmetry: bool = False  # augment data by the robot's symmetries
     rollout_batch_size: int = 128  # rollouts per update
     rollout_length: int = 8  # control steps of a rollout
+    rollout_history: int = 0  # recorded steps that the model sees before it
     lr: float = 0.01  # peak learning rate of Muon, for weight matrices
     adamw_lr: float = 3e-3  # peak learning rate of AdamW, for all other weights
     rollout_lr_ratio: float = 0.1  # learning rates of rollouts, as a share of the peaks
@@ -129,8 +134,9 @@ class TrainConfig:
 
     @property
     def features(self) -> FeatureConfig:
-        """Which predictions are among the model's features."""
-        return FeatureConfig(self.predicted_force, self.unconstrained_motion)
+        """What is among the model's features."""
+        predicted = self.predicted_force, self.unconstrained_motion
+        return FeatureConfig(*predicted, self.parameters)
 
     @property
     def total_steps(self) -> int:
@@ -140,8 +146,13 @@ class TrainConfig:
     @property
     def longest(self) -> int:
         """Control steps that a trajectory of the data must have."""
-        rollout = self.rollout_length if self.rollout_steps else 1
+        rollout = self.rollout_states if self.rollout_steps else 1
         return max(self.sequence_length, rollout)
+
+    @property
+    def rollout_states(self) -> int:
+        """Control steps of a rollout and its history."""
+        return self.rollout_history + self.rollout_length
 
 
 @dataclass(frozen=True)

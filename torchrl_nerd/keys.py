@@ -26,6 +26,10 @@ TARGET = "target"
 """Where a task of the dm_control suite put its n targets ``(*batch, 3 n)``, m, in the
 frame of their bodies, float64; a task's row parameter, drawn at each reset."""
 
+PARAMETERS = "parameters"
+"""Physical parameters of each row ``(*batch, variation.size)``, float64, see `Variation`.
+Only where they vary; the ground truth reads them, and models that are told."""
+
 SENSORDATA = "sensordata"
 """What MuJoCo's sensors read during the last substep ``(*batch, nsensordata)``, float64.
 Only from the ground truth of a model that senses forces; the task alone sees it."""

@@ -13,7 +13,8 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TERRAIN
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive
 
@@ -41,6 +42,8 @@ def stored_steps(model: Model, scene: Scene) -> dict[str, Tensor]:
     ``scene`` is the model's own, as the data were stepped, see `Scene.reference`.
     """
     start, scale = scene.sample_initial(ROWS, Generator().manual_seed(0))
+    if isinstance(model, NeRD) and (told := model.scene_features.variation) is not None:
+        start[PARAMETERS] = told.draw(ROWS, Generator().manual_seed(0))
     middle, half = scene.sampling.commands
     given = {**start, _command(scene): middle + scale * half}
     return {PREFIX + k: v for k, v in (given | _steps(model, scene, given)).items()}
@@ -92,7 +95,8 @@ def warn_of_differences(check: SelfCheck, folder: Path) -> None:
 
 def _steps(model: Model, scene: Scene, given: dict[str, Tensor]) -> dict[str, Tensor]:
     """One step of MuJoCo and of the model."""
-    state = TensorDict({key: given[key] for key in (QPOS, QVEL)}, [len(given[QPOS])])
+    kept = {key: given[key] for key in (QPOS, QVEL, PARAMETERS) if key in given}
+    state = TensorDict(kept, [len(given[QPOS])])
     driven = drive(scene, given[_command(scene)], state[QPOS], state[QVEL])
     (torque, ctrl), terrain = driven, given.get(TERRAIN)
     made, mujoco = {}, MujocoDynamics(scene, num_threads=1)

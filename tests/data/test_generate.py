@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import expect_few_dropped, generate, load_data
 from torchrl_nerd.data.simulate import LARGEST, first_beyond, is_sound, simulate
+from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.geometry.manifold import joint_label
 from torchrl_nerd.robots import load_scene
@@ -207,3 +208,36 @@ def test_many_dropped_trajectories_are_refused_by_name(scene, generator):
     card["trajectories"] = 94
     with pytest.raises(ValueError, match="5 of 99 did not; first beyond it: qvel of"):
         expect_few_dropped(card)
+
+
+RANGES = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4), "delay": (0, 2)}
+
+
+def test_varied_data_are_steps_of_each_rows_own_robot(tmp_path, seed):
+    scene = SCENE.vary(RANGES)
+    config = DataConfig(trajectories=9, steps=20, seed=seed)
+    data = load_data(scene, generate(scene, config, tmp_path, quiet=True))
+    own = data["parameters"]
+    assert (
+        torch.equal(own, own[:, :1].expand_as(own))
+        and len(own[:, 0].unique(dim=0)) == 9
+    )
+    assert not unequal(data, simulate(scene, 9, 20, fold_in(seed, 0)))
+    dynamics, state = MujocoDynamics(scene), data[:, 0].select(*STATE, "parameters")
+    dynamics.reset(state)
+    for t in range(20):
+        state = dynamics.step(state, data[:, t]["next", "joint_torque"])
+        for key in STATE:
+            assert torch.equal(state[key], data[:, t]["next", key])
+
+
+def test_data_of_other_parameters_are_refused(tmp_path):
+    varied, config = SCENE.vary(RANGES), DataConfig(trajectories=2, steps=2)
+    generate(varied, config, tmp_path / "varied", quiet=True)
+    generate(SCENE, config, tmp_path / "plain", quiet=True)
+    other = SCENE.vary(RANGES | {"delay": (0, 1)})
+    for scene, folder in ((SCENE, "varied"), (other, "varied"), (varied, "plain")):
+        with pytest.raises(ValueError, match=f"{folder} vary .*, expected"):
+            load_data(scene, tmp_path / folder)
+        with pytest.raises(ValueError, match="holds data with variation"):
+            generate(scene, config, tmp_path / folder, quiet=True)

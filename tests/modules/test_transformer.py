@@ -5,7 +5,7 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
-from torchrl_nerd.modules.networks import TRANSFORMERS
+from torchrl_nerd.modules.networks import TRANSFORMERS, network_config
 from torchrl_nerd.modules.transformer import (
     CausalTransformer,
     FullLinear,
@@ -15,6 +15,7 @@ from torchrl_nerd.modules.transformer import (
 INPUTS, OUTPUTS = 5, 3
 CONFIGS = {
     "transformer-2x64": TRANSFORMERS["transformer-2x64"],
+    "long band": network_config("transformer-2x64@64"),
     "narrow band": TransformerConfig(layers=1, width=8, heads=1, band=2),
     "deep": TransformerConfig(layers=3, width=24, heads=3, band=4),
 }
@@ -210,3 +211,10 @@ def test_autocast_leaves_the_ends_of_a_network_only(generator):
         assert torch.equal(
             found, nn.functional.linear(tokens, layer.weight, layer.bias)
         )
+
+
+def test_a_name_says_the_band():
+    assert network_config("transformer-2x64@64") == TransformerConfig(2, 64, 4, band=64)
+    for name in ("gru@64", "transformer-2x64@many"):
+        with pytest.raises(ValueError, match=f"its band, got '{name}'"):
+            network_config(name)

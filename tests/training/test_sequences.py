@@ -34,7 +34,7 @@ def sequences(model, data) -> Sequences:
 
 @pytest.mark.parametrize("length", [1, 4, STEPS])
 def test_windows_lie_inside_one_trajectory(length, sequences, data, seed):
-    qpos, qvel, torque, terrain = sequences.rollout(
+    qpos, qvel, torque, terrain, _ = sequences.rollout(
         300, length, Generator().manual_seed(seed)
     )
     assert qpos.shape[:2] == qvel.shape[:2] == (300, length + 1)
@@ -53,7 +53,7 @@ def test_windows_lie_inside_one_trajectory(length, sequences, data, seed):
 
 
 def test_windows_move_as_the_ground_truth_does(scene, sequences, generator):
-    qpos, qvel, torque, terrain = sequences.rollout(20, 3, generator)
+    qpos, qvel, torque, terrain, _ = sequences.rollout(20, 3, generator)
     for t in range(3):
         state = {"qpos": qpos[:, t], "qvel": qvel[:, t]}
         if terrain is not None:
@@ -66,7 +66,7 @@ def test_windows_move_as_the_ground_truth_does(scene, sequences, generator):
 
 def test_tokens_and_targets_are_those_of_the_windows(model, sequences, seed):
     inputs, targets = sequences.one_step(50, 4, Generator().manual_seed(seed))
-    qpos, qvel, torque, terrain = sequences.rollout(
+    qpos, qvel, torque, terrain, _ = sequences.rollout(
         50, 4, Generator().manual_seed(seed)
     )
     ground = None if terrain is None else terrain[:, None].expand(-1, 4, -1)

@@ -13,6 +13,7 @@ from torchrl_nerd.cli.options import (
     Positional,
     Reference,
     SceneName,
+    Vary,
     recorded_scene,
     run_name,
     scene_of,
@@ -44,6 +45,8 @@ class Data(Command):
 
     Example: nerd data cube --from cube_tosses.npz --out datasets/cube_tosses
 
+    Example: nerd data cartpole --vary mass:pole=0.3:3.0 motor=0.6:1.4
+
     Example: nerd data ant --trajectories 1000000 --ray auto
 
     Example: nerd data ant --policy runs/ppo_ant --out datasets/ant_policy
@@ -53,6 +56,7 @@ class Data(Command):
     out: Path | None = None
     """Folder of the data set; default datasets/SCENE."""
     reference: Reference = None
+    vary: Vary = ()
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """File of recorded trajectories (npz or CSV); units and frames are checked."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
@@ -68,7 +72,9 @@ class Data(Command):
     @property
     def folder(self) -> Path:
         """Of the data set that is generated."""
-        return self.out or Path("datasets") / run_name(self.scene, self.reference)
+        return self.out or Path("datasets") / run_name(
+            self.scene, self.reference, self.vary
+        )
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
         """Name and function that draw: the policy's, or the preset's."""
@@ -81,7 +87,7 @@ class Data(Command):
         if self.recorded is not None:
             recording, _ = load_recording(self.recorded, recorded_scene(self.scene))
             return [f"convert {len(recording)} recorded trajectories"]
-        scene, out = scene_of(self.scene, self.reference), self.folder
+        scene, out = scene_of(self.scene, self.reference, self.vary), self.folder
         _, draw = self.strategy(scene) or (None, partial(simulate, scene))
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
         wanted, existing = self.config.trajectories, 0
@@ -109,7 +115,7 @@ class Data(Command):
             count = card["trajectories"]
             print(f"{count} recorded trajectories in {out}: they pass all checks")
             return card
-        scene = scene_of(self.scene, self.reference)
+        scene = scene_of(self.scene, self.reference, self.vary)
         out = self.folder
         draw = self.strategy(scene)
         mapper = partial(ray_map, address=self.ray) if self.ray else map

@@ -1,11 +1,12 @@
 """Options that several commands share, and the scenes that they name."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import tyro
 
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.robots import load_scene, recorded_protocol
+from torchrl_nerd.robots import load_scene, preset_of, recorded_protocol
 from torchrl_nerd.scenes import Scene
 
 Positional = tyro.conf.Positional
@@ -31,17 +32,45 @@ Reference = Annotated[
         "substeps."
     ),
 ]
+Vary = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        help="Hidden parameters that differ from trajectory to trajectory, as "
+        "mass:pole=0.3:3.0 (KIND:TARGET=LOW:HIGH), or preset: those of the robot's preset."
+    ),
+]
 
 
-def scene_of(name: str, reference: str | None) -> Scene:
-    """A scene by its name, with its own or the reference solver, see `Scene.reference`."""
+def scene_of(name: str, reference: str | None, vary: tuple[str, ...] = ()) -> Scene:
+    """A scene by its name, with its own or the reference solver, see `Scene.reference`.
+
+    ``vary``: hidden parameters, see `Variation`.
+
+    Raises:
+        ValueError: no such scene, parameter or range.
+    """
     scene = load_scene(name)
-    return scene.reference if reference else scene
+    ranges: dict[str, Sequence[float]] = {}
+    for given in vary:
+        if given == "preset":
+            ranges |= preset_of(name).variation
+            continue
+        parameter, _, ends = given.partition("=")
+        try:
+            low, high = map(float, ends.split(":"))
+        except ValueError:
+            raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
+        ranges[parameter] = low, high
+    scene = scene.reference if reference else scene
+    return scene.vary(ranges) if ranges else scene
 
 
-def run_name(name: str, reference: str | None) -> str:
+def run_name(name: str, reference: str | None, vary: tuple[str, ...] = ()) -> str:
     """The folder under ``datasets`` and ``runs`` that belongs to it."""
-    return "-".join((folder_name(name), *((reference,) if reference else ())))
+    about = [
+        word for word, is_so in ((reference, reference), ("varied", vary)) if is_so
+    ]
+    return "-".join((folder_name(name), *map(str, about)))
 
 
 def recorded_scene(name: str) -> Scene:

@@ -13,6 +13,7 @@ from torchrl_nerd.cli.options import (
     Positional,
     Reference,
     SceneName,
+    Vary,
     run_name,
     scene_of,
 )
@@ -55,6 +56,7 @@ class Train(DeviceCommand):
     init_from: str | None = None
     """Continue training from a shipped model (its name) or a checkpoint (its folder)."""
     reference: Reference = None
+    vary: Vary = ()
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
     """Folder to copy the checkpoint to that the preset chooses, best or last."""
@@ -75,7 +77,7 @@ class Train(DeviceCommand):
     @property
     def folders(self) -> tuple[Path, tuple[Path, ...]]:
         """Of the run and of its data sets."""
-        name = run_name(self.scene, self.reference)
+        name = run_name(self.scene, self.reference, self.vary)
         run = name if self.kind == "learned" else f"{name}-hybrid"
         return self.out or Path("runs") / run, self.data or (Path("datasets") / name,)
 
@@ -97,7 +99,8 @@ class Train(DeviceCommand):
 
     def plan(self) -> list[str]:
         """Which model would be trained on which data, and what exists already."""
-        scene, (out, folders) = scene_of(self.scene, self.reference), self.folders
+        scene = scene_of(self.scene, self.reference, self.vary)
+        out, folders = self.folders
         initial = self.initial(scene)
         if initial is None:
             model = make_model(scene, self.config)
@@ -118,7 +121,7 @@ class Train(DeviceCommand):
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the preset chooses."""
-        scene = scene_of(self.scene, self.reference)
+        scene = scene_of(self.scene, self.reference, self.vary)
         preset, (out, folders) = preset_of(self.scene), self.folders
         initial = self.initial(scene)
         for folder in filter(None, (out, self.export)):

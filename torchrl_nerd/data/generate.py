@@ -155,6 +155,11 @@ def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
             f"the data in {folder} are of scene '{card.get('scene')}' "
             f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
         )
+    ranges = None if scene.variation is None else scene.variation.ranges
+    if card.get("variation") != ranges:
+        raise ValueError(
+            f"the data in {folder} vary {card.get('variation')}, expected {ranges}"
+        )
     config = _check_counts(card, folder)
     if card["trajectories"] + card["dropped"] < config.trajectories:
         raise ValueError(
@@ -182,6 +187,7 @@ def _open_card(
         "config": asdict(config),
         "strategy": strategy,
         "ranges": scene.sampling.ranges(),
+        "variation": None if scene.variation is None else scene.variation.ranges,
         "mujoco": mujoco.__version__,
         "torchrl_nerd": __version__,
         **dict.fromkeys(("trajectories", "dropped", "chunks_done"), 0),
@@ -192,11 +198,11 @@ def _open_card(
         write_json(path, fresh)  # before any chunk, which never exists without a card
         return fresh
     card = read_json(path)
-    for key in ("scene_hash", "config", "strategy", "ranges"):
-        if card.get(key) != fresh[key]:
+    for key in ("scene_hash", "config", "strategy", "ranges", "variation"):
+        if card.get(key) != fresh.get(key):
             raise ValueError(
                 f"{folder} already holds data with {key} {card.get(key)}, asked for "
-                f"{fresh[key]}: choose another folder"
+                f"{fresh.get(key)}: choose another folder"
             )
     _check_counts(card, folder)
     drawn = min(card["chunks_done"] * CHUNK, config.trajectories)

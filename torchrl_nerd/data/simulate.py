@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.geometry.manifold import joint_label
-from torchrl_nerd.keys import CTRL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import CTRL, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive, held
 from torchrl_nerd.scenes.sampling import sample_correlated_commands
@@ -22,7 +22,8 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
     """Trajectories ``[rows, steps]`` from the scene's ranges, diverged ones included."""
     dynamics = MujocoDynamics(scene)
     start, scale = scene.sample_initial(rows, generator)
-    terrain = start.pop(TERRAIN, None)
+    terrain, varied = start.pop(TERRAIN, None), scene.variation
+    parameters = None if varied is None else varied.draw(rows, generator)
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
     states, commands = [state[:, None]], []
@@ -32,6 +33,8 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
         drawn = sample_correlated_commands(sampling, scale, *how).split(SEGMENT, 1)
     for segment in range(steps if sampling.drive else len(drawn)):
         last = cast(TensorDict, states[-1][:, -1])
+        if parameters is not None:
+            last = last.set(PARAMETERS, parameters)
         if sampling.drive is None:
             command = drawn[segment]  # (rows, SEGMENT, m)
         else:  # depends on the state: one step at a time
@@ -39,7 +42,7 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
         torque, ctrl = held(scene, command)
         commands.append(command)
         states.append(dynamics.rollout(last, torque, terrain, ctrl))
-    return as_transitions(scene, states, commands, terrain)
+    return as_transitions(scene, states, commands, terrain, parameters)
 
 
 def as_transitions(
@@ -47,6 +50,7 @@ def as_transitions(
     states: list[TensorDictBase],
     commands: list[Tensor],
     terrain: Tensor | None,
+    parameters: Tensor | None = None,
 ) -> TensorDict:
     """A data set ``[rows, steps]`` in TorchRL's layout.
 
@@ -55,6 +59,7 @@ def as_transitions(
         states: parts of trajectories, ``[rows, *]``, in order: steps + 1 states in all.
         commands: of the steps between them, parts of ``(rows, *, m)``.
         terrain: ``(rows, terrain.size)`` where the ground varies.
+        parameters: ``(rows, variation.size)`` where they vary.
     """
     path = cast(TensorDict, TensorDict.cat(states, 1))
     data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))
@@ -62,9 +67,10 @@ def as_transitions(
     data["next"] = after.set("joint_torque", torque)
     if ctrl is not None:
         data[CTRL] = ctrl
-    if terrain is not None:
-        steps = data.batch_size[1]
-        data[TERRAIN] = terrain[:, None].expand(-1, steps, -1).contiguous()
+    for key, value in ((TERRAIN, terrain), (PARAMETERS, parameters)):
+        if value is not None:
+            steps = data.batch_size[1]
+            data[key] = value[:, None].expand(-1, steps, -1).contiguous()
     return data
 
 

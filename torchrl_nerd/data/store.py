@@ -50,6 +50,8 @@ def expect_layout(data: TensorDictBase, scene: Scene, steps: int, path: Path) ->
         sizes |= {"next/ctrl": num_ctrl(scene)}
     if scene.terrain is not None and scene.terrain.is_per_row:
         sizes |= {"terrain": scene.terrain.size}
+    if scene.variation is not None:
+        sizes |= {"parameters": scene.variation.size}
     found = dict(data.flatten_keys("/").items())
     for key in sizes.keys() | found.keys():
         value = found.get(key)

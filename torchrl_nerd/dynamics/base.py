@@ -6,7 +6,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes.scene import Scene
 
 
@@ -42,7 +42,8 @@ class Dynamics(Protocol):
         """The state one control step later.
 
         Args:
-            state: ``qpos (num_envs, nq)``, ``qvel (num_envs, nv)``.
+            state: ``qpos (num_envs, nq)``, ``qvel (num_envs, nv)`` and, where the scene
+                varies, ``parameters``, which the next state has too.
             joint_torque: ``(num_envs, num_actuated)``, N and N m, held over the step; with
                 ``ctrl``, that of its start.
             terrain: ``(num_envs, terrain.size)`` where the ground varies.
@@ -54,6 +55,24 @@ class Dynamics(Protocol):
             ground truth of a model that senses forces adds ``sensordata``.
         """
         ...
+
+
+def warm_up(dynamics: Dynamics, history: TensorDictBase) -> None:
+    """Give a dynamics the past that a recorded motion has; what it had is forgotten.
+
+    A rollout from the state after the motion then starts adapted to what the motion shows.
+
+    Args:
+        dynamics: any; the ground truth learns of late torques.
+        history: ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any,
+            ``ctrl``, ``terrain`` and ``parameters``, ``[num_envs, T]``, oldest first.
+    """
+    for step, then in enumerate(history.unbind(1)):
+        state = then.select(QPOS, QVEL, PARAMETERS, strict=False)
+        if step == 0:
+            dynamics.reset(state)
+        given = (then.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
+        dynamics.step(state, *given)
 
 
 class Memoryless:
@@ -104,6 +123,15 @@ def check_step(
         got = None if value is None else tuple(value.shape)
         if got not in (None, (rows, width)):
             raise ValueError(f"expected {name} of shape {(rows, width)}, got {got}")
+
+
+def refuse_variation(scene: Scene, engine: str) -> None:
+    """Raise ValueError where the scene's parameters differ from row to row."""
+    if scene.variation is not None:
+        raise ValueError(
+            f"expected MuJoCo for the varied scene '{scene.name}', got {engine}, which "
+            "steps one robot"
+        )
 
 
 def ground_pose(scene: Scene, terrain: Tensor | None) -> Tensor | None:

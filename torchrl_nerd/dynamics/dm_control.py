@@ -9,7 +9,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
+from torchrl_nerd.dynamics.base import (
+    as_numpy,
+    check_step,
+    ground_pose,
+    refuse_variation,
+)
 from torchrl_nerd.dynamics.mujoco import engine_model, feels_forces
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.controllers import ActuatorController
@@ -39,11 +44,15 @@ class DMControlDynamics:
 
     Args:
         scene: robot, ground and substeps.
+
+    Raises:
+        ValueError: a scene whose parameters differ from row to row.
     """
 
     kind = "ground truth"
 
     def __init__(self, scene: Scene) -> None:
+        refuse_variation(scene, "dm_control")
         self.scene = scene
         self._has_actuators = isinstance(scene.controller, ActuatorController)
         self._rows: list[Physics] = []

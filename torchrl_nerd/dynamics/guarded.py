@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrl_nerd.dynamics.models import NeRDDynamics
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
-from torchrl_nerd.keys import QPOS, QVEL, TRUST
+from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TRUST
 
 Guard = Literal["flag", "truncate", "raise", "fallback"]
 """What to do with an env that is not trusted: say so under ``trust``; also end its episode
@@ -99,7 +99,7 @@ class GuardedDynamics:
             )
         if self.ground_truth is not None and (rows := self._not_yet_calm(rows)).any():
             ground, told = (None if x is None else x[rows] for x in (terrain, ctrl))
-            some = state.select(QPOS, QVEL)[rows]
+            some = state.select(QPOS, QVEL, PARAMETERS, strict=False)[rows]
             self.ground_truth.reset(some)  # no warm start of other envs
             exact = self.ground_truth.step(some, joint_torque[rows], ground, told)
             for key in (QPOS, QVEL):

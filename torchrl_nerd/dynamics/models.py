@@ -12,7 +12,7 @@ from torchrl_nerd.analytic import AnalyticStep
 from torchrl_nerd.compiled import Compiled, RowThreads, parts_of, unaffected
 from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.geometry.manifold import normalize_pos
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD, Network
 from torchrl_nerd.modules.window import WindowNetwork
 from torchrl_nerd.scenes.commands import drive_of
@@ -148,7 +148,7 @@ class TorchDynamics:
         ground = None if terrain is None else terrain.to(qpos)
         self._prepare(len(qpos))
         told = None if self.scene.servos is None or ctrl is None else ctrl.to(qpos)
-        drive = drive_of(joint_torque.to(qpos), told)
+        drive = drive_of(joint_torque.to(qpos), told, self._told(state, qpos))
         given = qpos, qvel, drive, ground, self._memory, is_scored
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel, score = self._run(given)
@@ -157,7 +157,12 @@ class TorchDynamics:
             batch_size=state.batch_size,
             device=state.device,
         )
+        if PARAMETERS in state.keys():
+            after[PARAMETERS] = state[PARAMETERS]
         return after, None if score is None else score.to(there)
+
+    def _told(self, state: TensorDictBase, like: Tensor) -> Tensor | None:
+        """What the model is told of a varied scene's parameters."""
 
     def _prepare(self, rows: int) -> None:
         """What a step of so many envs needs beforehand."""
@@ -226,6 +231,14 @@ class NeRDDynamics(TorchDynamics):
         else:  # asks nothing of the device, and the memory stays where it is
             with torch.set_grad_enabled(self.differentiable):
                 memory.clear(rows.reshape(count).to(self.device))
+
+    def _told(self, state: TensorDictBase, like: Tensor) -> Tensor | None:
+        features = self.model.scene_features
+        if features.variation is None:
+            return None
+        if PARAMETERS not in state.keys():
+            raise ValueError("expected parameters in the state, got none")
+        return features.told(state[PARAMETERS].to(like))
 
     def _prepare(self, rows: int) -> None:
         if self._memory is None or self._rows != rows:

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
-from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
+from torchrl_nerd.dynamics.row_parameters import RowParameters
+from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import silence_mujoco
@@ -62,6 +63,8 @@ class MujocoDynamics:
     robot's own actuators act. Without it they are off, and the joint torque is held. The
     solver's warm start is carried from step to step, as ``mj_step`` does (it changes
     results by less than the solver's tolerance), and cleared for envs that are reset.
+    Where the scene varies, each env has the ``parameters`` of its state; without any all
+    are as the scene is.
 
     Args:
         scene: robot, ground and substeps.
@@ -81,8 +84,16 @@ class MujocoDynamics:
         self._has_actuators = isinstance(scene.controller, ActuatorController)
         self._start(np.zeros((0, scene.model.nv)))
 
-    def _start(self, warmstart: np.ndarray) -> None:
-        """Simulations, one for each row of the warm start ``(rows, nv)``."""
+    def _start(self, warmstart: np.ndarray, late: np.ndarray | None = None) -> None:
+        """Simulations, one for each row of the warm start ``(rows, nv)``.
+
+        ``late (rows, 1 + max_delay, m)``: the last commands, the latest first.
+        """
+        scene, rows = self.scene, len(warmstart)
+        longest = 0 if scene.variation is None else scene.variation.max_delay
+        size = 1 + longest, max(len(scene.actuated), scene.model.nu)
+        self._late = np.zeros((rows, *size)) if late is None else late
+        self._own: RowParameters | None = None
         self._model = engine_model(self.scene, self._has_actuators)
         self._batch: Batch | None = None
         self._warmstart = warmstart
@@ -96,27 +107,29 @@ class MujocoDynamics:
         """Threads do not travel: a copy in another process starts its own."""
         kept = ("scene", "num_threads")
         state = {name: self.__dict__[name] for name in kept}
-        return {**state, "warmstart": self._warmstart.copy()}
+        return {**state, "past": self.history()}
 
     def __setstate__(self, state: dict) -> None:
         self.__init__(state["scene"], state["num_threads"])
-        self._start(state["warmstart"])
+        self._start(*state["past"])
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Clear the warm start of ``rows (num_envs,)``; see `Dynamics.reset`."""
         count = state[QPOS].shape[0]
         if len(self._warmstart) != count:
             self._start(np.zeros((count, self._model.nv)))
-        self._warmstart[slice(None) if rows is None else rows.cpu().numpy()] = 0.0
+        for past in (self._warmstart, self._late):
+            past[slice(None) if rows is None else rows.cpu().numpy()] = 0.0
 
-    def history(self) -> np.ndarray:
-        """See `Dynamics.history`: the warm start."""
-        return self._warmstart.copy()
+    def history(self) -> tuple[np.ndarray, np.ndarray]:
+        """See `Dynamics.history`: the warm start and the commands that may be late."""
+        return self._warmstart.copy(), self._late.copy()
 
-    def restore(self, history: np.ndarray, rows: Tensor) -> None:
+    def restore(self, history: tuple[np.ndarray, np.ndarray], rows: Tensor) -> None:
         """See `Dynamics.restore`."""
-        mask = rows.cpu().numpy()
-        self._warmstart[mask] = history[mask] if len(history) == len(mask) else 0.0
+        mask, pasts = rows.cpu().numpy(), (self._warmstart, self._late)
+        for past, then in zip(pasts, history, strict=True):
+            past[mask] = then[mask] if len(then) == len(mask) else 0.0
 
     @uncompiled
     def step(
@@ -137,6 +150,8 @@ class MujocoDynamics:
             if self._batch is not None:
                 felt = self._batch.bind("sensordata").copy()
             last[SENSORDATA] = torch.from_numpy(felt)
+        if PARAMETERS in state.keys():
+            last[PARAMETERS] = state[PARAMETERS]
         return last.to(state[QPOS].device)
 
     def rollout(
@@ -171,7 +186,7 @@ class MujocoDynamics:
             check_step(self.scene, state, torque, terrain, now)
         if self._has_actuators != (ctrl is not None):
             self._has_actuators = ctrl is not None
-            self._start(self._warmstart.copy())
+            self._start(*self.history())
         if len(self._warmstart) != rows:
             self.reset(state)
         qpos = np.empty((rows, length, self._model.nq))
@@ -179,6 +194,7 @@ class MujocoDynamics:
         batch = self._batch
         if batch is not None and length:
             pose = ground_pose(self.scene, terrain)
+            self._vary(batch, state)
             self._place(batch, as_numpy(state[QPOS]), as_numpy(state[QVEL]), pose)
             commands, is_whole = as_numpy(command), np.ones(rows, bool)
             for t in range(length):
@@ -186,6 +202,15 @@ class MujocoDynamics:
                 qpos[:, t], qvel[:, t] = batch.bind(QPOS), batch.bind(QVEL)
         values = {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
         return TensorDict(values, [rows, length]).to(state[QPOS].device)
+
+    def _vary(self, batch: Batch, state: TensorDictBase) -> None:
+        """Give every simulation the parameters of its state, where there are any."""
+        given = state.get(PARAMETERS, None)
+        if given is None or self.scene.variation is None:
+            return
+        if self._own is None:
+            self._own = RowParameters(self.scene.variation, batch)
+        self._own.write(as_numpy(given))
 
     def _place(
         self, batch: Batch, qpos: np.ndarray, qvel: np.ndarray, pose: Tensor | None
@@ -201,6 +226,8 @@ class MujocoDynamics:
 
     def _advance(self, batch: Batch, command: np.ndarray, is_whole: np.ndarray) -> None:
         """One control step; a simulation with a warning is NaN, and whole no longer."""
+        if self._own is not None:
+            command = self._own.applied(command, self._late, self._has_actuators)
         if self._has_actuators:
             batch.bind("ctrl")[:] = command
         else:
@@ -227,7 +254,7 @@ def _restart_all() -> None:
     for dynamics in list(_STARTED):
         if dynamics._batch is not None:
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(dynamics._batch))
-            dynamics._start(dynamics._warmstart.copy())
+            dynamics._start(*dynamics.history())
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows

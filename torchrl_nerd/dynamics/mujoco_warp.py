@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step, ground_pose
+from torchrl_nerd.dynamics.base import check_step, ground_pose, refuse_variation
 from torchrl_nerd.dynamics.mujoco import engine_model, feels_forces
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
 from torchrl_nerd.scenes.controllers import ActuatorController
@@ -53,6 +53,7 @@ class MujocoWarpDynamics:
         max_contacts: int | None = None,
         is_capturing: bool = True,
     ) -> None:
+        refuse_variation(scene, "MuJoCo Warp")
         self.scene, self.device = scene, torch.device(device)
         self.max_contacts, self.is_capturing = max_contacts, is_capturing
         self.has_actuators = isinstance(scene.controller, ActuatorController)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled, unaffected
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
+from torchrl_nerd.dynamics.base import warm_up
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import FaultRecorder
 from torchrl_nerd.envs.pixels import RenderedEnv
@@ -21,7 +22,7 @@ from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import row_keys, stream_offsets
 from torchrl_nerd.envs.transition import Transition, drive_sizes, given_state
 from torchrl_nerd.geometry.manifold import normalize_pos
-from torchrl_nerd.keys import ACTION, FAULT, QPOS, QVEL, TRUST
+from torchrl_nerd.keys import ACTION, FAULT, PARAMETERS, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_count, expect_device
 from torchrl_nerd.tasks import Task
@@ -112,7 +113,8 @@ class SceneEnv(RenderedEnv):
             self.register_buffer(name, zeros.long())
         for key, size in self._state_sizes.items():  # (num_envs, size) each
             self.register_buffer(f"_state_{key}", zeros[:, None].repeat(1, size))
-        offsets = stream_offsets(task.num_uniforms, self.device)
+        drawn = task.num_uniforms + self._state_sizes.get(PARAMETERS, 0)
+        offsets = stream_offsets(drawn, self.device)
         self.register_buffer("_offsets", offsets, persistent=False)
         self.register_buffer("_keys", zeros.long(), persistent=False)
         self.register_buffer("_seed", zeros[0].long())
@@ -167,8 +169,9 @@ class SceneEnv(RenderedEnv):
 
     @property
     def _state_sizes(self) -> dict[str, int]:
-        model = self.scene.model
-        return {QPOS: model.nq, QVEL: model.nv, **self.task.parameters}
+        model, varied = self.scene.model, self.scene.variation
+        own = {} if varied is None else {PARAMETERS: varied.size}
+        return {QPOS: model.nq, QVEL: model.nv, **self.task.parameters, **own}
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         return False  # a state is set only where ``set_state=True`` says so
@@ -236,6 +239,11 @@ class SceneEnv(RenderedEnv):
         result = self._hand_out(found, {"_episode": episode, "_age": age})
         self.dynamics.reset(result, rows)
         return self._seen(result)
+
+    @unaffected
+    def warm_up(self, history: TensorDictBase) -> None:
+        """Show the dynamics a recorded motion up to the present state, see `warm_up`."""
+        warm_up(self.dynamics, history)
 
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:

@@ -19,6 +19,7 @@ from torchrl_nerd.keys import (
     ACTION,
     FAULT,
     OBSERVATION,
+    PARAMETERS,
     QPOS,
     QVEL,
     SENSORDATA,
@@ -126,7 +127,7 @@ class Transition:
         qpos, qvel = moving[QPOS], moving[QVEL]
         torque, ctrl = actuate(self.task.controller, action, qpos, qvel)
         move = self._move_apart if self.is_round else self._move
-        moved = move(qpos, qvel, torque, terrain, ctrl)
+        moved = move(qpos, qvel, torque, terrain, ctrl, moving.get(PARAMETERS))
         drive = {"joint_torque": torque}
         return moved, drive if ctrl is None else {**drive, "ctrl": ctrl}
 
@@ -137,8 +138,12 @@ class Transition:
         torque: Tensor,
         terrain: Tensor | None,
         ctrl: Tensor | None,
+        parameters: Tensor | None,
     ) -> Tensors:
-        state = TensorDict({QPOS: qpos, QVEL: qvel}, qpos.shape[:1], device=qpos.device)
+        values = {QPOS: qpos, QVEL: qvel}
+        if parameters is not None:
+            values[PARAMETERS] = parameters
+        state = TensorDict(values, qpos.shape[:1], device=qpos.device)
         moved = dict(self.dynamics.step(state, torque, terrain, ctrl).items())
         return moved | {key: moved[key].to(qpos.dtype) for key in (QPOS, QVEL)}
 
@@ -167,7 +172,10 @@ class Transition:
         """
         # drawn for all envs, then selected: shapes stay the same
         drawn = uniforms(*streams, state[QPOS].dtype)
-        fresh = self.task.initial_state(drawn) | given
+        fresh = self.task.initial_state(drawn[:, : self.task.num_uniforms])
+        if (variation := self.task.scene.variation) is not None:
+            fresh[PARAMETERS] = variation.values(drawn[:, self.task.num_uniforms :])
+        fresh = fresh | given
         column = rows[:, None]
         start = {
             key: torch.where(column, fresh[key].to(now.dtype), now)

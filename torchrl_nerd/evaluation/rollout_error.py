@@ -17,7 +17,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.dynamics.base import Dynamics
 from torchrl_nerd.geometry.manifold import joint_label
 from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate, drive, idle
@@ -60,6 +60,8 @@ def initial_states(source: Source, num_trajectories: int, seed: int) -> TensorDi
         shape = (num_trajectories, source.num_uniforms)
         u = torch.rand(shape, dtype=torch.float64, generator=generator)
         values = source.initial_state(u)
+    if (variation := scene_of(source).variation) is not None:
+        values[PARAMETERS] = variation.draw(num_trajectories, generator)
     return TensorDict(values, batch_size=[num_trajectories])
 
 
@@ -145,7 +147,8 @@ def _states(
     command: Tensor | Drive | None,
 ) -> Iterator[TensorDictBase]:
     """The state after each step."""
-    terrain, state = start.get(TERRAIN, None), start.select(QPOS, QVEL)
+    terrain = start.get(TERRAIN, None)
+    state: TensorDictBase = start.select(QPOS, QVEL, PARAMETERS, strict=False)
     if command is None:
         command = idle(dynamics.scene, len(start), 1).to(start[QPOS])
     dynamics.reset(state)

@@ -48,6 +48,10 @@ class HybridNeRD(NeRD):
         network: NetworkConfig,
         stats: Mapping[NestedKey, Stats] | None = None,
     ) -> None:
+        if features.parameters:
+            raise ValueError(
+                "expected a learned model to be told parameters, got a hybrid"
+            )
         self._num_defects = step.num_defects  # the base class asks for `token_size`
         super().__init__(scene, features, network, stats)
         self.analytic_step = step

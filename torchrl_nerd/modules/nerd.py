@@ -17,16 +17,11 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.transforms import (
-    ContactFeatures,
-    Normalize,
-    RobotCentric,
-    StateDelta,
-    Stats,
-)
+from torchrl_nerd.transforms import Normalize, StateDelta, Stats
+from torchrl_nerd.transforms.scene_features import SceneFeatures
 
 TOKEN, TARGET = "token", "target"  # keys of the statistics
 
@@ -72,25 +67,6 @@ class Encoded(NamedTuple):
     token: Tensor  # (*batch, token_size), the network's input
     base: Tensor  # (*batch, D) or (): normalised change without the network
     gate: Tensor  # (*batch, 1) or (): share of the network's output that counts
-
-
-class SceneFeatures(nn.Module):
-    """`RobotCentric`, drive and `ContactFeatures` of a state, concatenated."""
-
-    def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
-        super().__init__()
-        self.config = config
-        self.robot = RobotCentric(scene, config)
-        self.contact = ContactFeatures(scene, config)
-        self.size = sum((*self.robot.sizes.values(), *self.contact.sizes.values()))
-
-    def forward(
-        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
-    ) -> Tensor:
-        """Raw features ``(*batch, F)`` in the dtype of the state."""
-        state = self.robot.state_features(qpos, qvel)
-        contacts = self.contact.contact_features(qpos, qvel, terrain, drive)
-        return torch.cat((state, drive, *contacts), -1)
 
 
 class NeRD(nn.Module):

@@ -3,7 +3,7 @@
 The MLP has no history (a Markov model); the GRU's history is a hidden state.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ from torchrl_nerd.modules.transformer import (
     make_head,
     stored,
 )
-from torchrl_nerd.settings import look_up
+from torchrl_nerd.settings import SettingError, look_up
 
 
 @dataclass(frozen=True)
@@ -154,9 +154,15 @@ NETWORKS: dict[str, NetworkConfig] = {
 
 
 def network_config(name: str) -> NetworkConfig:
-    """The network of that name in `NETWORKS`.
+    """The network of that name in `NETWORKS`; ``"transformer-2x64@64"`` has a band of 64.
 
     Raises:
-        SettingError: no such network.
+        SettingError: no such network, or a band of another one.
     """
-    return look_up("network", name, NETWORKS)
+    kind, _, band = name.partition("@")
+    config = look_up("network", kind, NETWORKS)
+    if not band:
+        return config
+    if not isinstance(config, TransformerConfig) or not band.isdecimal():
+        raise SettingError(f"expected a transformer and its band, got '{name}'")
+    return replace(config, band=int(band))

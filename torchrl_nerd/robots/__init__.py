@@ -152,8 +152,11 @@ def recorded_protocol(name: str) -> RecordedProtocol:
 
 def source_of(scene: Scene) -> Source:
     """Whose initial states validate models of a scene: its preset's task, or itself."""
-    task = preset_of(scene.name).task
-    return scene if task is None else make_task(task)
+    name = preset_of(scene.name).task
+    if name is None:
+        return scene
+    task = make_task(name)
+    return task if scene.variation is None else task.vary(scene.variation.ranges)
 
 
 __all__ = [

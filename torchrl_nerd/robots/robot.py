@@ -7,6 +7,7 @@ from typing import Literal
 
 from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.variation import Ranges
 from torchrl_nerd.tasks import Task
 
 Source = Task | Scene
@@ -52,6 +53,8 @@ class Preset:
     strategy: str | None = None  # of training states, see `data.strategies`
     exports: Literal["best", "last"] = "best"  # the checkpoint that is the model
     recorded: RecordedProtocol | None = None
+    # hidden parameters of adaptive models, and their ranges; see `Scene.vary`
+    variation: Ranges = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

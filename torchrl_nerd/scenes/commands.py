@@ -33,9 +33,15 @@ def drive(scene: Scene, command: Tensor, qpos: Tensor, qvel: Tensor) -> Drive:
     return scene.servos.torque(command, qpos, qvel), command
 
 
-def drive_of(joint_torque: Tensor, ctrl: Tensor | None = None) -> Tensor:
-    """A model's input of both, side by side: ``(*batch, num_actuated + num_ctrl)``."""
-    return joint_torque if ctrl is None else torch.cat((joint_torque, ctrl), -1)
+def drive_of(
+    joint_torque: Tensor, ctrl: Tensor | None = None, told: Tensor | None = None
+) -> Tensor:
+    """A model's input of both, side by side: ``(*batch, num_actuated + num_ctrl)``.
+
+    ``told``: what else it is given, see `SceneFeatures.told`.
+    """
+    parts = [x for x in (joint_torque, ctrl, told) if x is not None]
+    return joint_torque if len(parts) == 1 else torch.cat(parts, -1)
 
 
 def held(scene: Scene, command: Tensor) -> tuple[Tensor | None, Tensor | None]:

@@ -15,6 +15,7 @@ from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose, keep_con
 from torchrl_nerd.geometry.constants import placed
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
+from torchrl_nerd.scenes import importer
 from torchrl_nerd.scenes.contact_points import (
     MAX_POINTS,
     ContactPoints,
@@ -23,18 +24,14 @@ from torchrl_nerd.scenes.contact_points import (
 )
 from torchrl_nerd.scenes.controllers import ActuatorController, Controller, driven_dofs
 from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
-from torchrl_nerd.scenes.importer import (
-    default_sampling,
-    gymnasium_file,
-    load_suite,
-    read_mjcf,
-)
 from torchrl_nerd.scenes.penetration import deepest_contacts
 from torchrl_nerd.scenes.sampling import Sampling, draw_initial
 from torchrl_nerd.scenes.support import check_supported, unit_gravity
 from torchrl_nerd.scenes.symmetries import Symmetries, find_symmetries
 from torchrl_nerd.scenes.terrain import Terrain, TerrainDistance
+from torchrl_nerd.scenes.variation import Ranges, Variation
 
+RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's own
 
 
@@ -51,6 +48,7 @@ class Scene:
     | ``sampling`` | ranges of training states and torques |
     | ``reference_ratio`` | substeps in one of the scene's own, see `reference`; else 1 |
     | ``max_contact_points`` | about how many contact points the robot may have |
+    | ``variation`` | parameters that differ from row to row, see `vary`; None for none |
 
     Raises:
         ValueError: the model has something no NeRD can be built for (named).
@@ -63,6 +61,7 @@ class Scene:
     sampling: Sampling
     reference_ratio: int = 1
     max_contact_points: int = MAX_POINTS
+    variation: Variation | None = None
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -94,7 +93,7 @@ class Scene:
             ValueError: a file that is not there or does not compile, a robot with
                 something not supported (named), or a plane beside another ground.
         """
-        parts = read_mjcf(Path(path), control_step, terrain)
+        parts = importer.read_mjcf(Path(path), control_step, terrain)
         scene = cls._from(name or str(path), *parts, ranges)
         return replace(scene, max_contact_points=max_contact_points)
 
@@ -107,7 +106,7 @@ class Scene:
         Raises:
             ValueError: no such task, or a robot with something not supported (named).
         """
-        env = load_suite(domain, task)
+        env = importer.load_suite(domain, task)
         model = env.physics.model.ptr
         substeps = round(env.control_timestep() / model.opt.timestep)
         return cls._from(f"dm_control/{domain}-{task}", model, substeps, ranges)
@@ -121,8 +120,8 @@ class Scene:
         Raises:
             ValueError: no such environment, or a robot with something not supported.
         """
-        path, frame_skip = gymnasium_file(env_id)
-        model, _ = read_mjcf(path, None)
+        path, frame_skip = importer.gymnasium_file(env_id)
+        model, _ = importer.read_mjcf(path, None)
         return cls._from(f"gymnasium/{env_id}", model, frame_skip, ranges)
 
     @classmethod
@@ -131,7 +130,7 @@ class Scene:
     ) -> "Scene":
         check_supported(name, model)
         controller = ActuatorController.from_model(model)
-        sampling = default_sampling(model, controller, **ranges)
+        sampling = importer.default_sampling(model, controller, **ranges)
         scene = cls(name, model, substeps, controller, sampling)
         terrain = scene.terrain  # refuses a ground without features right away
         if terrain is not None and terrain.is_per_row and not scene.sampling.ground:
@@ -150,17 +149,22 @@ class Scene:
         """The same scene, its control step cut into another number of substeps."""
         model = copy.copy(self.model)
         model.opt.timestep = self.control_step / substeps
-        if integrator is not None:
-            model.opt.integrator = integrator
+        model.opt.integrator = (
+            model.opt.integrator if integrator is None else integrator
+        )
         return replace(self, model=model, substeps=substeps)
+
+    def vary(self, ranges: Ranges) -> "Scene":
+        """The same with such as ``{"mass:pole": (0.3, 3.0)}``, see `Variation`."""
+        varied = Variation(self.model, self.actuated, ranges) if ranges else None
+        return replace(self, variation=varied)
 
     @cached_property
     def reference(self) -> "Scene":
         """The reference solver's scene: MuJoCo's RK4, four substeps in one of its own."""
         if self.reference_ratio > 1:
             return self
-        rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-        finer = self.with_substeps(REFERENCE_RATIO * self.substeps, rk4)
+        finer = self.with_substeps(REFERENCE_RATIO * self.substeps, RK4)
         return replace(finer, reference_ratio=REFERENCE_RATIO)
 
     @cached_property
@@ -260,8 +264,7 @@ class Scene:
             gaps, normals = self._ground(qpos, state.get("terrain"))
             lowest, point = gaps.min(-1)
             normal = normals[torch.arange(len(qpos)), point]  # (rows, 3), in B_t
-            _, rotation = self.base_pose(qpos)
-            up = (rotation @ normal[..., None])[..., 0]
+            up = (self.base_pose(qpos)[1] @ normal[..., None])[..., 0]
             qpos[:, q : q + 3] += (gap - lowest)[:, None] * up
 
     def _ground(self, qpos: Tensor, terrain: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -273,8 +276,7 @@ class Scene:
         points, _ = placed(self.point_kinematics, qpos)(qpos, still)
         ground = placed(self.terrain_distance, qpos)
         distance, normal = ground(points, terrain, *self.base_pose(qpos))
-        radii = placed(self._radii, qpos).get_buffer("radii")
-        return distance - radii, normal
+        return distance - placed(self._radii, qpos).get_buffer("radii"), normal
 
     def base_pose(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
         """World position ``(*batch, 3)`` and rotation ``(*batch, 3, 3)`` of B_t."""

@@ -1,5 +1,6 @@
 """A task: where episodes start, what the policy sees, what it earns, when it ends."""
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.controllers import Controller
+from torchrl_nerd.scenes.variation import Ranges
 
 State = Mapping[str, Tensor]
 """``qpos (*batch, nq)``, ``qvel (*batch, nv)`` and the task's parameters; after a step
@@ -35,6 +37,15 @@ class Task(ABC):
     @abstractmethod
     def build_scene(self) -> Scene:
         """What `scene` keeps; of a registered robot, the same object at every call."""
+
+    def vary(self, ranges: Ranges) -> "Task":
+        """The same task with a scene whose parameters differ, see `Scene.vary`.
+
+        An env draws them for every episode.
+        """
+        twin = copy.copy(self)
+        vars(twin)["scene"] = self.scene.vary(ranges)  # in place of `build_scene`'s
+        return twin
 
     @property
     def controller(self) -> Controller:

@@ -93,11 +93,14 @@ class Symmetry(nn.Module):
     The permutations of `TOKEN` and `TARGET` are found from random states.
 
     Raises:
-        ValueError: see `find_isometries`; a feature that is zero in all of these states.
+        ValueError: see `find_isometries`; a feature that is zero in all of these states;
+            a scene whose parameters differ from row to row.
     """
 
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
         super().__init__()
+        if scene.variation is not None:
+            raise ValueError("expected a varied scene without use_symmetry, got both")
         self.isometries = nn.ModuleList(find_isometries(scene))
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]

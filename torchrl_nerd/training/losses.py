@@ -44,8 +44,12 @@ def rollout_loss(
     command: Tensor,
     terrain: Tensor | None,
     loss_eps: float,
+    parameters: Tensor | None = None,
+    history: int = 0,
 ) -> Tensor:
     """Error of the model's own trajectory, fed back, from an empty history.
+
+    Or after a history of so many recorded steps, whose errors count as well.
 
     Velocity errors are measured in standard deviations of one step's change, position
     errors in what such a change moves in one control step.
@@ -57,18 +61,22 @@ def rollout_loss(
         command: ``(rows, K, m)``, torques or servos' controls.
         terrain: ``(rows, terrain.size)`` or None.
         loss_eps: see `relative_error`.
+        parameters: ``(rows, variation.size)`` or None.
+        history: control steps.
     """
     delta, layout = model.state_delta, model.scene.layout
     scale = model.normalize.std(TARGET)[: layout.nv]
     network = cast(Network, model.network)
     memory = network.empty_memory(len(qpos))
     position, velocity = qpos[:, 0], qvel[:, 0]
-    errors = []
+    errors, told = [], model.scene_features.told(parameters)
     for step in range(command.shape[1]):
+        if step <= history:
+            position, velocity = qpos[:, step], qvel[:, step]
         driven = drive(model.scene, command[:, step], position, velocity)
         position, velocity, _ = model.step(
             (position, velocity),
-            drive_of(*driven),
+            drive_of(*driven, told),
             terrain,
             lambda token: network.step(token, memory),
         )

@@ -20,7 +20,7 @@ from torchrl_nerd.evaluation.policy import (
     make_actor,
     policy_task,
 )
-from torchrl_nerd.keys import ACTION, OBSERVATION, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import ACTION, OBSERVATION, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate
 from torchrl_nerd.settings import expect_at_least
@@ -59,8 +59,10 @@ def policy_data(
     dynamics = MujocoDynamics(scene)
     dynamics.reset(row)
     state: TensorDictBase = row.select(QPOS, QVEL)
+    if scene.variation is not None:
+        state[PARAMETERS] = scene.variation.draw(rows, generator)
     action = torch.zeros(rows, controller.num_actions, dtype=torch.float64)
-    states, commands, recent = [state[:, None]], [], None
+    states, commands, recent = [state.select(QPOS, QVEL)[:, None]], [], None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for step in range(steps):
             if step % task.frame_skip == 0:
@@ -72,10 +74,11 @@ def policy_data(
                 action = (mean + spread * kick).clamp(-1.0, 1.0)
             torque, ctrl = actuate(controller, action, state[QPOS], state[QVEL])
             state = dynamics.step(state, torque, terrain, ctrl)
-            states.append(state[:, None])
+            states.append(state.select(QPOS, QVEL)[:, None])
             command = torque if scene.servos is None or ctrl is None else ctrl
             commands.append(command[:, None])
-    return as_transitions(scene, states, commands, terrain)
+    parameters = state.get(PARAMETERS, None)
+    return as_transitions(scene, states, commands, terrain, parameters)
 
 
 def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, Draw]:

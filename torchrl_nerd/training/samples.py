@@ -13,6 +13,7 @@ from torchrl_nerd.keys import (
     JOINT_TORQUE,
     NEXT_QPOS,
     NEXT_QVEL,
+    PARAMETERS,
     QPOS,
     QVEL,
     TERRAIN,
@@ -30,7 +31,8 @@ def raw_tokens(
 ) -> tuple[Tensor, Tensor]:
     """Unnormalised tokens ``(*batch, F)`` and targets ``(*batch, D)``, float64."""
     state, terrain = (data[QPOS], data[QVEL]), data.get(TERRAIN, None)
-    drive = drive_of(data[JOINT_TORQUE], data.get(CTRL, None))
+    told = tokens.told(data.get(PARAMETERS, None))
+    drive = drive_of(data[JOINT_TORQUE], data.get(CTRL, None), told)
     token = tokens(*state, drive, terrain)
     return token, state_delta.delta(*state, data[NEXT_QPOS], data[NEXT_QVEL])
 

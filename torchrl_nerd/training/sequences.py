@@ -7,7 +7,15 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import (
+    JOINT_TORQUE,
+    NEXT_QPOS,
+    NEXT_QVEL,
+    PARAMETERS,
+    QPOS,
+    QVEL,
+    TERRAIN,
+)
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.scenes.commands import command_of
 from torchrl_nerd.training.augmentation import Symmetry
@@ -95,8 +103,8 @@ class Sequences:
 
     def rollout(
         self, rows: int, length: int, generator: Generator
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """True ``qpos``, ``qvel (rows, length + 1, ...)``, commands and ground."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+        """True ``qpos``, ``qvel (rows, length + 1, ...)``, commands, ground, parameters."""
         row, time_index = self.pick(rows, length, generator)
         batch = cast(TensorDict, self.data[row, time_index])
         if self.symmetry is not None:  # the rows are in no order: a part for each
@@ -106,7 +114,6 @@ class Sequences:
             batch = cast(TensorDict, torch.cat(images))  # pyright: ignore
         qpos = torch.cat((batch[QPOS], batch[NEXT_QPOS][:, -1:]), 1)
         qvel = torch.cat((batch[QVEL], batch[NEXT_QVEL][:, -1:]), 1)
-        terrain = batch.get(TERRAIN, None)
-        if terrain is not None:
-            terrain = terrain[:, 0]  # the same at all times: (rows, terrain.size)
-        return qpos, qvel, command_of(self.scene, batch), terrain
+        first = cast(TensorDict, batch[:, 0])  # these are the same at all times
+        own = first.get(TERRAIN, None), first.get(PARAMETERS, None)  # (rows, size)
+        return qpos, qvel, command_of(self.scene, batch), *own

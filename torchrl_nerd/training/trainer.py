@@ -185,7 +185,7 @@ class Trainer:
         self.ema_share.fill_(1.0 - min(config.ema, self.step / (self.step + 10.0)))
         self.model.train()
         if self.step >= config.steps:
-            sizes = config.rollout_batch_size, config.rollout_length
+            sizes = config.rollout_batch_size, config.rollout_states
             batch = self.sequences.rollout(*sizes, generator)
             return self._follow["rollout"](*batch)
         count, length = config.batch_size, config.sequence_length
@@ -197,7 +197,7 @@ class Trainer:
 
     def _make_losses(self, compile: bool) -> dict[str, Callable[..., Tensor]]:
         """Of a batch of sequences, in two precisions, and of the model's own rollouts."""
-        loss_eps = self.config.loss_eps
+        loss_eps, history = self.config.loss_eps, self.config.rollout_history
 
         def one_step(*batch: Tensor) -> Tensor:
             inputs, targets = Inputs(*batch[:-1]), batch[-1]
@@ -209,7 +209,8 @@ class Trainer:
                 return one_step(*batch)
 
         def rollout(*batch: Any) -> Tensor:
-            return rollout_loss(self.model, *batch, loss_eps=loss_eps)
+            how = {"loss_eps": loss_eps, "parameters": batch[-1], "history": history}
+            return rollout_loss(self.model, *batch[:-1], **how)
 
         losses = {"one_step": one_step, "bfloat16": coarse}
         if compile:

@@ -27,6 +27,12 @@ PRESET = Preset(
         bf16_fraction=0.9,
     ),
     task="ant/run",
+    variation={
+        "payload:torso": (0.0, 20.0),
+        "motor": (0.6, 1.2),
+        "damping": (0.0, 5.0),
+        "friction": (0.3, 1.5),
+    },
 )
 # As in the paper's reference code (rl_games), except that its step size follows the
 # policy's KL divergence; here it falls linearly.

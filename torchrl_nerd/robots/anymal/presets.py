@@ -19,6 +19,13 @@ PRESET = Preset(
         bf16_fraction=0.8,
     ),
     task="anymal/forward",
+    variation={
+        "payload:base": (0.0, 10.0),
+        "payload_x:base": (-0.2, 0.2),
+        "motor": (0.7, 1.2),
+        "frictionloss": (0.0, 2.0),
+        "friction": (0.3, 1.5),
+    },
 )
 # As in the paper's reference code (rl_games), except that its step size follows the
 # policy's KL divergence; here it falls linearly.

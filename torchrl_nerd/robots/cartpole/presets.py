@@ -18,6 +18,13 @@ PRESET = Preset(
     DataConfig(trajectories=20_000, steps=100),
     TrainConfig(steps=30_000, rollout_steps=3_000, single_step_fraction=0.0),
     task="cartpole/swingup",
+    variation={
+        "mass:cart": (0.5, 2.0),
+        "mass:pole": (0.3, 3.0),
+        "damping:slider": (0.0, 20.0),
+        "damping:hinge": (0.0, 1.0),
+        "motor": (0.6, 1.4),
+    },
 )
 ROBOT = Robot(
     scenes={"cartpole": cartpole},

@@ -37,6 +37,14 @@ PRESET = Preset(
     task="double_pendulum/passive",
     strategy="level",
     exports="last",  # passive starts, which validate, say little about driven motion
+    variation={
+        "mass:link1": (0.5, 2.0),
+        "mass:link2": (0.5, 2.0),
+        "damping:joint1": (0.0, 20.0),
+        "damping:joint2": (0.0, 20.0),
+        "motor": (0.6, 1.4),
+        "friction": (0.2, 2.0),
+    },
 )
 ROBOT = Robot(
     scenes={"double_pendulum": double_pendulum},

@@ -44,6 +44,12 @@ def _protocol(task: Task) -> EvaluationProtocol:
     return EvaluationProtocol({"random": task}, (128,), random_actions=("random",))
 
 
+VARIATION = {
+    "payload:link7": (0.0, 3.0),
+    "damping": (0.0, 5.0),
+    "frictionloss": (0.0, 2.0),
+    "motor": (0.8, 1.2),
+}
 ROBOT = Robot(
     scenes={"franka": franka, "franka_gravity": franka_gravity},
     tasks={
@@ -54,7 +60,11 @@ ROBOT = Robot(
     },
     presets={
         "franka": Preset(
-            _protocol(FrankaReachTorque()), DATA, TRAIN, task="franka/reach_torque"
+            _protocol(FrankaReachTorque()),
+            DATA,
+            TRAIN,
+            task="franka/reach_torque",
+            variation=VARIATION,
         ),
         "franka_gravity": Preset(
             _protocol(FrankaGravityReachTorque()),
@@ -62,6 +72,7 @@ ROBOT = Robot(
             replace(TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500),
             task="franka_gravity/reach_torque",
             strategy="correlated",
+            variation=VARIATION,
         ),
     },
     ppo={

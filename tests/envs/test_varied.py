@@ -1,0 +1,145 @@
+"""Envs of a robot with hidden parameters: drawn anew, read by MuJoCo alone, warmed up."""
+
+import pickle
+
+import pytest
+import torch
+from dynamics_helpers import (
+    act_all,
+    assert_same_motion,
+    double_model,
+    random_actions,
+    random_mask,
+    reset_rows,
+    start_at,
+    unequal_keys,
+)
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
+from torchrl_nerd.robots import load_scene, make_task
+from torchrl_nerd.tasks import SceneTask
+
+ROWS, STEPS = 5, 7
+RANGES = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4), "delay": (0, 2)}
+TASKS = {
+    "cartpole": lambda: make_task("cartpole/swingup").vary(RANGES),
+    "franka, two steps an action": lambda: make_task("franka/reach").vary(
+        {"payload:link7": (0.0, 3.0), "delay": (1, 3)}
+    ),
+    "scene": lambda: SceneTask(load_scene("double_pendulum").vary({"mass": (0.5, 2)})),
+}
+
+
+@pytest.fixture(params=TASKS)
+def task(request):
+    return TASKS[request.param]()
+
+
+def test_specs_hold(task):
+    check_env_specs(GroundTruthEnv(task, num_envs=ROWS, seed=0))
+
+
+def test_every_episode_has_its_own_and_starts_as_it_did(task):
+    env = GroundTruthEnv(task, num_envs=ROWS, seed=0)
+    many = GroundTruthEnv(task, num_envs=2 * ROWS, seed=0)
+    first, again = env.reset(), env.reset()
+    seen = torch.cat((first[PARAMETERS], again[PARAMETERS]))
+    assert len(seen[:, 0].unique()) == 2 * ROWS
+    low, high = torch.tensor(list(task.scene.variation.ranges.values())).double().T
+    assert (seen >= low).all() and (seen <= high).all()
+    assert torch.equal(many.reset()[:ROWS][PARAMETERS], first[PARAMETERS])
+    alike = GroundTruthEnv(task.vary({}), num_envs=ROWS, seed=0)
+    assert PARAMETERS not in alike.state_spec.keys()
+    assert torch.equal(alike.reset()[QPOS], first[QPOS])
+
+
+def test_an_env_moves_as_its_parameters_say(task, generator):
+    env = GroundTruthEnv(task, num_envs=ROWS, seed=0)
+    start = env.reset()
+    actions = random_actions(env, STEPS, generator)
+    path = act_all(env, actions)
+    dynamics, terrain = MujocoDynamics(task.scene), start.get("terrain", None)
+    state = start.select(QPOS, QVEL, PARAMETERS)
+    dynamics.reset(state)
+    for step, action in enumerate(actions):
+        for _ in range(task.frame_skip):
+            torque = task.controller(action, state[QPOS], state[QVEL])
+            state = dynamics.step(state, torque, terrain)
+        for key in (QPOS, QVEL, PARAMETERS):
+            assert torch.equal(path[:, step][key], state[key])
+
+
+def test_given_parameters_are_kept_until_the_next_reset(task, generator):
+    env = GroundTruthEnv(task, num_envs=ROWS, seed=0)
+    start = env.reset().select(*env.state_spec.keys())
+    actions = random_actions(env, STEPS, generator)
+    expected = act_all(env, actions)
+    other = GroundTruthEnv(task, num_envs=ROWS, seed=1)
+    start_at(other, start)
+    assert not unequal_keys(act_all(other, actions), expected)
+    rows = random_mask(ROWS, generator)
+    reset_rows(other, rows)
+    changed = (other.state[PARAMETERS] != start[PARAMETERS]).any(1)
+    assert torch.equal(changed, rows)
+
+
+def test_the_past_of_a_late_torque_travels(generator):
+    """Through pickle, and back in time, in the middle of a motion."""
+    scene = load_scene("cartpole").vary({"delay": (2, 2)})
+    dynamics, state = MujocoDynamics(scene), scene.sample_initial(ROWS, generator)[0]
+    state = TensorDict(
+        state | {PARAMETERS: scene.variation.draw(ROWS, generator)}, ROWS
+    )
+    torques = 1000.0 * torch.rand(6, ROWS, 1, generator=generator).double()
+    dynamics.reset(state)
+    for torque in torques[:3]:
+        state = dynamics.step(state, torque)
+    past, twin = dynamics.history(), pickle.loads(pickle.dumps(dynamics))
+    paths = []
+    for each in (dynamics, twin, dynamics):
+        now = state
+        for torque in torques[3:]:
+            now = each.step(now, torque)
+        paths.append(now)
+        dynamics.restore(past, torch.ones(ROWS, dtype=torch.bool))
+    fresh = MujocoDynamics(scene)
+    fresh.reset(state)
+    forgotten = fresh.step(state, torques[3])
+    assert not unequal_keys(paths[1], paths[0])
+    assert not unequal_keys(paths[2], paths[0])
+    assert not torch.equal(forgotten[QVEL], dynamics.step(state, torques[3])[QVEL])
+
+
+@pytest.mark.parametrize("network", ["transformer-2x64", "gru"])
+def test_a_warm_env_goes_on_as_if_it_had_seen_the_motion(network, generator):
+    """Streamed past and present are one stream; a partial reset forgets for its rows."""
+    model = double_model(load_scene("cartpole"), generator, network)
+    task = make_task("cartpole/swingup")
+    whole, cold, warm = (NeRDEnv(task, model, ROWS, seed=0) for _ in range(3))
+    actions = 0.1 * random_actions(whole, 2 * STEPS, generator)
+    start = whole.reset()
+    path = act_all(whole, actions)
+    states = torch.cat((start[:, None].select(QPOS, QVEL), path.select(QPOS, QVEL)), 1)
+    history = states[:, :STEPS].clone()
+    history[JOINT_TORQUE] = path["joint_torque"][:, :STEPS]
+    rows = random_mask(ROWS, generator)
+    for env in (cold, warm):
+        start_at(TransformedEnv(env), states[:, STEPS])
+    warm.warm_up(history)
+    assert torch.equal(warm.state[QPOS], states[:, STEPS][QPOS])
+    warm.dynamics.reset(warm.state, rows)
+    late = [act_all(env, actions[STEPS:]) for env in (cold, warm)]
+    assert_same_motion(late[1][~rows], path[~rows][:, STEPS:], 1e-9)
+    assert_same_motion(late[1][rows], late[0][rows], 1e-9)
+    assert not torch.allclose(late[0][QVEL][~rows], late[1][QVEL][~rows], rtol=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["dm_control"])
+def test_engines_of_one_robot_refuse(engine):
+    with pytest.raises(ValueError, match="expected MuJoCo for the varied scene"):
+        GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), engine)

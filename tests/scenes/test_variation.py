@@ -1,0 +1,138 @@
+"""Names, ranges and draws of hidden parameters; what they do to a model's constants."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_nerd.robots import PRESETS, load_scene
+from torchrl_nerd.scenes.variation import Variation
+
+DRAWS = 2000
+
+
+def variation(name: str, ranges: dict):
+    return load_scene(name).vary(ranges).variation
+
+
+def test_draws_fill_their_ranges(generator):
+    ranges = {"mass:pole": (0.25, 4.0), "damping:hinge": (-0.0, 2.0), "delay": (1, 3)}
+    drawn = variation("cartpole", ranges).draw(DRAWS, generator)
+    factor, damping, delay = drawn.unbind(-1)
+    for value, (low, high) in zip((factor, damping), ranges.values(), strict=False):
+        width = high - low
+        assert low <= value.min() < low + 0.02 * width
+        assert high - 0.02 * width < value.max() <= high
+    # log-uniform: as many below 1 as above it
+    assert abs((factor < 1.0).double().mean() - 0.5) < 0.06
+    assert abs((damping < 1.0).double().mean() - 0.5) < 0.06
+    counts = torch.stack([(delay == k).sum() for k in (1, 2, 3)])
+    assert counts.sum() == DRAWS and counts.min() > DRAWS / 4
+
+
+def test_shares_are_where_a_parameter_lies_in_its_range():
+    found = variation("cartpole", {"mass:pole": (0.25, 4.0), "slope:x": (0.0, 0.2)})
+    u = torch.tensor([[0.0, 0.0], [0.5, 0.5], [1.0, 0.25]], dtype=torch.float64)
+    torch.testing.assert_close(found.shares(found.values(u)), 2.0 * u - 1.0)
+
+
+def test_a_payload_is_a_small_heavy_body(generator):
+    """The mass matrix is that of a model with one more body, a tiny sphere."""
+    scene = load_scene("ant").vary(
+        {
+            "payload:torso": (2.0, 9.0),
+            **{f"payload_{x}:torso": (-0.4, 0.4) for x in "xyz"},
+        }
+    )
+    [given] = scene.variation.draw(1, generator)
+    path = "torchrl_nerd/robots/ant/ant.xml"
+    spec = mujoco.MjSpec.from_file(path)
+    load = spec.body("torso").add_body(name="load", pos=given[1:].tolist())
+    load.mass, load.inertia = float(given[0]), [1e-9] * 3
+    load.ipos, load.explicitinertial = [0.0] * 3, True
+    other, own = spec.compile(), scene.variation.model_of(given)
+    matrices = []
+    for model in (own, other):
+        data = mujoco.MjData(model)
+        data.qpos[3:7] = [0.5, 0.5, -0.5, 0.5]
+        data.qpos[7:] = np.linspace(-1.0, 1.0, 8)
+        mujoco.mj_forward(model, data)
+        dense = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, dense)
+        matrices.append((dense, data.qfrc_bias.copy()))
+    for a, b in zip(*matrices, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.5])
+def test_a_slope_is_steep_where_friction_does_not_hold(friction):
+    """A cube rests on ground that rises by less than its friction, and slides on more."""
+    scene = load_scene("cube")
+    found = scene.vary({"slope:x": (0.0, 0.6), "friction": (0.01, 10.0)}).variation
+    speeds = []
+    for angle in (0.8 * np.arctan(friction), 1.3 * np.arctan(friction)):
+        own = [angle, friction / 0.15]
+        model = found.model_of(torch.tensor(own, dtype=torch.float64))
+        data = mujoco.MjData(model)
+        data.qpos[2] = 0.0524
+        mujoco.mj_step(model, data, nstep=3000)
+        speeds.append(-data.qvel[0])
+        assert np.isclose(np.linalg.norm(model.opt.gravity), 9.81)
+    assert abs(speeds[0]) < 0.05 < 0.3 < speeds[1]  # creep, and a slide
+
+
+def test_stiffness_keeps_the_damping_ratio():
+    """Of both forms of MuJoCo's solref: the penetration at rest divides by the factor."""
+    xml = """<mujoco><default><geom solimp="0.9 0.9 0.001" solref="{0}"/></default>
+    <worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .1"><freejoint/>
+    <geom size=".1"/></body></worldbody></mujoco>"""
+    for solref in ("0.02 0.7", "-2000 -80"):
+        model = mujoco.MjModel.from_xml_string(xml.format(solref))
+        stiffer = Variation(model, [], {"stiffness": (4.0, 4.0)})
+        own = stiffer.model_of(torch.full((1,), 4.0, dtype=torch.float64))
+        depths = []
+        for each in (model, own):
+            data = mujoco.MjData(each)
+            mujoco.mj_step(each, data, nstep=3000)
+            depths.append(0.1 - data.qpos[2])
+        assert depths[0] / depths[1] == pytest.approx(4.0, rel=0.05)
+
+
+def test_nothing_varied_leaves_hash_and_model_alone():
+    scene = load_scene("ant")
+    before = copy.copy(scene.model)
+    varied = scene.vary({"mass": (0.5, 2.0), "friction": (0.1, 1.0)})
+    varied.variation.model_of(torch.tensor([2.0, 0.5], dtype=torch.float64))
+    assert varied.hash == scene.hash and varied.vary({}).variation is None
+    np.testing.assert_array_equal(scene.model.body_mass, before.body_mass)
+    np.testing.assert_array_equal(scene.model.geom_friction, before.geom_friction)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_name_what_is_there(name):
+    scene = load_scene(name).vary(PRESETS[name].variation)
+    assert (scene.variation is None) == (not PRESETS[name].variation)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({"weight:pole": (1, 2)}, "expected a kind of mass"),
+        ({"mass:poel": (1, 2)}, "expected a body of world, cart, pole"),
+        ({"mass:pole": (2, 1)}, "possible range for 'mass:pole', got 2:1"),
+        ({"mass:pole": (0, 1)}, "possible range"),
+        ({"damping:hinge": (-1, 1)}, "possible range"),
+        ({"damping:hinge": (0, float("inf"))}, "possible range"),
+        ({"delay": (0.5, 2)}, "possible range"),
+        ({"delay:slider": (0, 2)}, "without a target"),
+        ({"motor:hinge": (0.5, 2)}, "a joint with a motor"),
+        ({"payload_x:pole": (0, 1)}, "expected 'payload:pole' beside"),
+        ({"slope": (0, 1)}, "slope:x or slope:y"),
+    ],
+)
+def test_what_cannot_be_is_refused(ranges, words):
+    with pytest.raises(ValueError, match=words) as raised:
+        load_scene("cartpole").vary(ranges)
+    assert "\n" not in str(raised.value)

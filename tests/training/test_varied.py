@@ -1,0 +1,123 @@
+"""Models of varied robots: told their parameters or not, trained after a history."""
+
+import pytest
+import torch
+
+from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd.cli import main
+from torchrl_nerd.configs import FeatureConfig, TrainConfig
+from torchrl_nerd.data.generate import is_sound
+from torchrl_nerd.data.simulate import simulate
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import NETWORKS
+from torchrl_nerd.robots import load_scene, source_of
+from torchrl_nerd.training.losses import rollout_loss
+from torchrl_nerd.training.samples import data_stats
+from torchrl_nerd.training.trainer import Trainer
+
+SCENE = load_scene("cartpole").vary({"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4)})
+TOLD = FeatureConfig(parameters=True)
+LOSS_EPS = 0.01
+
+
+@pytest.fixture
+def data(generator):
+    found = simulate(SCENE, 24, 20, generator)
+    return found[is_sound(found)]
+
+
+def model_of(data, network="transformer-2x64", features=TOLD):
+    stats = data_stats(SCENE, data, features)
+    return NeRD(SCENE, features, NETWORKS[network], stats).eval()
+
+
+def test_only_a_told_model_sees_the_parameters(data):
+    for features, is_seen in ((TOLD, True), (FeatureConfig(), False)):
+        dynamics = NeRDDynamics(model_of(data, "mlp-2x32", features))
+        state, torque = (
+            data[:, 0].select(QPOS, QVEL, PARAMETERS),
+            data[:, 0][JOINT_TORQUE],
+        )
+        other = state.clone()
+        other[PARAMETERS] *= 1.1
+        after, changed = (dynamics.step(s, torque) for s in (state, other))
+        assert torch.equal(after[QVEL], changed[QVEL]) != is_seen
+        assert torch.equal(changed[PARAMETERS], other[PARAMETERS])
+    with pytest.raises(ValueError, match="expected parameters in the state, got none"):
+        NeRDDynamics(model_of(data)).step(data[:, 0].select(QPOS, QVEL), torque)
+    with pytest.raises(ValueError, match="expected a varied scene for a told"):
+        NeRD(load_scene("cartpole"), TOLD, NETWORKS["mlp-2x32"])
+
+
+def test_a_rollout_sees_true_states_first_and_then_its_own(data):
+    model, history, seen, made = model_of(data), 4, [], []
+    step = model.step
+
+    def watched(state, *args):
+        seen.append(state[1])
+        found = step(state, *args)
+        made.append(found[1])
+        return found
+
+    model.step = watched
+    qpos = torch.cat((data[QPOS], data["next", QPOS][:, -1:]), 1)
+    qvel = torch.cat((data[QVEL], data["next", QVEL][:, -1:]), 1)
+    batch = qpos, qvel, data[JOINT_TORQUE], None
+    loss = rollout_loss(model, *batch, LOSS_EPS, data[PARAMETERS][:, 0], history)
+    assert loss.isfinite() and len(seen) == data.batch_size[1]
+    for t, state in enumerate(seen):
+        assert torch.equal(state, qvel[:, t]) == (t <= history)
+        assert t == 0 or torch.equal(state, made[t - 1]) == (t > history)
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_trained_model_comes_back_with_its_variation(is_told, data, tmp_path):
+    config = TrainConfig(
+        network="mlp-2x32",
+        parameters=is_told,
+        steps=4,
+        rollout_steps=2,
+        rollout_history=3,
+        rollout_length=2,
+        batch_size=4,
+        rollout_batch_size=4,
+        single_step_fraction=0.0,
+        validate_every=6,
+    )
+    how = {"horizons": (2,), "quiet": True, "logger": "csv"}
+    Trainer(SCENE, data, source_of(SCENE), config, tmp_path, **how).run()
+    model = load_checkpoint(tmp_path / "last")
+    assert model.scene.variation.ranges == SCENE.variation.ranges
+    assert model.scene_features.size == 6 + 1 + 2 * is_told
+    if is_told:
+        with pytest.raises(ValueError, match="expected a varied scene"):
+            load_checkpoint(tmp_path / "last", load_scene("cartpole"))
+    else:
+        assert load_checkpoint(tmp_path / "last", load_scene("cartpole"))
+
+
+def test_symmetry_images_of_varied_robots_are_refused(data, tmp_path):
+    config = TrainConfig(use_symmetry=True)
+    with pytest.raises(ValueError, match="varied scene without use_symmetry"):
+        Trainer(SCENE, data, SCENE, config, tmp_path)
+
+
+def test_the_command_line_varies_data_and_training(tmp_path, capsys):
+    where = tmp_path / "data"
+    vary = ("--vary", "preset", "mass:pole=1:1")
+    made = ("--trajectories", "4", "--steps", "12", "--out", str(where), "--quiet")
+    assert main(["data", "cartpole", *vary, *made]) == 0
+    tiny = ("--steps", "2", "--rollout-steps", "0", "--sequence-length", "8")
+    run = ("--out", str(tmp_path / "run"), "--data", str(where), "--quiet")
+    how = ("--network", "transformer-2x64@8", "--logger", "csv", *tiny, *run)
+    assert main(["train", "cartpole", *vary, *how]) == 0
+    card = load_checkpoint(tmp_path / "run" / "last").scene.variation.ranges
+    assert card["mass:pole"] == [1.0, 1.0] and card["motor"] == [0.6, 1.4]
+    capsys.readouterr()
+    for bad in ("mass:pole", "mass:pole=1", "mass:pole=a:b", "mass:rod=1:2"):
+        assert (
+            main(["data", "cartpole", "--vary", bad, "--out", str(tmp_path / "x")]) == 2
+        )
+        assert capsys.readouterr().err.count("\n") == 1

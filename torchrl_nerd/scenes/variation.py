@@ -1,0 +1,237 @@
+"""Physical parameters that differ from row to row and that no feature tells.
+
+A parameter is named ``KIND`` or ``KIND:TARGET``. With V its value:
+
+| kind | target | value | what the row's robot has |
+|---|---|---|---|
+| ``mass`` | body | factor | mass and inertia times V |
+| ``payload`` | body | kg | a point mass V, at the centre of mass |
+| ``payload_x``, ``payload_y``, ``payload_z`` | body | m, body frame | or at this place |
+| ``com_x``, ``com_y``, ``com_z`` | body | m, body frame | centre of mass moved by V |
+| ``damping`` | joint | N s/m, N m s/rad | damping V |
+| ``frictionloss`` | joint | N, N m | dry friction V |
+| ``armature`` | joint | kg, kg m^2 | armature V |
+| ``motor`` | joint | factor | the strength of its motors times V |
+| ``delay`` | | control steps | every torque V steps later, none before the first |
+| ``friction`` | geom | factor | sliding, torsional and rolling friction times V |
+| ``stiffness`` | geom | factor | contact stiffness times V, the same damping ratio |
+| ``slope`` | ``x``, ``y`` | rad | ground that rises along the axis: gravity turns |
+
+Without a target: all bodies that move, all joints, all geoms. Of two geoms in contact
+MuJoCo takes the greater friction, unless one has a higher priority, as the geoms of this
+package's robots have. Factors are drawn log-uniform, all other values uniform.
+"""
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import isfinite
+
+import mujoco
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.scenes.parameter_kinds import KINDS, MOTOR, Fields, Kind
+
+Ranges = Mapping[str, Sequence[float]]
+"""Name of each parameter -> lowest and highest value."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a `Variation`; ``indices`` of its target's bodies, dofs, geoms."""
+
+    name: str
+    low: float
+    high: float
+    indices: list[int]
+
+    @property
+    def kind(self) -> str:
+        """The part of its name before the colon."""
+        return self.name.partition(":")[0]
+
+    @property
+    def unit(self) -> str:
+        """Such as ``"kg"``, or ``"factor"``."""
+        return KINDS[self.kind].unit
+
+    @property
+    def is_factor(self) -> bool:
+        """Whether it multiplies what the robot has."""
+        return self.unit == "factor"
+
+
+class Variation:
+    """Named parameters of a robot and their ranges; see the table of this file.
+
+    Args:
+        model: of the robot.
+        actuated: its actuated dofs, in the order of the joint torques.
+        ranges: of each parameter.
+
+    Raises:
+        ValueError: in one sentence, a kind or target that is not there, a range that
+            cannot be, or a payload's place without a payload.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, actuated: list[int], ranges: Ranges
+    ) -> None:
+        self.model, self.actuated = model, actuated
+        self.parameters = [_parameter(model, *item) for item in ranges.items()]
+        self._columns = {p.name: i for i, p in enumerate(self.parameters)}
+        for parameter in self.parameters:
+            kind, _, target = parameter.name.partition(":")
+            if kind.startswith("payload_") and f"payload:{target}" not in ranges:
+                raise ValueError(
+                    f"expected 'payload:{target}' beside '{parameter.name}', got none"
+                )
+            has_motors = set(parameter.indices) <= set(actuated)
+            if kind == "motor" and target and not has_motors:
+                raise ValueError(
+                    f"expected a joint with a motor, got '{parameter.name}'"
+                )
+
+    @property
+    def size(self) -> int:
+        """How many parameters there are."""
+        return len(self.parameters)
+
+    @property
+    def ranges(self) -> dict[str, list[float]]:
+        """Lowest and highest value of each, as cards have them."""
+        return {p.name: [p.low, p.high] for p in self.parameters}
+
+    @cached_property
+    def max_delay(self) -> int:
+        """Longest delay of a torque, control steps."""
+        return int(sum(p.high for p in self.parameters if p.kind == "delay"))
+
+    def values(self, u: Tensor) -> Tensor:
+        """Parameters ``(*batch, size)`` from as many uniform numbers in [0, 1)."""
+        values = []
+        for p, share in zip(self.parameters, u.unbind(-1), strict=True):
+            if p.is_factor:
+                values.append(p.low * (p.high / p.low) ** share)
+            elif p.kind == "delay":
+                values.append((p.low + (p.high - p.low + 1.0) * share).floor())
+            else:
+                values.append(p.low + (p.high - p.low) * share)
+        return torch.stack(values, -1)
+
+    def draw(self, rows: int, generator: Generator) -> Tensor:
+        """Random parameters ``(rows, size)``, float64."""
+        shape = (rows, self.size)
+        u = torch.rand(shape, dtype=torch.float64, generator=generator)
+        return self.values(u)
+
+    def shares(self, parameters: Tensor) -> Tensor:
+        """Where parameters ``(*batch, size)`` lie in their ranges: -1 to 1."""
+        shares = []
+        for p, value in zip(self.parameters, parameters.unbind(-1), strict=True):
+            low, high = p.low, p.high
+            if p.is_factor:
+                low, high, value = np.log(low), np.log(high), value.log()
+            shares.append((2.0 * value - low - high) / max(high - low, 1e-9))
+        return torch.stack(shares, -1)
+
+    def fields(self, parameters: np.ndarray) -> Fields:
+        """The fields of MuJoCo's model that change, ``(rows, ...)`` each.
+
+        ``parameters (rows, size)``; what acts on joint torques is in `strength`, `delay`.
+        """
+        fields = Fields(self.model, len(parameters))
+        for kind, about in KINDS.items():
+            for i, p in self._of_kind(kind):
+                value, indices = parameters[:, i : i + 1], p.indices
+                if kind == "payload":
+                    target = p.name.partition(":")[2]
+                    places = [self._columns.get(f"payload_{x}:{target}") for x in "xyz"]
+                    none = np.full(len(parameters), np.nan)
+                    at = [none if j is None else parameters[:, j] for j in places]
+                    value = np.column_stack((value, *at))
+                if about.write is not None:
+                    about.write(fields, indices, value)
+                elif kind == "motor":
+                    is_on = np.isin(self._motor_dofs, indices)
+                    MOTOR(fields, np.flatnonzero(is_on).tolist(), value)
+        return fields
+
+    def strength(self, parameters: np.ndarray) -> np.ndarray:
+        """Factor of every joint torque, ``(rows, num_actuated)``."""
+        factor = np.ones((len(parameters), len(self.actuated)))
+        for i, p in self._of_kind("motor"):
+            factor[:, np.isin(self.actuated, p.indices)] *= parameters[:, i : i + 1]
+        return factor
+
+    def delay(self, parameters: np.ndarray) -> np.ndarray:
+        """Control steps by which every torque is late, whole numbers ``(rows,)``."""
+        late = np.zeros(len(parameters))
+        for i, _ in self._of_kind("delay"):
+            late += parameters[:, i]
+        return late.astype(int)
+
+    def model_of(self, parameters: Tensor) -> mujoco.MjModel:
+        """A model of its own for one row's parameters ``(size,)``."""
+        model = copy.copy(self.model)
+        for name, value in self.fields(parameters.numpy()[None]).items():
+            owner = model.opt if name.startswith("opt.") else model
+            getattr(owner, name.removeprefix("opt."))[...] = value[0]
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+    def _of_kind(self, kind: str) -> Iterator[tuple[int, Parameter]]:
+        return ((i, p) for i, p in enumerate(self.parameters) if p.kind == kind)
+
+    @cached_property
+    def _motor_dofs(self) -> np.ndarray:
+        """The dof that each actuator drives."""
+        return self.model.jnt_dofadr[self.model.actuator_trnid[:, 0]]
+
+
+def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Parameter:
+    """A parameter and its target's indices; refuses what cannot be."""
+    kind, _, target = name.partition(":")
+    if kind not in KINDS:
+        raise ValueError(f"expected a kind of {', '.join(KINDS)}, got '{name}'")
+    about, (low, high) = KINDS[kind], (float(x) for x in given)
+    least = np.nextafter(0.0, 1.0) if about.unit == "factor" else about.least
+    is_whole = kind != "delay" or (low.is_integer() and high.is_integer())
+    if not (least <= low <= high and isfinite(low) and isfinite(high) and is_whole):
+        raise ValueError(
+            f"expected a possible range for '{name}', got {low:g}:{high:g}"
+        )
+    return Parameter(name, low, high, _indices(model, about, target, name))
+
+
+def _indices(model: mujoco.MjModel, kind: Kind, target: str, name: str) -> list[int]:
+    """Bodies, dofs or geoms of a target, or of all; of an axis its number."""
+    if kind.target == "axis":
+        if target not in ("x", "y") or model.opt.gravity[:2].any():
+            raise ValueError(
+                f"expected slope:x or slope:y on level ground, got '{name}'"
+            )
+        return ["xy".index(target)]
+    if kind.target == "":
+        if target:
+            raise ValueError(f"expected 'delay' without a target, got '{name}'")
+        return []
+    every = {
+        "body": model.body_dofnum[model.body_weldid] > 0,
+        "joint": np.isin(model.jnt_type, (HINGE, SLIDE)),
+        "geom": np.ones(model.ngeom, bool),
+    }[kind.target]
+    chosen = np.flatnonzero(every)
+    if target:
+        names = [getattr(model, kind.target)(i).name for i in range(len(every))]
+        if target not in names:
+            known = ", ".join(filter(None, names)) or "none"
+            raise ValueError(f"expected a {kind.target} of {known}, got '{name}'")
+        chosen = [names.index(target)]
+    if kind.target == "joint":
+        chosen = np.flatnonzero(np.isin(model.dof_jntid, chosen))  # its dofs
+    return [int(i) for i in chosen]

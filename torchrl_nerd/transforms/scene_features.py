@@ -1,0 +1,40 @@
+"""All that a model sees of a state: robot, torques, contacts, and what it is told."""
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
+from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.transforms.contact_features import ContactFeatures
+from torchrl_nerd.transforms.robot_centric import RobotCentric
+
+
+class SceneFeatures(nn.Module):
+    """`RobotCentric`, drive and `ContactFeatures` of a state, concatenated."""
+
+    def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
+        super().__init__()
+        self.config = config
+        self.robot = RobotCentric(scene, config)
+        self.contact = ContactFeatures(scene, config)
+        self.size = sum((*self.robot.sizes.values(), *self.contact.sizes.values()))
+        self.variation = scene.variation if config.parameters else None
+        if config.parameters and self.variation is None:
+            raise ValueError(
+                f"expected a varied scene for a told model, got '{scene.name}'"
+            )
+        self.size += 0 if self.variation is None else self.variation.size
+
+    def told(self, parameters: Tensor | None) -> Tensor | None:
+        """What a model that is told the row's parameters gets of them; else None."""
+        if self.variation is None or parameters is None:
+            return None
+        return self.variation.shares(parameters)
+
+    def forward(
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
+    ) -> Tensor:
+        """Raw features ``(*batch, F)`` in the dtype of the state."""
+        state = self.robot.state_features(qpos, qvel)
+        contacts = self.contact.contact_features(qpos, qvel, terrain, drive)
+        return torch.cat((state, drive, *contacts), -1)
