@@ -10,7 +10,13 @@ from torchrl_nerd.transforms.robot_centric import RobotCentric
 
 
 class SceneFeatures(nn.Module):
-    """`RobotCentric`, drive and `ContactFeatures` of a state, concatenated."""
+    """`RobotCentric`, drive and `ContactFeatures` of a state, concatenated.
+
+    The drive is joint torques, servos' controls and what the model is told, see `drive_of`.
+
+    Raises:
+        ValueError: a model that is told parameters, of a scene that does not vary.
+    """
 
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
         super().__init__()
