@@ -58,6 +58,27 @@ ARM = """
   </body></worldbody><actuator><motor joint="elbow"/></actuator></mujoco>"""
 """Ball and hinge on a mount, fixed and turned, over a fixed and tilted plane."""
 
+PROPS = FLOATER.replace(
+    '<body pos="0 0 0.5"><freejoint/>',
+    """<body name="ball" pos="1 0 0.3"><freejoint/>
+    <geom type="ellipsoid" size="0.1 0.15 0.2" mass="0.5"/></body>
+  <body pos="0 1 0.2" quat="0.9 0.2 -0.1 0.3"><body pos="0 0.1 0">
+    <joint name="door" type="hinge" axis="0 0.1 1" pos="0.1 0 0"/>
+    <geom type="box" size="0.3 0.02 0.4" pos="0.2 0 0" mass="2"/></body></body>
+  <body pos="0 0 0.5"><freejoint/>""",
+)
+"""The floater behind a loose ball, which it is no base of, and a door in the world."""
+
+TABLE = ARM.replace(
+    "</worldbody>",
+    """<body name="cube" pos="0.6 -0.2 0.6"><freejoint/>
+    <geom type="box" size="0.1 0.12 0.15" mass="0.3" contype="2" conaffinity="3"/></body>
+  <body pos="0.4 -1 0.6"><joint type="ball"/>
+    <geom type="capsule" size="0.05 0.2" mass="0.3" conaffinity="2"/></body>
+  </worldbody>""",
+)
+"""The arm, a loose cube and a pendulum."""
+
 
 def slow_but(quick: Iterable[Any], names: Iterable[Any]) -> list:
     """All names for `pytest.mark.parametrize`; those that are not quick, marked slow."""
@@ -83,14 +104,15 @@ def make_scene(model: mujoco.MjModel | str, name: str = "handmade") -> Scene:
     return Scene(name, model, 2, TorqueController(torque), sampling)
 
 
-HANDMADE = {"floater": make_scene(FLOATER, "floater"), "arm": make_scene(ARM, "arm")}
+FILES = {"floater": FLOATER, "arm": ARM, "props": PROPS, "table": TABLE}
+HANDMADE = {name: make_scene(xml, name) for name, xml in FILES.items()}
 
 every_scene = pytest.mark.parametrize(
     "scene",
     [*(load_scene(name) for name in SCENES), *HANDMADE.values()],
     ids=[*SCENES, *HANDMADE],
 )
-"""All registered scenes, one with a floating base and one with a ball joint."""
+"""All registered scenes, robots with a floating base and a ball joint, and with props."""
 
 
 def random_states(
@@ -167,6 +189,14 @@ def yaw_quat(yaw: float) -> Tensor:
     return torch.tensor([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
 
 
+def free_joints(scene: Scene) -> dict[int, int]:
+    """Addresses in qpos of all free joints, and in qvel."""
+    model = scene.model
+    free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    places = model.jnt_qposadr[free].tolist(), model.jnt_dofadr[free].tolist()
+    return dict(zip(*places, strict=True))
+
+
 def moved_scene(scene: Scene, yaw: float, shift: Tensor) -> Scene:
     """The scene with all that is fixed in its world turned about gravity and shifted."""
     model, turn = copy.copy(scene.model), yaw_quat(yaw)
@@ -181,8 +211,7 @@ def moved_scene(scene: Scene, yaw: float, shift: Tensor) -> Scene:
         if model.body_parentid[body] == 0 and model.body_mocapid[body] < 0
     ]
     model.geom_sameframe[model.geom_bodyid == 0] = 0  # or MuJoCo skips the new pose
-    if scene.base.is_floating:  # its place at rest, or it would lie deep in the ground
-        q = scene.base.qpos_address
+    for q in free_joints(scene):  # places at rest, or deep in the ground
         fixed.append(
             (model.qpos0[None, q : q + 3], model.qpos0[None, q + 3 : q + 7], 0)
         )
@@ -203,8 +232,9 @@ def moved_rows(scene: Scene, rows: TensorDict, yaw: float, shift: Tensor) -> Ten
         offset = rows[TERRAIN][..., 3] + (normal * shift).sum(-1)
         rows[TERRAIN] = torch.cat((normal, offset[..., None]), -1)
     for state in (rows, rows.get("next", None)):
-        if state is not None and scene.base.is_floating:
-            q, v = scene.base.qpos_address, scene.base.dof_address
+        if state is None:
+            continue
+        for q, v in free_joints(scene).items():
             qpos, qvel = state[QPOS], state[QVEL]
             qpos[..., q : q + 3] = rotate(turn, qpos[..., q : q + 3]) + shift
             quat = qpos[..., q + 3 : q + 7]

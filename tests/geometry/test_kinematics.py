@@ -14,12 +14,9 @@ ROWS, POINTS = 20, 7
 
 
 def random_points(model, base, rng):
-    """Bodies that the base carries, itself included, and places on them."""
-    carried = [base.body]
-    for body in range(base.body + 1, model.nbody):
-        if model.body_parentid[body] in carried:
-            carried.append(body)
-    return rng.choice(carried, POINTS).tolist(), rng.normal(size=(POINTS, 3))
+    """Bodies that move, the base itself and props included, and places on them."""
+    carried = {base.body, *np.flatnonzero(model.body_treeid >= 0).tolist()}
+    return rng.choice(sorted(carried), POINTS).tolist(), rng.normal(size=(POINTS, 3))
 
 
 def seen_by_the_base(model, base, mount, data, body, point):
@@ -115,17 +112,20 @@ def test_matrices_are_mujocos(generator):
         np.testing.assert_allclose(got, want, 0, 1e-15)
 
 
-@pytest.mark.parametrize(
-    ("bodies", "found"),
-    [
-        ('<body><geom size="1"/></body>', "no joint"),
-        ('<body><freejoint/><geom size="1"/></body>' * 2, "2 moving trees"),
-    ],
-)
-def test_a_scene_is_one_robot(bodies, found):
-    xml = f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"
-    with pytest.raises(ValueError, match=f"one robot, got {found}"):
-        Base.from_model(mujoco.MjModel.from_xml_string(xml))
+def test_the_robot_is_the_tree_with_the_actuators():
+    free = '<body name="{0}"><freejoint/><geom size="1"/>{1}</body>'
+    arm = '<body name="{0}arm"><joint name="{0}"/><geom size="1"/></body>'
+    trees = free.format("ball", "") + free.format("robot", arm.format("a"))
+    for motors, name in (("", "ball"), ('<motor joint="a"/>', "robot")):
+        model = mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody>{trees}</worldbody><actuator>{motors}</actuator></mujoco>"
+        )
+        base = Base.from_model(model)
+        assert base.is_floating and model.body(base.body).name == name
+        assert len(base.others) == 1 and base.qpos_address == 7 * bool(motors)
+    bare = '<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>'
+    with pytest.raises(ValueError, match="no joint"):
+        Base.from_model(mujoco.MjModel.from_xml_string(bare))
 
 
 def test_points_must_be_on_the_robot(rng):

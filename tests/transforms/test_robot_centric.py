@@ -34,7 +34,9 @@ def test_place_and_heading_are_not_features(scene, distance, generator):
     elsewhere = moved_scene(scene, float(yaw), shift)
     moved = moved_rows(scene, rows, float(yaw), shift)
     got, want = state_features(elsewhere, moved), state_features(scene, rows)
-    torch.testing.assert_close(got, want, rtol=0.0, atol=1e-10)
+    # a prop is as near to the base as numbers of that size can tell
+    rounding = 1e-15 * distance * bool(scene.base.others)
+    torch.testing.assert_close(got, want, rtol=0.0, atol=1e-10 + rounding)
 
 
 @every_scene

@@ -68,8 +68,9 @@ def test_any_change_leads_to_a_state_and_back(scene, rng):
 def test_place_and_heading_are_not_in_it(scene, distance, tolerance, generator):
     rows = random_transitions(scene, ROWS, generator)
     yaw, *shift = torch.randn(4, dtype=torch.float64, generator=generator)
-    moved = moved_rows(scene, rows, float(yaw), distance * torch.stack(shift))
-    got, want = delta_of(scene, moved), delta_of(scene, rows)
+    where = float(yaw), distance * torch.stack(shift)
+    elsewhere, moved = moved_scene(scene, *where), moved_rows(scene, rows, *where)
+    got, want = delta_of(elsewhere, moved), delta_of(scene, rows)
     torch.testing.assert_close(got, want, rtol=1e-12, atol=tolerance)
 
 

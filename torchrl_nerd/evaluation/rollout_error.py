@@ -169,11 +169,16 @@ def position_errors(
 
     A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
     over ``joints`` (rad); a fixed base gives one entry per joint, see `joint_label`.
+    Another free body gives its position (m) and orientation (rad).
     """
-    model, both, joints = scene.model, (ground_truth, other), {}
+    model, both, joints, props = scene.model, (ground_truth, other), {}, {}
     for joint in range(model.njnt):
         q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
         if kind == mujoco.mjtJoint.mjJNT_FREE:
+            if not scene.base.is_floating or q != scene.base.qpos_address:
+                label = joint_label(model, joint)
+                place, turn = _pose_error(q, *both)
+                props |= {f"{label} position": place, f"{label} orientation": turn}
             continue
         if kind == mujoco.mjtJoint.mjJNT_BALL:
             error = orientation_error(*(x[..., q : q + 4] for x in both))
@@ -183,26 +188,28 @@ def position_errors(
             error = (wrap_angle(error) if is_hinge else error).abs()
         joints[joint_label(model, joint)] = error
     if not scene.base.is_floating:
-        return joints
-    q = scene.base.qpos_address
-    offset = ground_truth[..., q : q + 3] - other[..., q : q + 3]
-    turn = orientation_error(*(x[..., q + 3 : q + 7] for x in both))
-    errors = {
-        "base_position": torch.linalg.vector_norm(offset, dim=-1),
-        "base_orientation": turn,
-    }
+        return joints | props
+    place, turn = _pose_error(scene.base.qpos_address, *both)
+    errors = {"base_position": place, "base_orientation": turn}
     if joints:
         errors["joints"] = torch.stack(list(joints.values())).mean(0)  # (n, steps)
-    return errors
+    return errors | props
+
+
+def _pose_error(q: int, one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Error of the free joint at ``q`` in qpos: position, m, and orientation, rad."""
+    offset = one[..., q : q + 3] - other[..., q : q + 3]
+    turn = orientation_error(*(x[..., q + 3 : q + 7] for x in (one, other)))
+    return torch.linalg.vector_norm(offset, dim=-1), turn
 
 
 def unit_of(scene: Scene, quantity: str) -> str:
     """Unit of a quantity of `position_errors`: m or rad."""
-    if scene.base.is_floating:
-        return "m" if quantity == "base_position" else "rad"
     model = scene.model
     kinds = {joint_label(model, i): model.jnt_type[i] for i in range(model.njnt)}
-    return "m" if kinds[quantity] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    if quantity in kinds and not scene.base.is_floating:
+        return "m" if kinds[quantity] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    return "m" if quantity.endswith("position") else "rad"
 
 
 def interval_of_mean(samples: Tensor) -> float:

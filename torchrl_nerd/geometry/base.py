@@ -33,46 +33,60 @@ class Base:
     """The body whose pose defines B_t.
 
     A floating base is the body of the free joint. A fixed base is the pose,
-    constant in the world, of the first moving body's frame before its joints move.
+    constant in the world, of the first moving body's frame before its joints move. Of
+    several moving trees the robot is that which most actuators drive, the first of equals;
+    ``others`` are the root bodies of the rest: props, and further robots.
     """
 
     body: int
     is_floating: bool
     qpos_address: int = 0
     dof_address: int = 0
+    others: tuple[int, ...] = ()
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel) -> "Base":
         """Find the base.
 
         Raises:
-            ValueError: the model has no joint, or more than one moving tree.
+            ValueError: nothing in the model can move.
         """
-        weld = model.body_weldid
-        roots = [
-            body
-            for body in range(1, model.nbody)
-            if model.body_dofnum[body] > 0 and weld[body] == body
-            if weld[model.body_parentid[body]] == 0
-        ]
-        if len(roots) != 1:
-            found = "no joint" if not roots else f"{len(roots)} moving trees"
-            raise ValueError(f"expected a model with one robot, got {found}")
-        joint = int(model.body_jntadr[roots[0]])
-        if model.jnt_type[joint] != FREE:
-            return cls(roots[0], False)
+        if not model.njnt:
+            raise ValueError("no joint")
+        roots = [model.body_treeid.tolist().index(tree) for tree in range(model.ntree)]
+        drives = np.zeros(model.ntree, int)
+        if model.nu and model.ntree > 1:
+            data = mujoco.MjData(model)
+            mujoco.mj_fwdPosition(model, data)
+            driven = model.dof_treeid[data.moment_colind[: data.moment_rownnz.sum()]]
+            drives = np.bincount(driven, minlength=model.ntree)
+        root = roots[int(drives.argmax())]
+        others = tuple(body for body in roots if body != root)
+        if not is_free(model, root):
+            return cls(root, False, others=others)
+        joint = int(model.body_jntadr[root])
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        return cls(roots[0], True, q, v)
+        return cls(root, True, q, v, others)
+
+
+def is_free(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a body that moves has a free joint."""
+    return bool(model.jnt_type[model.body_jntadr[body]] == FREE)
 
 
 def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
     """World position ``(3,)``, m, and rotation ``(3, 3)`` of a fixed base."""
+    return mount_pose(model, base.body)
+
+
+def mount_pose(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where a tree's root body stands before its joints move, as `fixed_base_pose`."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    parent = int(model.body_parentid[base.body])
+    parent = int(model.body_parentid[body])
     rotation = data.xmat[parent].reshape(3, 3)
-    position = data.xpos[parent] + rotation @ model.body_pos[base.body]
-    return position, rotation @ quat_matrix(model.body_quat[base.body])
+    position = data.xpos[parent] + rotation @ model.body_pos[body]
+    return position, rotation @ quat_matrix(model.body_quat[body])
 
 
 class BasePose(nn.Module):
@@ -130,8 +144,13 @@ class JointAxes:
         """Read them from a compiled model.
 
         Raises:
-            ValueError: a ball joint, or several joints of one body.
+            ValueError: a ball joint, several joints of one body, or several moving trees.
         """
+        if base.others:
+            raise ValueError(
+                f"expected one moving tree for the equation of motion, got "
+                f"{1 + len(base.others)}"
+            )
         joints = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
         if len(joints) + base.is_floating < model.njnt or (model.body_jntnum > 1).any():
             raise ValueError(

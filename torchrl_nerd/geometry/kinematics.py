@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.base import Base, BasePose, is_free, mount_pose
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import BALL, SLIDE
 from torchrl_nerd.geometry.rotations import (
@@ -53,10 +53,18 @@ class PointKinematics(nn.Module):
     ) -> None:
         super().__init__()
         self.base, self.depths = base, nn.ModuleList()
+        self.trees = OtherTrees(model, base) if base.others else None
+        roots = (base.body, *base.others)
+        moving = (base.is_floating, *(is_free(model, root) for root in base.others))
+        # roots whose pose is a state, and those that stand on a mount
+        above = {r: i for i, r in enumerate(roots) if moving[i]}
+        mounts = {r: i for i, r in enumerate(roots) if not moving[i]}
         depth: dict[int, int] = {}
-        for body in _bodies_on_path(model, base, bodies):  # parents first
+        for body in _bodies_on_path(model, above, mounts, bodies):  # parents first
             depth[body] = depth.get(int(model.body_parentid[body]), -1) + 1
-        order, above = [base.body] if base.is_floating else [], {base.body: 0}
+        self.shows_roots = len(roots) > 1 or base.is_floating
+        # a mount is no body, its root comes later
+        order = [r if r in above else -r for r in roots] if self.shows_roots else []
         for level in range(max(depth.values(), default=-1) + 1):
             by_kind: dict[tuple, list[int]] = {}
             for body in depth:
@@ -64,7 +72,7 @@ class PointKinematics(nn.Module):
                     kinds = tuple(int(model.jnt_type[j]) for j in _joints(model, body))
                     by_kind.setdefault(kinds, []).append(body)
             members = by_kind.values()
-            groups = (_Group(model, base, alike, above) for alike in members)
+            groups = (_Group(model, mounts, alike, above) for alike in members)
             self.depths.append(nn.ModuleList(groups))
             ordered = [body for alike in members for body in alike]
             above = {body: index for index, body in enumerate(ordered)}
@@ -100,11 +108,67 @@ class PointKinematics(nn.Module):
         zero, still = q.new_zeros(3, 1, 1), v.new_zeros(3, 1, min(1, v.shape[-1]))
         identity = torch.eye(3, dtype=q.dtype, device=q.device)[..., None, None]
         above = zero, identity, still, still  # the base itself, seen from the base
-        motions = [above] if self.base.is_floating else []
+        if self.trees is not None:
+            above = _join([above, self.trees(q, v)])
+        motions = [above] if self.shows_roots else []
         for groups in self.depths:
             above = _join([group(above, q, v) for group in groups])  # pyright: ignore
             motions.append(above)
         return _pick(_join(motions), self.body_of_point)
+
+
+class OtherTrees(nn.Module):
+    """Motion of the roots of the moving trees beside the robot's, as seen from B_t.
+
+    A free body's own motion; of a tree that stands somewhere, that of its mount.
+    """
+
+    position: Tensor  # (3, n, 1), m, of the mounts, world
+    rotation: Tensor  # (3, 3, n, 1)
+
+    def __init__(self, model: mujoco.MjModel, base: Base) -> None:
+        super().__init__()
+        self.base, self.pose = base, BasePose(model, base)
+        self.addresses: list[tuple[int, int] | None] = []
+        for root in base.others:
+            joint = int(model.body_jntadr[root])
+            at = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            self.addresses.append(at if is_free(model, root) else None)
+        places, turns = zip(*(mount_pose(model, r) for r in base.others), strict=True)
+        _keep(self, position=places, rotation=turns)
+
+    def forward(self, qpos: Tensor, qvel: Tensor) -> Motion:
+        """From ``qpos (nq, N)`` and ``qvel (nv, M)``, of all robots or the first M."""
+        moving = slice(qvel.shape[-1])
+        place, turn = self.pose(qpos.T)
+        place, inverse = place.T[:, None], turn.permute(2, 1, 0)[:, :, None]
+        zero = qvel.new_zeros(3, qvel.shape[-1])
+        motions = []
+        for i, address in enumerate(self.addresses):
+            position = self.position[:, i].expand(3, qpos.shape[-1])
+            rotation = self.rotation[:, :, i].expand(3, 3, qpos.shape[-1])
+            linear = spin = zero
+            if address is not None:
+                q, v = address
+                position = qpos[q : q + 3]
+                quat = quat_normalize(qpos[q + 3 : q + 7].T)
+                rotation = matrix_from_quat(quat).permute(1, 2, 0)
+                linear, spin = qvel[v : v + 3], qvel[v + 3 : v + 6]
+            motions.append((position, rotation, spin, linear))
+        world, axes, spin, linear = (
+            torch.stack(same, -2) for same in zip(*motions, strict=True)
+        )  # (3, n, N), (3, 3, n, N), ...
+        position = rotate_by(inverse, world - place)
+        rotation = matmul(inverse, axes)
+        spin = rotate_by(rotation[..., moving], spin)
+        linear = rotate_by(inverse[..., moving], linear)
+        if self.base.is_floating:
+            v = self.base.dof_address
+            own, turning = qvel[v : v + 3, None], qvel[v + 3 : v + 6, None]
+            linear = linear - rotate_by(inverse[..., moving], own)
+            linear = linear - cross(turning.expand_as(spin), position[..., moving])
+            spin = spin - turning
+        return position, rotation, spin, linear
 
 
 class _Group(nn.Module):
@@ -116,17 +180,21 @@ class _Group(nn.Module):
     def __init__(
         self,
         model: mujoco.MjModel,
-        base: Base,
+        mounts: dict[int, int],
         bodies: list[int],
         above: dict[int, int],
     ) -> None:
         super().__init__()
-        if bodies == [base.body]:  # a fixed base's mount is B_t itself
-            self.parents, offsets, turns = [0], np.zeros((1, 3)), [np.eye(3)]
-        else:
-            self.parents = [above[int(model.body_parentid[body])] for body in bodies]
-            offsets = model.body_pos[bodies]
-            turns = [quat_matrix(model.body_quat[body]) for body in bodies]
+        self.parents, offsets, turns = [], [], []
+        for body in bodies:
+            if body in mounts:  # its parent's motion is that of the mount itself
+                self.parents.append(mounts[body])
+                offsets.append(np.zeros(3))
+                turns.append(np.eye(3))
+            else:
+                self.parents.append(above[int(model.body_parentid[body])])
+                offsets.append(model.body_pos[body])
+                turns.append(quat_matrix(model.body_quat[body]))
         self.joints = nn.ModuleList()
         slots = zip(*(_joints(model, body) for body in bodies), strict=True)
         for joints in slots:  # the first joints of all bodies, then the second ones
@@ -269,17 +337,22 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
     return range(start, start + int(model.body_jntnum[body]))
 
 
-def _bodies_on_path(model: mujoco.MjModel, base: Base, bodies: list[int]) -> list[int]:
-    """Bodies from the base, if it is fixed, to the points' bodies, parents first."""
+def _bodies_on_path(
+    model: mujoco.MjModel,
+    above: dict[int, int],
+    mounts: dict[int, int],
+    bodies: list[int],
+) -> list[int]:
+    """Bodies from the roots to the points' bodies, parents first; free roots left out."""
     needed: set[int] = set()
     for body in bodies:
-        while body != base.body:
+        while body not in above:
             if body == 0:
                 raise ValueError(
                     "expected contact points on moving bodies of the robot"
                 )
             needed.add(body)
+            if body in mounts:
+                break
             body = int(model.body_parentid[body])
-        if not base.is_floating:
-            needed.add(base.body)
     return sorted(needed)

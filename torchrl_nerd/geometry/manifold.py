@@ -37,22 +37,25 @@ class JointLayout:
     nv: int
     linear: tuple[tuple[int, int], ...]  # of every entry that adds like a number
     rotations: tuple[tuple[int, int], ...]  # of every quaternion
+    translations: tuple[int, ...] = ()  # dof address of every free joint
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel) -> "JointLayout":
         """Read the joints of a compiled model."""
-        linear, rotations = [], []
+        linear, rotations, translations = [], [], []
         for joint in range(model.njnt):
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             kind = int(model.jnt_type[joint])
             if kind == FREE:
                 linear += [(q + i, v + i) for i in range(3)]
                 rotations.append((q + 3, v + 3))
+                translations.append(v)
             elif kind == BALL:
                 rotations.append((q, v))
             else:
                 linear.append((q, v))
-        return cls(model.nq, model.nv, tuple(linear), tuple(rotations))
+        parts = (tuple(x) for x in (linear, rotations, translations))
+        return cls(model.nq, model.nv, *parts)
 
     @cached_property
     def runs(self) -> tuple[tuple[slice, slice], ...]:

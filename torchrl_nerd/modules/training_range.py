@@ -222,5 +222,5 @@ def magnitudes(vectors: tuple[int, ...], qvel: Tensor) -> Tensor:
 
 def vector_dofs(scene: Scene) -> tuple[int, ...]:
     """Where in ``qvel`` the three components of each vector begin."""
-    linear = [scene.base.dof_address] if scene.base.is_floating else []
-    return (*linear, *(v for _, v in scene.layout.rotations))
+    layout = scene.layout
+    return (*layout.translations, *(v for _, v in layout.rotations))

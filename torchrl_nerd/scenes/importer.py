@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 CONTROL_STEP = 0.02  # s, where nobody says
 FREE_SLIDE = 1.0  # m
+PROP_ROOM = 0.1  # m: how far from its place a prop starts at least
 LEAST_REACH = 0.01  # m
 START_PENETRATION = 1e-3  # m: about what a resting robot's soft contacts give
 LEAST_SPEED = 1.0  # m/s or rad/s: where nothing falls and nothing pushes
@@ -163,7 +164,9 @@ def default_sampling(
             f"expected ranges among {', '.join(known)}, got '{unknown[0]}'"
         )
     base = Base.from_model(model)
-    skipped_q, skipped_v = (7, 6) if base.is_floating else (0, 0)
+    # a floating base has ranges of its own where it is the first joint
+    is_first = base.is_floating and base.dof_address == 0
+    skipped_q, skipped_v = (7, 6) if is_first else (0, 0)
     low, high = (tuple(x.tolist()) for x in _positions(model))
     torque = _largest_torques(model, controller, low, high)
     speed = _speeds(model, controller, torque).tolist()
@@ -174,7 +177,7 @@ def default_sampling(
         qvel_low=tuple(-v for v in speed[skipped_v:]),
         qvel_high=tuple(speed[skipped_v:]),
         torque=tuple(torque),
-        base=_base_sampling(model, speed) if base.is_floating else None,
+        base=_base_sampling(model, speed) if is_first else None,
         ctrl=None if controller.is_motor else controls,
         clearance=0.0 if len(contact_points(model, base)) else None,
         penetration=START_PENETRATION,
@@ -183,8 +186,8 @@ def default_sampling(
 
 
 def _positions(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest ``qpos``; ball joints as quaternions yet to be normalised."""
-    low, high = model.qpos0.copy(), model.qpos0.copy()
+    """Lowest and highest ``qpos``; quaternions are yet to be normalised."""
+    low, high, reaches = model.qpos0.copy(), model.qpos0.copy(), _reaches(model)
     for joint in range(model.njnt):
         q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
         limits, is_limited = model.jnt_range[joint], bool(model.jnt_limited[joint])
@@ -193,7 +196,12 @@ def _positions(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
             side = sin(half) / sqrt(3.0)
             low[q : q + 4] = (cos(half), -side, -side, -side)
             high[q : q + 4] = (cos(half), side, side, side)
-        elif kind != FREE:
+        elif kind == FREE:
+            room = max(reaches[joint], PROP_ROOM)
+            low[q : q + 3] -= (room, room, 0.0)
+            high[q : q + 3] += room
+            low[q + 3 : q + 7], high[q + 3 : q + 7] = -1.0, 1.0  # normalised later
+        else:
             free = pi if kind == HINGE else FREE_SLIDE
             low[q] = limits[0] if is_limited else low[q] - free
             high[q] = limits[1] if is_limited else high[q] + free

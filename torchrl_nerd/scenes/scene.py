@@ -262,10 +262,18 @@ class Scene:
         if self.base.is_floating and self.terrain is not None:
             qpos, q = state["qpos"], self.base.qpos_address
             gaps, normals = self._ground(qpos, state.get("terrain"))
+            if self.base.others:  # the robot's own points count, not the props'
+                gaps = torch.where(self._is_own(), gaps, torch.inf)
             lowest, point = gaps.min(-1)
             normal = normals[torch.arange(len(qpos)), point]  # (rows, 3), in B_t
             up = (self.base_pose(qpos)[1] @ normal[..., None])[..., 0]
             qpos[:, q : q + 3] += (gap - lowest)[:, None] * up
+
+    def _is_own(self) -> Tensor:
+        """Which contact points are on the robot's own tree, ``(P,)`` bool."""
+        trees = self.model.body_treeid
+        own = trees[self.contacts.bodies] == trees[self.base.body]
+        return torch.from_numpy(own)
 
     def _ground(self, qpos: Tensor, terrain: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gap ``(*batch, P)``, m, and the ground's normal ``(*batch, P, 3)`` in B_t."""

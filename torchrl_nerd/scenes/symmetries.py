@@ -67,11 +67,11 @@ def find_symmetries(
 
     One coordinate is moved and nothing else, so that only invariances of the
     dynamics pass; the ground stays where it is. Nothing is dropped where a few states do
-    not show what matters: limited tendons, and static shapes without features. Servos act
-    in every substep; without them a torque is a torque.
+    not show what matters: limited tendons, static shapes without features, props. Servos
+    act in every substep; without them a torque is a torque.
     """
     unseen = set(ground_geoms(model)) - set(terrain_geoms(model))
-    if model.tendon_limited.any() or unseen:
+    if model.tendon_limited.any() or unseen or model.ntree > 1:
         return Symmetries(())
     free, rng = _without(model, LIMIT, has_servos), np.random.default_rng(0)
     effects: list[Effect] = []

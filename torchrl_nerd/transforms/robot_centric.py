@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.constants import constant, take
+from torchrl_nerd.geometry.kinematics import OtherTrees
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import (
@@ -43,6 +44,10 @@ class RobotCentric(FeatureTransform):
     | | unlimited hinge: sin, cos | 2 |
     | | other hinge, slide: position, unless the dynamics ignore it | 1 |
     | | ball: first two columns of its rotation matrix | 6 |
+    | | other free body: position, two columns of its rotation matrix, linear and angular
+      velocity, all relative to B_t | 15 |
+    | | other tree that stands in the world, beside a floating base: where, as B_t sees it:
+      position, two columns of its rotation matrix | 9 |
     | | limited joint: gaps to both limits, minus the margin, at most 0 | 2 |
     | | velocity of every dof; one that the free dynamics ignore only near a limit | 1 |
     | | limited joint, with ``predicted_force``: mean torque of the limit's spring and
@@ -61,14 +66,20 @@ class RobotCentric(FeatureTransform):
 
     def __init__(self, scene: Scene, features: FeatureConfig = NO_PREDICTIONS) -> None:
         joints = _JointFeatures.from_scene(scene, features)
+        trees = OtherTrees(scene.model, scene.base) if scene.base.others else None
+        free = [] if trees is None else [at is not None for at in trees.addresses]
+        # mounts do not move, as a fixed base does not
+        seen = [i for i, moves in enumerate(free) if moves or scene.base.is_floating]
         state_size = joints.size + 9 * scene.base.is_floating
+        state_size += 9 * len(seen) + 6 * sum(free)
         sizes: dict[NestedKey, int] = {ROBOT_STATE: state_size}
         if scene.actuated:
             sizes[ROBOT_TORQUE] = len(scene.actuated)
         if num_ctrl(scene):
             sizes[ROBOT_CTRL] = num_ctrl(scene)
         super().__init__([QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
-        self.base = scene.base
+        self.base, self.trees = scene.base, trees
+        self.seen, self.free = seen, [i for i, moves in enumerate(free) if moves]
         self.joints = joints
         self.down = scene.gravity_direction
 
@@ -84,7 +95,21 @@ class RobotCentric(FeatureTransform):
             linear = rotate_inverse(quat, qvel[..., v : v + 3])
             angular = qvel[..., v + 3 : v + 6]
             parts = [linear, angular, rotate_inverse(quat, down), *parts]
+        if self.trees is not None:
+            parts += self._other_trees(self.trees, qpos, qvel)
         return torch.cat(parts, -1)
+
+    def _other_trees(
+        self, trees: OtherTrees, qpos: Tensor, qvel: Tensor
+    ) -> list[Tensor]:
+        """Poses of other trees ``(*batch, 3)``, and velocities of free bodies, in B_t."""
+        batch = qpos.shape[:-1]
+        rows = (x.reshape(batch.numel(), x.shape[-1]).T for x in (qpos, qvel))
+        position, rotation, spin, linear = trees(*rows)
+        vectors = [position[:, i] for i in self.seen]
+        vectors += [rotation[:, axis, i] for i in self.seen for axis in (0, 1)]
+        vectors += [x[:, i] for i in self.free for x in (linear, spin)]
+        return [x.T.reshape(*batch, 3) for x in vectors]
 
     def _features(self, tensordict: TensorDictBase) -> dict:
         state = self.state_features(tensordict[QPOS], tensordict[QVEL])

@@ -7,12 +7,15 @@ rotations live in the tangent space: 2 nv numbers, no quaternion.
 
 from collections.abc import Callable
 
+import mujoco
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import Transform
 
+from torchrl_nerd.geometry.constants import constant
 from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
 from torchrl_nerd.geometry.rotations import quat_exp, rotate, rotate_inverse
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, STATE_DELTA
@@ -47,7 +50,9 @@ class StateDelta(Transform):
     def __init__(self, scene: Scene) -> None:
         super().__init__([QPOS, QVEL, NEXT_QPOS, NEXT_QVEL], [STATE_DELTA])
         self.layout, self.base = scene.layout, scene.base
-        self.step_size = scene.control_step
+        self.step_size, mount = scene.control_step, np.empty(4)
+        mujoco.mju_mat2Quat(mount, scene.fixed_base_pose[1].reshape(-1))
+        self.mount = tuple(mount.tolist())
 
     @property
     def size(self) -> int:
@@ -64,7 +69,7 @@ class StateDelta(Transform):
             after = _replace(after, v, rotate(turn, after[..., v : v + 3]))
         residual = moved - 0.5 * self.step_size * (qvel + after)
         change = after - qvel
-        if self.base.is_floating:
+        if self.layout.translations:
             change, residual = (
                 self._turn(qpos, x, rotate_inverse) for x in (change, residual)
             )
@@ -83,7 +88,7 @@ class StateDelta(Transform):
         next velocities, over one, and how far positions move of what begins within them.
         """
         change, residual = delta.split(self.layout.nv, -1)
-        if self.base.is_floating:
+        if self.layout.translations:
             change, residual = (self._turn(qpos, x, rotate) for x in (change, residual))
         after = qvel + change if limit is None else limit(qvel + change, 1.0)
         moved = 0.5 * self.step_size * (qvel + after) + residual
@@ -99,9 +104,16 @@ class StateDelta(Transform):
     def _turn(
         self, qpos: Tensor, x: Tensor, turn: Callable[[Tensor, Tensor], Tensor]
     ) -> Tensor:
-        """The floating base's linear part of a tangent vector, in other axes."""
-        q, v = self.base.qpos_address + 3, self.base.dof_address
-        return _replace(x, v, turn(qpos[..., q : q + 4], x[..., v : v + 3]))
+        """Linear parts of free joints in a tangent vector, in axes of the base."""
+        q = self.base.qpos_address + 3
+        quat = qpos[..., q : q + 4] if self.base.is_floating else self._mount(qpos)
+        for v in self.layout.translations:
+            x = _replace(x, v, turn(quat, x[..., v : v + 3]))
+        return x
+
+    def _mount(self, qpos: Tensor) -> Tensor:
+        """Orientation of a fixed base, ``(*batch, 4)``."""
+        return constant(qpos, self.mount).expand(*qpos.shape[:-1], 4)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
         """Write the change between the state and the one under ``next``.
