@@ -73,7 +73,9 @@ def mujoco_contacts(scene, row):
 
 
 def is_raisable(scene):
-    return not scene.base.others and (scene.terrain.is_per_row or scene.base.is_floating)
+    return not scene.base.others and (
+        scene.terrain.is_per_row or scene.base.is_floating
+    )
 
 
 def near_ground(scene, generator):

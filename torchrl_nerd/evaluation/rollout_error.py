@@ -176,7 +176,8 @@ def position_errors(
         q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             if not scene.base.is_floating or q != scene.base.qpos_address:
-                label = joint_label(model, joint)
+                body = model.body(model.jnt_bodyid[joint]).name
+                label = model.joint(joint).name or body or joint_label(model, joint)
                 place, turn = _pose_error(q, *both)
                 props |= {f"{label} position": place, f"{label} orientation": turn}
             continue
