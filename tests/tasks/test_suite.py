@@ -193,8 +193,6 @@ def test_a_model_of_one_task_serves_another_of_the_same_robot(generator, tmp_pat
     [
         ("dm_control/cheetah-fly", "unknown task in 'dm_control/cheetah-fly'"),
         ("dm_control/cheetah", "unknown task in 'dm_control/cheetah-'"),
-        ("dm_control/fish-swim", "a tendon with a limit.*'fins_sym'.*not supported"),
-        ("dm_control/finger-spin", "expected a model with one robot, got 2"),
         ("dm_control/lqr-lqr_2_1", "has no time limit: not supported"),
         ("dm_control/point_mass-hard", "changes its robot at every reset"),
     ],

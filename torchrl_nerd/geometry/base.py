@@ -76,10 +76,10 @@ def is_free(model: mujoco.MjModel, body: int) -> bool:
 
 def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
     """World position ``(3,)``, m, and rotation ``(3, 3)`` of a fixed base."""
-    return mount_pose(model, base.body)
+    return root_pose(model, base.body)
 
 
-def mount_pose(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+def root_pose(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Where a tree's root body stands before its joints move, as `fixed_base_pose`."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

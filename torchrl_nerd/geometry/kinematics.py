@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import Base, BasePose, is_free, mount_pose
+from torchrl_nerd.geometry.base import Base, BasePose, is_free, root_pose
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import BALL, SLIDE
 from torchrl_nerd.geometry.rotations import (
@@ -56,14 +56,14 @@ class PointKinematics(nn.Module):
         self.trees = OtherTrees(model, base) if base.others else None
         roots = (base.body, *base.others)
         moving = (base.is_floating, *(is_free(model, root) for root in base.others))
-        # roots whose pose is a state, and those that stand on a mount
+        # roots whose pose is a state, and those that stand in the world
         above = {r: i for i, r in enumerate(roots) if moving[i]}
-        mounts = {r: i for i, r in enumerate(roots) if not moving[i]}
+        standing = {r: i for i, r in enumerate(roots) if not moving[i]}
         depth: dict[int, int] = {}
-        for body in _bodies_on_path(model, above, mounts, bodies):  # parents first
+        for body in _bodies_on_path(model, above, standing, bodies):  # parents first
             depth[body] = depth.get(int(model.body_parentid[body]), -1) + 1
         self.shows_roots = len(roots) > 1 or base.is_floating
-        # a mount is no body, its root comes later
+        # a place in the world is no body: its root comes later
         order = [r if r in above else -r for r in roots] if self.shows_roots else []
         for level in range(max(depth.values(), default=-1) + 1):
             by_kind: dict[tuple, list[int]] = {}
@@ -72,7 +72,7 @@ class PointKinematics(nn.Module):
                     kinds = tuple(int(model.jnt_type[j]) for j in _joints(model, body))
                     by_kind.setdefault(kinds, []).append(body)
             members = by_kind.values()
-            groups = (_Group(model, mounts, alike, above) for alike in members)
+            groups = (_Group(model, standing, alike, above) for alike in members)
             self.depths.append(nn.ModuleList(groups))
             ordered = [body for alike in members for body in alike]
             above = {body: index for index, body in enumerate(ordered)}
@@ -120,10 +120,10 @@ class PointKinematics(nn.Module):
 class OtherTrees(nn.Module):
     """Motion of the roots of the moving trees beside the robot's, as seen from B_t.
 
-    A free body's own motion; of a tree that stands somewhere, that of its mount.
+    A free body's own motion; of a tree that stands in the world, that of its place.
     """
 
-    position: Tensor  # (3, n, 1), m, of the mounts, world
+    position: Tensor  # (3, n, 1), m, world, of those that stand
     rotation: Tensor  # (3, 3, n, 1)
 
     def __init__(self, model: mujoco.MjModel, base: Base) -> None:
@@ -134,7 +134,7 @@ class OtherTrees(nn.Module):
             joint = int(model.body_jntadr[root])
             at = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             self.addresses.append(at if is_free(model, root) else None)
-        places, turns = zip(*(mount_pose(model, r) for r in base.others), strict=True)
+        places, turns = zip(*(root_pose(model, r) for r in base.others), strict=True)
         _keep(self, position=places, rotation=turns)
 
     def forward(self, qpos: Tensor, qvel: Tensor) -> Motion:
@@ -180,15 +180,15 @@ class _Group(nn.Module):
     def __init__(
         self,
         model: mujoco.MjModel,
-        mounts: dict[int, int],
+        standing: dict[int, int],
         bodies: list[int],
         above: dict[int, int],
     ) -> None:
         super().__init__()
         self.parents, offsets, turns = [], [], []
         for body in bodies:
-            if body in mounts:  # its parent's motion is that of the mount itself
-                self.parents.append(mounts[body])
+            if body in standing:  # its parent's motion is that of its place itself
+                self.parents.append(standing[body])
                 offsets.append(np.zeros(3))
                 turns.append(np.eye(3))
             else:
@@ -340,7 +340,7 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
 def _bodies_on_path(
     model: mujoco.MjModel,
     above: dict[int, int],
-    mounts: dict[int, int],
+    standing: dict[int, int],
     bodies: list[int],
 ) -> list[int]:
     """Bodies from the roots to the points' bodies, parents first; free roots left out."""
@@ -352,7 +352,7 @@ def _bodies_on_path(
                     "expected contact points on moving bodies of the robot"
                 )
             needed.add(body)
-            if body in mounts:
+            if body in standing:
                 break
             body = int(model.body_parentid[body])
     return sorted(needed)

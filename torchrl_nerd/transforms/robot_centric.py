@@ -68,7 +68,7 @@ class RobotCentric(FeatureTransform):
         joints = _JointFeatures.from_scene(scene, features)
         trees = OtherTrees(scene.model, scene.base) if scene.base.others else None
         free = [] if trees is None else [at is not None for at in trees.addresses]
-        # mounts do not move, as a fixed base does not
+        # what stands in the world does not move from a fixed base
         seen = [i for i, moves in enumerate(free) if moves or scene.base.is_floating]
         state_size = joints.size + 9 * scene.base.is_floating
         state_size += 9 * len(seen) + 6 * sum(free)
