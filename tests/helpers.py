@@ -19,6 +19,7 @@ from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import drive, held
 from torchrl_nerd.scenes.contact_points import ContactPoints
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling, sample_commands
@@ -286,12 +287,13 @@ def random_tree(
 def simulated(
     scene: Scene, generator: Generator, trajectories: int = 6, states: int = 20
 ) -> Recording:
-    """A log of MuJoCo motion under random torques."""
+    """A log of MuJoCo motion under random torques or controls."""
     state, scale = scene.sample_initial(trajectories, generator)
-    torque = sample_commands(scene.sampling, scale, states - 1, generator)
+    command = sample_commands(scene.sampling, scale, states - 1, generator)
     start, dynamics = TensorDict(state, [trajectories]), MujocoDynamics(scene)
     dynamics.reset(start)
-    path = dynamics.rollout(start, torque, start.get(TERRAIN, None))
+    torque, ctrl = held(scene, command)
+    path = dynamics.rollout(start, torque, start.get(TERRAIN, None), ctrl)
     ground = start.get(TERRAIN, None)
     if ground is not None:
         ground = ground.repeat_interleave(states, 0)
@@ -299,7 +301,8 @@ def simulated(
         torch.cat((start[key][:, None], path[key]), 1).flatten(0, 1)
         for key in (QPOS, QVEL)
     )
-    held = torch.cat((torque, 0.0 * torque[:, :1]), 1).flatten(0, 1)
+    told = torch.cat((command, 0.0 * command[:, :1]), 1).flatten(0, 1)
+    torque, ctrl = drive(scene, told, qpos, qvel)
     offsets = states * torch.arange(trajectories + 1)
     frame = scene.control_step
-    return Recording(qpos, qvel, held, offsets, frame, terrain=ground)
+    return Recording(qpos, qvel, torque, offsets, frame, terrain=ground, ctrl=ctrl)

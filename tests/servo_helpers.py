@@ -38,6 +38,17 @@ SERVOS = """
   </actuator></mujoco>"""
 """Every actuator there is law for: several on a joint, on a tendon, on a ball, limited."""
 
+ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body><joint name="a" axis="0 1 0" range="-2 2" damping="1"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.05"/>
+    <body pos="0.3 0 0"><joint name="b" axis="0 1 0" range="-2 2" damping="1"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.05"/></body>
+  </body></worldbody><actuator>
+    <position joint="a" kp="4500" kv="450" ctrlrange="-2 2" forcerange="-87 87"/>
+    <position joint="b" kp="3500" kv="350" ctrlrange="-2 2" forcerange="-87 87"/>
+  </actuator><keyframe><key qpos="0.3 -0.4" ctrl="0.3 -0.4"/></keyframe></mujoco>"""
+"""Two links held by servos as stiff as those of a Franka."""
+
 ENGINE_ALONE = """
     <motor site="tool" gear="1 0.5 0 0 0.1 0"/>
     <position site="tool" refsite="side" kp="2" kv="0.1" gear="0 0 1 0 0 0"/>
@@ -63,3 +74,10 @@ def servo_scene(
     path = folder / "servos.xml"
     path.write_text(SERVOS.format(integrator=integrator, more=more))
     return Scene.from_mjcf(path, control_step, **ranges)
+
+
+def arm_scene(folder: Path, **ranges: Any) -> Scene:
+    """The arm of `ARM`."""
+    path = folder / "arm.xml"
+    path.write_text(ARM)
+    return Scene.from_mjcf(path, **ranges)

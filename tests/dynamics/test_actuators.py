@@ -10,7 +10,7 @@ import pytest
 import torch
 from dynamics_helpers import random_model
 from helpers import slow_but
-from servo_helpers import ENGINE_ALONE, SERVOS, servo_scene
+from servo_helpers import ENGINE_ALONE, SERVOS, arm_scene, servo_scene
 from tensordict import TensorDict
 
 from torchrl_nerd import make_env
@@ -35,24 +35,13 @@ SUITE = """acrobot-swingup ball_in_cup-catch cartpole-swingup cheetah-run dog-ru
     finger-spin fish-swim hopper-hop humanoid-run humanoid_CMU-run lqr-lqr_2_1
     manipulator-bring_ball pendulum-swingup point_mass-easy quadruped-walk reacher-easy
     stacker-stack_2 swimmer-swimmer6 walker-walk"""
-FILES = os.environ.get("NERD_ROBOTS", "no folder of MJCF files")
+FILES = os.environ.get("NERD_MJCF", "no folder of MJCF files")
 ROBOTS = [
     *(f"gymnasium/{name}-v5" for name in GYMNASIUM.split()),
     *(f"dm_control/{name}" for name in SUITE.split()),
     *sorted(glob(f"{FILES}/**/*.xml", recursive=True)),
 ]
-"""Third-party robots; the environment variable ``NERD_ROBOTS`` names a folder of more."""
-
-ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-  <body><joint name="a" axis="0 1 0" range="-2 2" damping="1"/>
-    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.05"/>
-    <body pos="0.3 0 0"><joint name="b" axis="0 1 0" range="-2 2" damping="1"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.05"/></body>
-  </body></worldbody><actuator>
-    <position joint="a" kp="4500" kv="450" ctrlrange="-2 2" forcerange="-87 87"/>
-    <position joint="b" kp="3500" kv="350" ctrlrange="-2 2" forcerange="-87 87"/>
-  </actuator><keyframe><key qpos="0.3 -0.4" ctrl="0.3 -0.4"/></keyframe></mujoco>"""
-"""Two links held by servos as stiff as those of a Franka."""
+"""Third-party robots; the environment variable ``NERD_MJCF`` names a folder of more."""
 
 
 def start_of(scene: Scene, generator: torch.Generator) -> TensorDict:
@@ -115,9 +104,7 @@ def test_gravity_compensation_of_actuators_is_mujocos(tmp_path, generator):
 
 def test_an_arm_at_rest_stays_at_rest(tmp_path):
     """Held torques made stiff servos buzz at several rad/s."""
-    path = tmp_path / "arm.xml"
-    path.write_text(ARM)
-    scene, data = Scene.from_mjcf(path), None
+    scene = arm_scene(tmp_path)
     data = mujoco.MjData(scene.model)
     mujoco.mj_resetDataKeyframe(scene.model, data, 0)
     qpos, ctrl = (torch.from_numpy(x.copy())[None] for x in (data.qpos, data.ctrl))

@@ -22,14 +22,14 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, own_contacts
-from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.penetration import count_touching
 from torchrl_nerd.scenes.symmetries import Effect, base_effects
 from torchrl_nerd.scenes.terrain import PLANE
 
+SERVOS = "; servos: the control is held, MuJoCo evaluates their law in every substep"
 TRAJECTORIES = 64, 20  # and their steps: what self-contacts are counted in
 MEANINGS = {
-    ROBOT_TORQUE: "joint torque at the start of the step, N and N m",
+    ROBOT_TORQUE: "joint torque, N and N m",
     ROBOT_CTRL: "control of every servo, held over the step",
     CONTACT_DISTANCE: "clearance to the ground minus the margin, m; 0 beyond the margin",
     CONTACT_VELOCITY: "velocity along and across the ground's normal, m/s",
@@ -176,7 +176,7 @@ def explain(scene: Scene) -> SceneReport:
         ),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
         controller=f"{type(controller).__name__}, {controller.num_actions} actions"
-        + _who_drives(scene),
+        + SERVOS * servos,
         analytic_step=step,
         why_no_step=reason,
     )
@@ -205,17 +205,6 @@ def _state_meaning(scene: Scene) -> str:
     if scene.model.jnt_limited.any():
         parts.append("gaps to joint limits")
     return ", ".join(parts)
-
-
-def _who_drives(scene: Scene) -> str:
-    """What holds over a control step in the ground truth."""
-    if scene.servos is not None:
-        return (
-            "; MuJoCo's servos: their control is held, their torque follows the state"
-        )
-    if isinstance(scene.controller, ActuatorController):
-        return "; MuJoCo's motors: their control is held, and so is their torque"
-    return "; its torque is held over the control step"
 
 
 def _terrain(scene: Scene, has_normal: bool) -> str:

@@ -49,6 +49,9 @@ def policy_data(
         steps: control steps of each.
         generator: of initial states and noise.
         noise: largest standard deviation of the noise, in units of the action.
+
+    Raises:
+        ValueError: a task that pushes a robot with servos by torques.
     """
     scene, controller = task.scene, task.controller
     size = (rows, task.num_uniforms)
@@ -75,7 +78,12 @@ def policy_data(
             torque, ctrl = actuate(controller, action, state[QPOS], state[QVEL])
             state = dynamics.step(state, torque, terrain, ctrl)
             states.append(state.select(QPOS, QVEL)[:, None])
-            command = torque if scene.servos is None or ctrl is None else ctrl
+            command = torque if scene.servos is None else ctrl
+            if command is None:
+                raise ValueError(
+                    f"expected a task that drives the servos of '{scene.name}', got one "
+                    f"with a {type(controller).__name__}"
+                )
             commands.append(command[:, None])
     parameters = state.get(PARAMETERS, None)
     return as_transitions(scene, states, commands, terrain, parameters)
