@@ -11,11 +11,14 @@ import mujoco
 import pytest
 import torch
 from dynamics_helpers import random_drive, unequal_keys
+from servo_helpers import arm_scene
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import load_scene, make_env
 from torchrl_nerd.dynamics import MujocoDynamics, MujocoWarpDynamics
+from torchrl_nerd.scenes.commands import drive
+from torchrl_nerd.scenes.sampling import sample_commands
 
 pytest.importorskip("mujoco_warp")
 
@@ -61,6 +64,21 @@ def test_sensors_feel_what_they_feel_in_mujoco(generator):
     expected = ground_truth.step(state, torques[0], terrain)
     assert expected["sensordata"].any()
     assert_agree(warp.step(state, torques[0], terrain), expected)
+
+
+@pytest.mark.slow
+def test_servos_and_held_torques_are_those_of_mujoco(tmp_path, generator):
+    """Damped joints and an implicit integrator, with and without actuators."""
+    scene = arm_scene(tmp_path)
+    start = TensorDict(scene.sample_initial(ROWS, generator)[0], [ROWS])
+    command = sample_commands(scene.sampling, torch.ones(ROWS, 1), 1, generator)[:, 0]
+    torque, ctrl = drive(scene, command, start["qpos"], start["qvel"])
+    ground_truth, warp = MujocoDynamics(scene, 1), MujocoWarpDynamics(scene, "cpu")
+    for told in (ctrl, None, ctrl):
+        for dynamics in (ground_truth, warp):
+            dynamics.reset(start)
+        expected = ground_truth.step(start, torque, None, told)
+        assert_agree(warp.step(start, torque, None, told), expected)
 
 
 def test_broken_rows_break_no_other_and_heal(generator):

@@ -114,7 +114,7 @@ def command_of(window: TensorDict) -> Tensor:
 def is_free_body(scene: Scene) -> bool:
     """Whether the robot is one free body without motors."""
     is_single = scene.base.is_floating and scene.model.nv == 6
-    return is_single and not scene.actuated
+    return is_single and not scene.controller.num_actions
 
 
 def complete(log: Recording, scene: Scene) -> Recording:

@@ -68,6 +68,8 @@ class MujocoWarpDynamics:
                 f"MuJoCo Warp finds no device '{self.device}' here"
             ) from error
         self._source = engine_model(self.scene, self.has_actuators)
+        if not self.has_actuators:
+            _weaken_actuators(self._source)
         # a flag that Warp does not know: it never resets an env by itself
         disabled = self._source.opt.disableflags
         no_reset = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -234,6 +236,17 @@ class MujocoWarpDynamics:
     def _substeps(self) -> None:
         for _ in range(self.scene.substeps):
             self._engine.step(self._model, self._data)
+
+
+def _weaken_actuators(model: mujoco.MjModel) -> None:
+    """Actuators without force in place of disabled ones, in place.
+
+    Where they are disabled, Warp's implicit integrators leave joint damping out.
+    """
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    model.actuator_gaintype[:] = mujoco.mjtGain.mjGAIN_FIXED
+    model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_NONE
+    model.actuator_gainprm[:] = 0.0
 
 
 def is_warp_installed() -> bool:

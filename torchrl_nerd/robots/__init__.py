@@ -140,7 +140,8 @@ def protocol_of(scene: Scene) -> EvaluationProtocol:
     """
     if (known := preset_of(scene.name).protocol) is not None:
         return known
-    names = ("passive", "random") if scene.actuated else ("passive",)
+    is_driven = scene.controller.num_actions > 0
+    names = ("passive", "random") if is_driven else ("passive",)
     cases: dict[str, Source] = {name: scene for name in names}
     return EvaluationProtocol(cases, (20, 100), random_actions=names[1:])
 

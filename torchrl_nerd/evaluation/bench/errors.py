@@ -99,7 +99,7 @@ def cases_of(protocol: EvaluationProtocol) -> Iterator[tuple[str, Source, bool]]
     for case, source in protocol.cases.items():
         yield case, source, case in protocol.random_actions
     last = list(protocol.cases.values())[-1]
-    if scene_of(last).actuated and not protocol.random_actions:
+    if scene_of(last).controller.num_actions and not protocol.random_actions:
         yield DRIVEN, last, True
 
 

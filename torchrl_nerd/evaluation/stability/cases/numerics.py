@@ -117,7 +117,7 @@ def hinge_turns(trial: Trial) -> Iterator[Metric]:
     yield Metric("difference after 100 turns and 20 steps, rad", shift, 1e-6)
 
 
-@hard_case(lambda scene: bool(len(scene.actuated)))
+@hard_case(lambda scene: scene.controller.num_actions > 0)
 def torques(trial: Trial) -> Iterator[Metric]:
     """Zero, largest, 1000-fold and alternating torques leave every state finite."""
     middle, high = trial.scene.sampling.commands

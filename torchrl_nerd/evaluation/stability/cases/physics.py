@@ -167,7 +167,7 @@ def _limited(scene: Scene) -> tuple[list[int], Tensor]:
     return model.jnt_qposadr[found].tolist(), torch.from_numpy(model.jnt_range[found])
 
 
-@hard_case(lambda scene: bool(len(scene.actuated) and _limited(scene)[0]))
+@hard_case(lambda scene: bool(scene.controller.num_actions and _limited(scene)[0]))
 def joint_limits(trial: Trial) -> Iterator[Metric]:
     """Full torque or control presses no joint farther beyond its limit than in MuJoCo."""
     scene, start = trial.scene, trial.starts(16)
