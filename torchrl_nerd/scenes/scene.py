@@ -25,6 +25,7 @@ from torchrl_nerd.scenes.contact_points import (
 from torchrl_nerd.scenes.controllers import ActuatorController, Controller, driven_dofs
 from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
 from torchrl_nerd.scenes.penetration import deepest_contacts
+from torchrl_nerd.scenes.ranges import default_sampling
 from torchrl_nerd.scenes.sampling import Sampling, draw_initial
 from torchrl_nerd.scenes.support import check_supported, unit_gravity
 from torchrl_nerd.scenes.symmetries import Symmetries, find_symmetries
@@ -130,7 +131,7 @@ class Scene:
     ) -> "Scene":
         check_supported(name, model)
         controller = ActuatorController.from_model(model)
-        sampling = importer.default_sampling(model, controller, **ranges)
+        sampling = default_sampling(model, controller, **ranges)
         scene = cls(name, model, substeps, controller, sampling)
         terrain = scene.terrain  # refuses a ground without features right away
         if terrain is not None and terrain.is_per_row and not scene.sampling.ground:

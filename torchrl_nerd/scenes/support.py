@@ -61,24 +61,24 @@ def check_supported(name: str, model: mujoco.MjModel) -> None:
     Raises:
         ValueError: with all reasons, each naming its elements and their bodies.
     """
-    reasons = []
-    for what, is_there, get in (*_parts(model), *_actuators(model)):
+    base, reasons = None, []
+    try:
+        base = Base.from_model(model)
+    except ValueError as error:
+        reasons.append(str(error))
+    is_floating = base is not None and base.is_floating
+    for what, is_there, get in (*_parts(model, is_floating), *_actuators(model)):
         found = np.flatnonzero(is_there).tolist()
         if found and get is not None:
             what += f" ({', '.join(_label(model, get(i)) for i in found[:MOST_NAMED])}"
             what += f" and {len(found) - MOST_NAMED} more" * (len(found) > MOST_NAMED)
             what += ")"
         reasons += [what] if found else []
-    try:
-        base = Base.from_model(model)
-    except ValueError as error:
-        reasons.append(str(error))
-    else:
-        if base.is_floating and not _moves_alike_everywhere(model, base):
-            reasons.append(
-                "a floating base whose motion depends on where it is or faces (wind, a "
-                "spring, a constraint, an actuator)"
-            )
+    if base and is_floating and not _moves_alike_everywhere(model, base):
+        reasons.append(
+            "a floating base whose motion depends on where it is or faces (wind, a "
+            "spring, a constraint, an actuator)"
+        )
     if reasons:
         raise ValueError(
             f"scene '{name}' is not supported: it has {'; '.join(reasons)}"
@@ -98,7 +98,7 @@ def _label(model: mujoco.MjModel, element: Any) -> str:
     return label + f", a {geom_kind(model, element.id)}" * is_geom
 
 
-def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
+def _parts(model: mujoco.MjModel, is_floating: bool) -> Iterator[Refusal]:
     """Everything but the actuators."""
     yield "a flexible body", model.nflex, None
     yield "a plugin", model.nplugin, None
@@ -107,7 +107,7 @@ def _parts(model: mujoco.MjModel) -> Iterator[Refusal]:
     sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
     yield "bodies that may sleep", sleeps, None
     unknown = np.zeros(model.ngeom, bool)
-    unknown[ground_geoms(model)] = mujoco.mjtJoint.mjJNT_FREE in model.jnt_type
+    unknown[ground_geoms(model)] = is_floating
     unknown[terrain_geoms(model)] = False
     what = (
         "ground of another shape than plane, box and height field, for a floating base"
