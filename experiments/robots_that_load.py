@@ -1,4 +1,4 @@
-"""Which robots of others load, and whether their ground truth is MuJoCo's own.
+"""Which third-party robots load, and whether their ground truth is MuJoCo itself.
 
     python experiments/robots_that_load.py --json results/robots_that_load.json
 
