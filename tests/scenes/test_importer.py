@@ -26,6 +26,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate
 from torchrl_nerd.scenes.contact_points import ground_geoms
 from torchrl_nerd.scenes.controllers import ActuatorController
+from torchrl_nerd.scenes.ranges import CROSSING, LEAST_SPEED
 from torchrl_nerd.scenes.sampling import sample_correlated_commands
 from torchrl_nerd.tasks import SceneTask
 from torchrl_nerd.transforms import StateDelta
@@ -269,10 +270,13 @@ def test_starts_are_within_the_limits_and_clear_of_the_ground(robot, generator):
         assert robot.clearances(qpos).amin() >= 0.0
 
 
-@pytest.mark.parametrize("name", ["dm_control/hopper-hop", "gymnasium/Ant-v5"])
+SOUND = ("dm_control/hopper-hop", "gymnasium/Ant-v5", "dm_control/swimmer-swimmer15")
+
+
+@pytest.mark.parametrize("name", (*SOUND, "dm_control/fish-upright"))
 def test_random_trajectories_stay_sound(name, generator):
     scene = load_scene(name)
-    data = simulate(scene, 8, 10, generator)
+    data = simulate(scene, 16, 20, generator)
     assert is_sound(data).all()
     largest = torch.tensor(scene.sampling.torque, dtype=torch.float64)
     assert (data["next", "joint_torque"].abs() <= largest).all()
@@ -295,6 +299,14 @@ def test_servos_are_driven_by_random_controls(servos, generator):
     assert is_sound(data).all() and data["next", "ctrl"].shape == (4, 20, 8)
     expected = servos.servos.torque(data["next", "ctrl"], data[QPOS], data[QVEL])
     assert torch.equal(data["next", "joint_torque"], expected)
+
+
+def test_no_joint_starts_so_fast_that_it_crosses_its_range_in_a_moment(robot):
+    model, fastest = robot.model, robot.sampling.qvel_high
+    for joint in np.flatnonzero(model.jnt_limited):
+        v = int(model.jnt_dofadr[joint]) - model.nv
+        width = float(np.ptp(model.jnt_range[joint]))
+        assert fastest[v] <= max(1.001 * width / CROSSING, LEAST_SPEED)
 
 
 def test_ranges_can_be_given():
