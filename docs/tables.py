@@ -1,8 +1,8 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
-``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates`` or
-``gpu_errors``.
+``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
+``gpu_errors`` or ``hidden_parameters``.
 """
 
 import json
@@ -224,6 +224,47 @@ def state_dtype_table(folder: Path = RESULTS) -> str:
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
+def hidden_parameters_tables(folder: Path = RESULTS) -> str:
+    """Error of every robot against the length of the history, and by region."""
+    parts = []
+    for robot, record in read("hidden_parameters", folder).items():
+        found = {
+            (r["region"], r["name"], r["history"]): r
+            for r in record["results"]["errors"]
+        }
+        names = dict.fromkeys(name for _, name, _ in found)
+        lengths = sorted({length for *_, length in found})
+        parts.append(f"### {robot}")
+        for steps in ("20", "100"):
+            first = found["inside", next(iter(names)), lengths[0]]["errors"][steps]
+            quantity = list(first)[-1]
+            table = [["steps of history", *map(str, lengths)]]
+            for name in names:
+                cells = (found["inside", name, n]["errors"][steps] for n in lengths)
+                table.append(
+                    [name, *(number(cell[quantity]["mean"]) for cell in cells)]
+                )
+            parts += [
+                f"Mean error of {quantity} (rad) over {steps} steps:",
+                rows(table),
+            ]
+        regions = dict.fromkeys(region for region, *_ in found)
+        table = [["parameters, after 20 steps", *regions, "time per robot (ms)"]]
+        for name in names:
+            cells = [found[region, name, 20] for region in regions]
+            means = (number(cell["errors"]["100"][quantity]["mean"]) for cell in cells)
+            spent = (
+                found["inside", name, 20]["seconds"]
+                - found["inside", name, 0]["seconds"]
+            )
+            table.append([name, *means, number(1e3 * max(spent, 0.0))])
+        about = (
+            f"Mean error of {quantity} (rad) over 100 steps, and time for the history:"
+        )
+        parts += [about, rows(table), made_by(record)]
+    return "\n\n".join(parts)
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
@@ -234,10 +275,12 @@ TABLES = {
     "state_dtype": state_dtype_table,
     "gpu_rates": gpu_rates_table,
     "gpu_errors": gpu_errors_table,
+    "hidden_parameters": hidden_parameters_tables,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
 COMMANDS |= {"state_dtype": MEASURED, "gpu_rates": "make gpu", "gpu_errors": "make gpu"}
+COMMANDS |= {"hidden_parameters": "python -m experiments.hidden_parameters"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

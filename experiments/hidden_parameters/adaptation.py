@@ -1,0 +1,127 @@
+"""What a model's hidden state says of the parameters, and how soon it follows a change."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Generator, Tensor
+
+from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.keys import (
+    CTRL,
+    JOINT_TORQUE,
+    NEXT_QVEL,
+    PARAMETERS,
+    QPOS,
+    QVEL,
+    TERRAIN,
+)
+from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.modules.transformer import Attention
+from torchrl_nerd.scenes import Scene
+
+from .motions import draw_parameters, motions
+
+ROWS = 512
+CHANGE, AFTER = 100, 60  # step at which a parameter changes, steps after it
+SEEN = 50  # steps of history that a probe reads the hidden state after
+LAST = 10  # steps whose hidden states a probe reads the mean of
+RIDGE = 1e-3
+BACK = 2.0  # the error is back below this many times its former level
+CHANGES = {  # kind of parameter -> what it is multiplied by
+    "motor": 2.0 / 3.0,
+    "mass": 2.0,
+}
+
+
+def one_step_errors(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
+    """Errors ``(rows, T)`` of the next velocity, and hidden states ``(rows, T, w)``.
+
+    Errors are root mean squares over dofs, in standard deviations of one step's change, of
+    a model that sees the recorded motion step by step. Hidden is what each layer's
+    attention brings from the past; of a network without attention, what its head gets.
+    """
+    dynamics, errors, hidden = NeRDDynamics(model), [], []
+    scale = model.normalize.std(TARGET)[: model.scene.layout.nv]
+    layers = [m.output for m in model.network.modules() if isinstance(m, Attention)]
+    watched, seen = layers or [model.network.head], []
+    handles = [
+        layer.register_forward_pre_hook(lambda _, given: seen.append(given[0].clone()))
+        for layer in watched
+    ]
+    dynamics.reset(data[:, 0])
+    for now in data.unbind(1):
+        state = now.select(QPOS, QVEL, PARAMETERS)
+        given = (now.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
+        after = dynamics.step(state, *given)
+        miss = (after[QVEL] - now[NEXT_QVEL]) / scale
+        errors.append(miss.square().mean(-1).sqrt())
+        hidden.append(torch.cat(seen, -1))
+        seen.clear()
+    for handle in handles:
+        handle.remove()
+    return torch.stack(errors, 1), torch.stack(hidden, 1)
+
+
+def changes(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, Any]]:
+    """Median one-step error before and after a parameter changes, a row per change.
+
+    ``steps_until_back``: steps until the median stays below `BACK` times its level before.
+    """
+    variation, rows = scene.variation, []
+    assert variation is not None
+    for kind, factor in CHANGES.items():
+        chosen = [i for i, p in enumerate(variation.parameters) if p.kind == kind]
+        if not chosen:
+            continue
+        column = chosen[-1]
+        generator = Generator().manual_seed(seed)
+        before = draw_parameters(scene, "inside", ROWS, generator)
+        after = before.clone()
+        after[:, column] *= factor
+        data = motions(scene, [before, after], [CHANGE, AFTER], generator)
+        for name, model in models.items():
+            median = one_step_errors(model, data)[0].median(0).values
+            level = float(median[CHANGE - 20 : CHANGE].mean())
+            late = (median[CHANGE:] > BACK * level).nonzero()
+            back = int(late.max()) + 1 if len(late) else 0
+            rows.append(
+                {
+                    "parameter": variation.parameters[column].name,
+                    "factor": factor,
+                    "name": name,
+                    "before": level,
+                    "first": float(median[CHANGE : CHANGE + 3].max()),
+                    "steps_until_back": back if back < AFTER else None,
+                    "median": median[CHANGE - 20 :].tolist(),
+                }
+            )
+            print("change", kind, name, *list(rows[-1].values())[3:6], flush=True)
+    return rows
+
+
+def probe(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, Any]]:
+    """Share of each parameter's variance that is linear in the hidden state.
+
+    Fitted on half of the motions, measured on the other half, after `SEEN` steps. Points:
+    true and inferred place in the range, -1 to 1, of some test motions.
+    """
+    variation, rows = scene.variation, []
+    assert variation is not None
+    generator = Generator().manual_seed(seed)
+    own = draw_parameters(scene, "inside", 4 * ROWS, generator)
+    data = motions(scene, [own], [SEEN + 1], generator)
+    truth, half = variation.shares(data[:, 0][PARAMETERS]), len(data) // 2
+    for name, model in models.items():
+        state = one_step_errors(model, data)[1][:, -LAST:].mean(1).double()
+        state = (state - state[:half].mean(0)) / state[:half].std(0).clamp_min(1e-9)
+        state = torch.cat((state, torch.ones(len(state), 1)), 1)
+        a, b = state[:half], truth[:half]
+        eye = RIDGE * half * torch.eye(a.shape[1], dtype=a.dtype)
+        guess = state[half:] @ torch.linalg.solve(a.T @ a + eye, a.T @ b)
+        miss = (guess - truth[half:]).square().mean(0) / truth[half:].var(0)
+        share = dict(zip(variation.ranges, (1.0 - miss).tolist(), strict=True))
+        points = torch.stack((truth[half:], guess), -1)[:200].tolist()
+        rows.append({"name": name, "explained": share, "points": points})
+        print("probe", name, {k: round(v, 2) for k, v in share.items()}, flush=True)
+    return rows

@@ -1,0 +1,62 @@
+"""System identification: MuJoCo's parameters with the least one-step error on a history."""
+
+from typing import cast
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.keys import NEXT_QVEL, PARAMETERS, QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import command_of, drive
+
+ITERATIONS, STEP = 15, 1e-4  # STEP: of finite differences, of a range's width
+FIRST_DAMPING = 1e-3
+
+
+def identify(scene: Scene, history: TensorDict) -> Tensor:
+    """Parameters ``(rows, size)`` from ``[rows, T]``, from the middle of their ranges.
+
+    Levenberg-Marquardt with finite differences, all rows at once; residuals are errors of
+    ``qvel`` one step after each state. Parameters stay within their ranges.
+    """
+    variation = scene.variation
+    assert variation is not None
+    rows, size = len(history), variation.size
+    u = torch.full((rows, size), 0.5, dtype=torch.float64)
+    damping = torch.full((rows, 1, 1), FIRST_DAMPING, dtype=torch.float64)
+    scale = (history[NEXT_QVEL] - history[QVEL]).flatten(0, 1).std(0).clamp_min(1e-9)
+    eye = torch.eye(size, dtype=torch.float64)
+
+    def residuals(u: Tensor) -> Tensor:  # (k * rows, size) -> (k * rows, T * nv)
+        copies = len(u) // rows
+        data = cast(TensorDict, history.repeat(copies, 1))
+        data[PARAMETERS] = variation.values(u)[:, None].expand(-1, data.shape[1], -1)
+        flat = data.flatten(0, 1)
+        state = flat.select(QPOS, QVEL, PARAMETERS)
+        torque, ctrl = drive(scene, command_of(scene, flat), flat[QPOS], flat[QVEL])
+        dynamics = MujocoDynamics(scene, num_threads=1)
+        after = dynamics.step(state, torque, flat.get(TERRAIN, None), ctrl)
+        error = (after[QVEL] - flat[NEXT_QVEL]) / scale
+        return error.unflatten(0, (len(u), -1)).flatten(1)
+
+    now = residuals(u)
+    for _ in range(ITERATIONS):
+        side = torch.where(u > 0.5, -STEP, STEP)
+        moved = (u[None] + side[None] * eye[:, None]).flatten(0, 1)
+        changed = residuals(moved).unflatten(0, (size, rows))
+        slope = ((changed - now) / side.T[..., None]).permute(
+            1, 2, 0
+        )  # (rows, R, size)
+        normal = slope.mT @ slope
+        normal = normal + damping * (eye + torch.diag_embed(normal.diagonal(0, 1, 2)))
+        step = torch.linalg.solve(normal, slope.mT @ now[..., None])[..., 0]
+        tried = (u - step).clamp(0.0, 1.0)
+        then = residuals(tried)
+        better = then.square().sum(1) < now.square().sum(1)
+        u = torch.where(better[:, None], tried, u)
+        now = torch.where(better[:, None], then, now)
+        factor = torch.where(better, 0.2, 5.0).double()[:, None, None]
+        damping = (damping * factor).clamp(1e-9, 1e9)
+    return variation.values(u)

@@ -1,0 +1,73 @@
+"""The study of hidden parameters: its motions, its fit, its measurements."""
+
+import json
+
+import pytest
+import torch
+from dynamics_helpers import random_model
+from hidden_parameters.__main__ import HISTORIES, Options, main
+from hidden_parameters.adaptation import one_step_errors
+from hidden_parameters.identify import identify
+from hidden_parameters.motions import draw_parameters, motions
+
+from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.robots import load_scene, preset_of
+
+ROWS = 6
+SCENE = load_scene("cartpole").vary(preset_of("cartpole").variation)
+
+
+def test_a_fit_finds_the_parameters_of_a_motion_without_noise(generator):
+    """Those that the motion shows: it follows from them to the last steps."""
+    own = draw_parameters(SCENE, "inside", ROWS, generator)
+    data = motions(SCENE, [own], [60], generator)
+    found = identify(SCENE, data[:, :30])
+    state = data[:, 30].select("qpos", "qvel").set("parameters", found)
+    dynamics = MujocoDynamics(SCENE)
+    for now in data[:, 30:].unbind(1):
+        state = dynamics.step(state, now["next", "joint_torque"])
+    middle = SCENE.variation.values(torch.full_like(own, 0.5))
+    error = (state["qpos"] - data[:, -1]["next", "qpos"]).abs().amax(1)
+    assert error.median() < 1e-3
+    assert ((found - own).abs() <= (middle - own).abs() + 1e-6).double().mean() > 0.7
+
+
+def test_a_parameter_changes_where_it_should(generator):
+    before = draw_parameters(SCENE, "inside", ROWS, generator)
+    after = before.clone()
+    after[:, 4] *= 0.5
+    data = motions(SCENE, [before, after], [7, 5], generator)
+    assert torch.equal(data["parameters"][:, :7, 4], before[:, None, 4].expand(-1, 7))
+    assert torch.equal(data["parameters"][:, 7:, 4], after[:, None, 4].expand(-1, 5))
+    states = torch.cat((data["next", "qpos"], data["next", "qvel"]), -1)[:, :-1]
+    begun = torch.cat((data["qpos"], data["qvel"]), -1)[:, 1:]
+    assert torch.equal(states, begun)
+
+
+@pytest.mark.parametrize("region", ["inside", "corners", "outside"])
+def test_regions_are_where_their_names_say(region, generator):
+    own = draw_parameters(SCENE, region, 200, generator)
+    share = SCENE.variation.shares(own).abs()
+    expected = {"inside": share <= 1, "corners": (share - 1).abs() < 1e-9}
+    assert expected.get(region, share > 1.2).all()
+
+
+def test_errors_and_hidden_states_are_those_of_the_model(generator):
+    model = random_model(load_scene("cartpole"), generator)
+    own = draw_parameters(SCENE, "inside", ROWS, generator)
+    data = motions(SCENE, [own], [9], generator)
+    errors, hidden = one_step_errors(model, data)
+    assert errors.shape == (ROWS, 9) and (errors > 0).all()
+    assert hidden.shape == (ROWS, 9, 2 * 64)
+
+
+@pytest.mark.slow
+def test_all_of_it_at_a_tiny_budget(generator, tmp_path, capsys):
+    model = random_model(load_scene("cartpole"), generator)
+    save_checkpoint(model, tmp_path / "model", make_card(model))
+    path = tmp_path / "found.json"
+    main(Options("cartpole", {"model": tmp_path / "model"}, 4, 0, fit=False, json=path))
+    rows = json.loads(path.read_text())["results"]["errors"]
+    assert len(rows) == 3 * 2 * len(HISTORIES)
+    assert capsys.readouterr().out
