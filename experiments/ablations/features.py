@@ -45,13 +45,13 @@ class DistanceTokens(SceneFeatures):
         self.size -= sum(sizes.get(key, 0) for key in derived)
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """``(*batch, size)``."""
         state = self.robot.state_features(qpos, qvel)
-        found = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
+        found = self.contact.contact_features(qpos, qvel, terrain, drive)
         kept = (found[number] for number in self.kept)
-        return torch.cat((state, joint_torque, *kept), -1)
+        return torch.cat((state, drive, *kept), -1)
 
 
 class PaperTokens(SceneFeatures):
@@ -66,12 +66,12 @@ class PaperTokens(SceneFeatures):
         self.size = self.input.size
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """``(*batch, size)``."""
         angles, wrapped = self.robot.joints.angles, qpos.clone()
         wrapped[..., angles] = wrap_angle(qpos[..., angles])
-        return self.input(wrapped, qvel, joint_torque, terrain)
+        return self.input(wrapped, qvel, drive, terrain)
 
 
 class LinkTokens(SceneFeatures):
@@ -82,13 +82,13 @@ class LinkTokens(SceneFeatures):
         self.frame = BaseFrame(scene)
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """``(*batch, size)``."""
         state = self.robot.state_features(qpos, qvel)
-        found = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
+        found = self.contact.contact_features(qpos, qvel, terrain, drive)
         found = aim(self.contact, found, self.frame(qpos)[0].mT)
-        return torch.cat((state, joint_torque, *found), -1)
+        return torch.cat((state, drive, *found), -1)
 
 
 class EndToEndTokens(SceneFeatures):
@@ -106,11 +106,11 @@ class EndToEndTokens(SceneFeatures):
         self.size = base + width + len(scene.actuated)
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """``(*batch, size)``."""
         joints = self.robot.joints(qpos, qvel)[: self.num_parts]
-        return torch.cat((*base_in_world(self, qpos, qvel), *joints, joint_torque), -1)
+        return torch.cat((*base_in_world(self, qpos, qvel), *joints, drive), -1)
 
 
 class WorldTokens(SceneFeatures):
@@ -122,13 +122,13 @@ class WorldTokens(SceneFeatures):
             self.size += WORLD_POSE - 3
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, joint_torque: Tensor, terrain: Tensor | None
+        self, qpos: Tensor, qvel: Tensor, drive: Tensor, terrain: Tensor | None
     ) -> Tensor:
         """``(*batch, size)``."""
-        found = self.contact.contact_features(qpos, qvel, terrain, joint_torque)
+        found = self.contact.contact_features(qpos, qvel, terrain, drive)
         found = aim(self.contact, found, self.contact.pose(qpos)[1])
         base, joints = base_in_world(self, qpos, qvel), self.robot.joints(qpos, qvel)
-        return torch.cat((*base, *joints, joint_torque, *found), -1)
+        return torch.cat((*base, *joints, drive, *found), -1)
 
 
 def base_in_world(tokens: SceneFeatures, qpos: Tensor, qvel: Tensor) -> list[Tensor]:

@@ -20,7 +20,7 @@ from typing import Annotated, Any, cast
 
 import torch
 import tyro
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.checkpoint import load_checkpoint
@@ -34,7 +34,7 @@ from torchrl_nerd.robots import load_scene, preset_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import command_of, drive
 
-from .adaptation import changes, probe
+from .adaptation import changes, probe, rates
 from .identify import identify
 from .motions import Region, draw_parameters, motions
 
@@ -65,8 +65,9 @@ class Options:
 
 def roll(dynamics: Any, scene: Scene, future: TensorDict, own: Tensor) -> Tensor:
     """Positions ``(rows, K, nq)`` under the recorded commands; ``own``: parameters."""
-    state, path = future[:, 0].select(QPOS, QVEL).set(PARAMETERS, own), []
-    terrain, commands = future[:, 0].get(TERRAIN, None), command_of(scene, future)
+    first, path = cast(TensorDict, future[:, 0]), []
+    state: TensorDictBase = first.select(QPOS, QVEL).set(PARAMETERS, own)
+    terrain, commands = first.get(TERRAIN, None), command_of(scene, future)
     for command in commands.unbind(1):
         torque, ctrl = drive(scene, command, state[QPOS], state[QVEL])
         state = dynamics.step(state, torque, terrain, ctrl)
@@ -78,11 +79,11 @@ def of_model(
     model: NeRD, scene: Scene, history: TensorDict, future: TensorDict
 ) -> Tensor:
     """A model that has seen the history."""
-    dynamics = NeRDDynamics(model)
-    dynamics.reset(future[:, 0])
+    dynamics, first = NeRDDynamics(model), cast(TensorDict, future[:, 0])
+    dynamics.reset(first)
     if history.batch_size[1]:
         warm_up(dynamics, history)
-    return roll(dynamics, scene, future, future[:, 0][PARAMETERS])
+    return roll(dynamics, scene, future, first[PARAMETERS])
 
 
 def of_mujoco(
@@ -93,7 +94,7 @@ def of_mujoco(
 ) -> Tensor:
     """MuJoCo with parameters that may follow from the history."""
     dynamics = MujocoDynamics(scene, num_threads=1)
-    dynamics.reset(future[:, 0])
+    dynamics.reset(cast(TensorDict, future[:, 0]))
     return roll(dynamics, scene, future, parameters(history, future))
 
 
@@ -174,6 +175,7 @@ def main(options: Options) -> None:
         "errors": measure(scene, candidates, options),
         "changes": changes(scene, models, options.seed + 10),
         "probe": probe(scene, models, options.seed + 20),
+        "rates": rates(load_scene(options.scene)),
     }
     if options.json is not None:
         words = ["python -m experiments.hidden_parameters", *sys.argv[1:]]

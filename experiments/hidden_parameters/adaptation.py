@@ -1,11 +1,14 @@
 """What a model's hidden state says of the parameters, and how soon it follows a change."""
 
-from typing import Any
+import statistics
+import time
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.keys import (
     CTRL,
@@ -17,6 +20,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.modules.transformer import Attention
 from torchrl_nerd.scenes import Scene
 
@@ -27,6 +31,7 @@ CHANGE, AFTER = 100, 60  # step at which a parameter changes, steps after it
 SEEN = 50  # steps of history that a probe reads the hidden state after
 LAST = 10  # steps whose hidden states a probe reads the mean of
 RIDGE = 1e-3
+BANDS, ENVS, TURNS = (10, 32, 64, 128), 512, 15
 BACK = 2.0  # the error is back below this many times its former level
 CHANGES = {  # kind of parameter -> what it is multiplied by
     "motor": 2.0 / 3.0,
@@ -49,7 +54,7 @@ def one_step_errors(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
         layer.register_forward_pre_hook(lambda _, given: seen.append(given[0].clone()))
         for layer in watched
     ]
-    dynamics.reset(data[:, 0])
+    dynamics.reset(cast(TensorDict, data[:, 0]))
     for now in data.unbind(1):
         state = now.select(QPOS, QVEL, PARAMETERS)
         given = (now.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
@@ -111,17 +116,50 @@ def probe(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, An
     generator = Generator().manual_seed(seed)
     own = draw_parameters(scene, "inside", 4 * ROWS, generator)
     data = motions(scene, [own], [SEEN + 1], generator)
-    truth, half = variation.shares(data[:, 0][PARAMETERS]), len(data) // 2
+    actual, half = variation.shares(data[PARAMETERS][:, 0]), len(data) // 2
     for name, model in models.items():
         state = one_step_errors(model, data)[1][:, -LAST:].mean(1).double()
         state = (state - state[:half].mean(0)) / state[:half].std(0).clamp_min(1e-9)
         state = torch.cat((state, torch.ones(len(state), 1)), 1)
-        a, b = state[:half], truth[:half]
+        a, b = state[:half], actual[:half]
         eye = RIDGE * half * torch.eye(a.shape[1], dtype=a.dtype)
         guess = state[half:] @ torch.linalg.solve(a.T @ a + eye, a.T @ b)
-        miss = (guess - truth[half:]).square().mean(0) / truth[half:].var(0)
+        miss = (guess - actual[half:]).square().mean(0) / actual[half:].var(0)
         share = dict(zip(variation.ranges, (1.0 - miss).tolist(), strict=True))
-        points = torch.stack((truth[half:], guess), -1)[:200].tolist()
+        points = torch.stack((actual[half:], guess), -1)[:200].tolist()
         rows.append({"name": name, "explained": share, "points": points})
         print("probe", name, {k: round(v, 2) for k, v in share.items()}, flush=True)
+    return rows
+
+
+def rates(scene: Scene) -> list[dict[str, Any]]:
+    """Control steps per second of a transformer 2x64 by its band, and its ring's size.
+
+    The bands take turns, so that a machine that others use slows all alike.
+    """
+    found: dict[int, list[float]] = {band: [] for band in BANDS}
+    state = TensorDict(
+        scene.sample_initial(ENVS, Generator().manual_seed(0))[0], [ENVS]
+    )
+    torque = torch.zeros(ENVS, len(scene.actuated), dtype=torch.float64)
+    features = FeatureConfig()
+    dynamics = {
+        band: NeRDDynamics(
+            NeRD(scene, features, network_config(f"transformer-2x64@{band}"))
+        )
+        for band in BANDS
+    }
+    for turn in range(TURNS + 1):
+        for band, each in dynamics.items():
+            began = time.perf_counter()
+            for _ in range(10):
+                each.step(state, torque)
+            if turn:  # the first one warms up
+                found[band].append(10 * ENVS / (time.perf_counter() - began))
+    rows = []
+    for band, values in found.items():
+        kilobytes = 2 * 2 * (band - 1) * 64 * 4 / 1024
+        rate = statistics.median(values)
+        rows.append({"band": band, "steps_per_s": rate, "ring_kib_per_env": kilobytes})
+    print("rates", {row["band"]: round(row["steps_per_s"]) for row in rows}, flush=True)
     return rows

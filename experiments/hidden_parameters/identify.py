@@ -26,20 +26,21 @@ def identify(scene: Scene, history: TensorDict) -> Tensor:
     rows, size = len(history), variation.size
     u = torch.full((rows, size), 0.5, dtype=torch.float64)
     damping = torch.full((rows, 1, 1), FIRST_DAMPING, dtype=torch.float64)
-    scale = (history[NEXT_QVEL] - history[QVEL]).flatten(0, 1).std(0).clamp_min(1e-9)
+    gain = history[NEXT_QVEL] - history[QVEL]
+    scale = gain.reshape(-1, gain.shape[-1]).std(0).clamp_min(1e-9)
     eye = torch.eye(size, dtype=torch.float64)
 
     def residuals(u: Tensor) -> Tensor:  # (k * rows, size) -> (k * rows, T * nv)
         copies = len(u) // rows
-        data = cast(TensorDict, history.repeat(copies, 1))
+        data = cast(TensorDict, torch.cat([history] * copies))  # pyright: ignore
         data[PARAMETERS] = variation.values(u)[:, None].expand(-1, data.shape[1], -1)
-        flat = data.flatten(0, 1)
+        flat = cast(TensorDict, data.flatten(0, 1))
         state = flat.select(QPOS, QVEL, PARAMETERS)
         torque, ctrl = drive(scene, command_of(scene, flat), flat[QPOS], flat[QVEL])
         dynamics = MujocoDynamics(scene, num_threads=1)
         after = dynamics.step(state, torque, flat.get(TERRAIN, None), ctrl)
         error = (after[QVEL] - flat[NEXT_QVEL]) / scale
-        return error.unflatten(0, (len(u), -1)).flatten(1)
+        return error.reshape(len(u), -1)
 
     now = residuals(u)
     for _ in range(ITERATIONS):

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import torch
 from dynamics_helpers import random_drive
+from servo_helpers import ARM
+from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.dynamics.mujoco import engine_model
@@ -13,6 +15,7 @@ from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 
 ROWS, STEPS = 6, 12
+PLANE = "terrain"
 LINKS = {"com_y:link2": (-0.2, 0.2), "com_x:link2": (-0.2, 0.2)}
 PLACE = {f"payload_{axis}:torso": (-0.3, 0.3) for axis in "xyz"}
 CASES = [
@@ -58,9 +61,6 @@ def alone(scene: Scene, start, torques, parameters) -> np.ndarray:
     return np.array(states)
 
 
-PLANE = "terrain"
-
-
 @pytest.mark.parametrize(("name", "ranges"), CASES, ids=IDS)
 def test_a_row_is_a_model_of_its_own_bit_for_bit(name, ranges, generator):
     scene = load_scene(name).vary(ranges)
@@ -84,3 +84,30 @@ def test_a_row_is_a_model_of_its_own_bit_for_bit(name, ranges, generator):
         atol = 0.0 if terrain is None else 1e-12 * np.abs(expected).max()
         np.testing.assert_allclose(path[row], expected, rtol=0, atol=atol)
     assert (np.abs(path[:, -1, : state[QPOS].shape[1]] - state[QPOS].numpy()) > 0).any()
+
+
+def test_servos_of_a_row_are_as_strong_and_late_as_it_says(tmp_path, generator):
+    """With ``ctrl`` MuJoCo's own law acts in every substep, that of the row's model."""
+    ranges = {"motor:a": (0.5, 1.5), "damping": (0.1, 2.0), "delay": (0, 2)}
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    scene = Scene.from_mjcf(path).vary(ranges)
+    state = TensorDict(scene.sample_initial(ROWS, generator)[0], [ROWS])
+    state[PARAMETERS] = own = scene.variation.draw(ROWS, generator)
+    commands = torch.rand(STEPS, ROWS, 2, generator=generator).double()
+    dynamics, start, idle = MujocoDynamics(scene), state, torch.zeros(ROWS, 2).double()
+    dynamics.reset(state)
+    for ctrl in commands:
+        state = dynamics.step(state, idle, None, ctrl)
+    for row in range(ROWS):
+        model = scene.variation.model_of(own[row])
+        assert model.actuator_gainprm[0, 0] == pytest.approx(4500 * float(own[row, 0]))
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = start[row][QPOS], start[row][QVEL]
+        late = int(own[row, 2])
+        given = torch.cat((torch.zeros(late, 2), commands[:, row]))[:STEPS].numpy()
+        for ctrl in given:
+            data.ctrl[:] = ctrl
+            mujoco.mj_step(model, data, scene.substeps)
+        assert np.array_equal(state[row][QPOS], data.qpos)
+        assert np.array_equal(state[row][QVEL], data.qvel)

@@ -11,7 +11,7 @@ A parameter is named ``KIND`` or ``KIND:TARGET``. With V its value:
 | ``damping`` | joint | N s/m, N m s/rad | damping V |
 | ``frictionloss`` | joint | N, N m | dry friction V |
 | ``armature`` | joint | kg, kg m^2 | armature V |
-| ``motor`` | joint | factor | the strength of its motors times V |
+| ``motor`` | joint | factor | the strength of the motors on it times V |
 | ``delay`` | | control steps | every torque V steps later, none before the first |
 | ``friction`` | geom | factor | sliding, torsional and rolling friction times V |
 | ``stiffness`` | geom | factor | contact stiffness times V, the same damping ratio |
@@ -36,6 +36,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.scenes.parameter_kinds import KINDS, MOTOR, Fields, Kind
 
+ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 Ranges = Mapping[str, Sequence[float]]
 """Name of each parameter -> lowest and highest value."""
 
@@ -157,7 +158,7 @@ class Variation:
                 if about.write is not None:
                     about.write(fields, indices, value)
                 elif kind == "motor":
-                    is_on = np.isin(self._motor_dofs, indices)
+                    is_on = np.isin(self._motor_dofs, indices) | (p.name == "motor")
                     MOTOR(fields, np.flatnonzero(is_on).tolist(), value)
         return fields
 
@@ -189,8 +190,10 @@ class Variation:
 
     @cached_property
     def _motor_dofs(self) -> np.ndarray:
-        """The dof that each actuator drives."""
-        return self.model.jnt_dofadr[self.model.actuator_trnid[:, 0]]
+        """The dof of the joint that each actuator acts on; -1 where it is on no joint."""
+        model, is_on = self.model, np.isin(self.model.actuator_trntype, ON_JOINT)
+        joint = np.where(is_on, model.actuator_trnid[:, 0], 0)
+        return np.where(is_on, model.jnt_dofadr[joint], -1)
 
 
 def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Parameter:
