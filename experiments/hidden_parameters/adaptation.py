@@ -116,7 +116,12 @@ def probe(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, An
     generator = Generator().manual_seed(seed)
     own = draw_parameters(scene, "inside", 4 * ROWS, generator)
     data = motions(scene, [own], [SEEN + 1], generator)
-    actual, half = variation.shares(data[PARAMETERS][:, 0]), len(data) // 2
+    given, half = data[PARAMETERS][:, 0], len(data) // 2
+    actual, told = variation.shares(given), list(variation.ranges)
+    if "motor" in told and told[0].startswith("mass"):  # what a torque's effect shows
+        ratio = (given[:, told.index("motor")] / given[:, 0]).log()
+        actual = torch.cat((actual, (ratio / ratio.abs().max())[:, None]), 1)
+        told.append(f"motor / {told[0]}")
     for name, model in models.items():
         state = one_step_errors(model, data)[1][:, -LAST:].mean(1).double()
         state = (state - state[:half].mean(0)) / state[:half].std(0).clamp_min(1e-9)
@@ -125,7 +130,7 @@ def probe(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, An
         eye = RIDGE * half * torch.eye(a.shape[1], dtype=a.dtype)
         guess = state[half:] @ torch.linalg.solve(a.T @ a + eye, a.T @ b)
         miss = (guess - actual[half:]).square().mean(0) / actual[half:].var(0)
-        share = dict(zip(variation.ranges, (1.0 - miss).tolist(), strict=True))
+        share = dict(zip(told, (1.0 - miss).tolist(), strict=True))
         points = torch.stack((actual[half:], guess), -1)[:200].tolist()
         rows.append({"name": name, "explained": share, "points": points})
         print("probe", name, {k: round(v, 2) for k, v in share.items()}, flush=True)

@@ -1,0 +1,60 @@
+"""Error against history, and inferred against actual parameters, as one picture.
+
+python -m experiments.hidden_parameters.plot RESULTS.json PICTURE.svg
+"""
+
+from pathlib import Path
+from typing import Any
+
+import tyro
+from matplotlib.figure import Figure
+
+from torchrl_nerd.evaluation.results import read_results
+
+SHOWN = 200  # points of a probe
+
+
+def curves(axes: Any, found: dict[str, Any], steps: str) -> None:
+    """Mean error over so many steps, inside the ranges, a line per candidate."""
+    rows = [row for row in found["errors"] if row["region"] == "inside"]
+    quantity = list(rows[0]["errors"][steps])[-1]
+    lengths = sorted({row["history"] for row in rows})
+    for name in dict.fromkeys(row["name"] for row in rows):
+        own = [row for row in rows if row["name"] == name]
+        errors = [row["errors"][steps][quantity]["mean"] for row in own]
+        axes.plot(lengths, errors, marker="o", markersize=3, label=name)
+    axes.set_xscale("symlog", linthresh=1)
+    axes.set_xticks(lengths, lengths)
+    axes.set_yscale("log")
+    axes.set_xlabel("steps of history")
+    axes.set_ylabel(f"error of {quantity} over {steps} steps (rad)")
+
+
+def points(axes: Any, found: dict[str, Any], parameter: str) -> None:
+    """Actual and inferred parameter of the first model, both -1 to 1."""
+    row = found["probe"][0]
+    column = list(row["explained"]).index(parameter)
+    actual, guess = zip(
+        *(point[column] for point in row["points"][:SHOWN]), strict=True
+    )
+    axes.plot(actual, guess, ".", markersize=3)
+    axes.set_xlabel(f"actual {parameter}")
+    axes.set_ylabel("linear in the hidden state")
+    axes.set_title(f"explained: {row['explained'][parameter]:.2f}", fontsize=9)
+
+
+def main(results: tyro.conf.Positional[Path], path: tyro.conf.Positional[Path]) -> None:
+    """Draw the results of `hidden_parameters`."""
+    found = read_results(results)["results"]
+    best = max(found["probe"][0]["explained"].items(), key=lambda item: item[1])[0]
+    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for axes, steps in zip(panels, ("20", "100"), strict=False):
+        curves(axes, found, steps)
+    panels[0].legend(fontsize=7)
+    points(panels[2], found, best)
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
