@@ -26,11 +26,13 @@ class FeatureConfig:
       nothing touches it, not at constant velocity; see `PredictedPenetration` |
     | ``parameters`` | the row's parameters, for a model of a varied scene that is told what
       others find in their history; see `Variation` |
+    | ``self_contact`` | contacts of the robot with itself, see `SelfContactFeatures` |
     """
 
     predicted_force: bool = False
     unconstrained_motion: bool = False
     parameters: bool = False
+    self_contact: bool = False
 
 
 NO_PREDICTIONS = FeatureConfig()
@@ -99,6 +101,7 @@ class TrainConfig:
     # feature: contacts along the unconstrained motion in place of constant velocity
     unconstrained_motion: bool = False
     parameters: bool = False  # feature: the row's parameters, of a varied scene
+    self_contact: bool = False  # features of the robot's contacts with itself
     steps: int = 20_000  # updates on one-step targets
     rollout_steps: int = 2_000  # further updates on the model's own rollouts
     batch_size: int = 64  # sequences per update
@@ -136,7 +139,7 @@ class TrainConfig:
     def features(self) -> FeatureConfig:
         """What is among the model's features."""
         predicted = self.predicted_force, self.unconstrained_motion
-        return FeatureConfig(*predicted, self.parameters)
+        return FeatureConfig(*predicted, self.parameters, self.self_contact)
 
     @property
     def total_steps(self) -> int:

@@ -84,6 +84,10 @@ CONTACT_NORMAL = "contact_normal"
 """Ground normal at each point in B_t ``(*batch, num_points * 3)``, zero beyond the
 margin. Only where it does not follow from gravity."""
 
+SELF_CONTACT = "self_contact"
+"""Distance, normal, velocity and predicted depth of pairs of the robot's own shapes in B_t
+``(*batch, D)``; see SelfContactFeatures. Only where the model's `FeatureConfig` asks."""
+
 STATE_DELTA = "state_delta"
 """Change of the state over one control step in B_t ``(*batch, 2 nv)``; see StateDelta."""
 

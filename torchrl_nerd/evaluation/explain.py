@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from torch import Generator
@@ -22,7 +23,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, own_contacts
-from torchrl_nerd.scenes.penetration import count_touching
+from torchrl_nerd.scenes.penetration import touching_bodies
 from torchrl_nerd.scenes.symmetries import Effect, base_effects
 from torchrl_nerd.scenes.terrain import PLANE
 
@@ -135,8 +136,9 @@ class SceneReport:
         never = len(self.self_contacts) - len(touch)
         also = [f"{never} pairs in none"] if never else []
         return (
-            f"{len(self.self_contacts)} pairs of bodies, without features; share of "
-            f"random states in which they touch: {', '.join([*shares, *also])}"
+            f"{len(self.self_contacts)} pairs of bodies, features with --self-contact "
+            "alone; share of random states in which they touch: "
+            + ", ".join([*shares, *also])
         )
 
 
@@ -191,8 +193,8 @@ def _self_contacts(scene: Scene) -> list[tuple[tuple[int, int], float]]:
     }
     if pairs:
         data = simulate(scene, *TRAJECTORIES, Generator().manual_seed(0))
-        states = data[is_sound(data)]["next", QPOS].flatten(0, 1)
-        counts = count_touching(scene.model, states)
+        states = data["next", QPOS][is_sound(data)].flatten(0, 1)
+        counts = Counter(chain.from_iterable(touching_bodies(scene.model, states)))
         pairs |= {pair: counts[pair] / max(1, len(states)) for pair in pairs}
     return sorted(pairs.items(), key=lambda item: (-item[1], item[0]))
 

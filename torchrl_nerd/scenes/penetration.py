@@ -1,6 +1,5 @@
 """Where a robot touches itself and the ground, and how deep, by MuJoCo's own collision."""
 
-from collections import Counter
 from collections.abc import Iterator
 
 import mujoco
@@ -23,13 +22,13 @@ def deepest_contacts(model: mujoco.MjModel, qpos: Tensor) -> Tensor:
     return torch.tensor(depths, dtype=torch.float64).to(qpos)
 
 
-def count_touching(model: mujoco.MjModel, qpos: Tensor) -> Counter[tuple[int, int]]:
-    """In how many of the states ``(rows, nq)`` two bodies touch; ids, the low first."""
-    counts: Counter[tuple[int, int]] = Counter()
+def touching_bodies(
+    model: mujoco.MjModel, qpos: Tensor
+) -> Iterator[set[tuple[int, int]]]:
+    """Which bodies touch each other in each state ``(rows, nq)``, by ids, low first."""
     for geoms, dist in _contacts(model, qpos):
         bodies = np.sort(model.geom_bodyid[geoms[dist <= 0.0]])
-        counts.update({(int(low), int(high)) for low, high in bodies})
-    return counts
+        yield {(int(low), int(high)) for low, high in bodies}
 
 
 def _contacts(

@@ -52,7 +52,7 @@ def default_sampling(
     # a floating base has ranges of its own where it is the first joint
     is_first = base.is_floating and base.dof_address == 0
     skipped_q, skipped_v = (7, 6) if is_first else (0, 0)
-    low, high = (tuple(x.tolist()) for x in _positions(model))
+    low, high = (tuple(x.tolist()) for x in position_ranges(model))
     torque = _largest_torques(model, controller, low, high)
     speed = _speeds(model, controller, torque).tolist()
     controls = controller.ctrl_low, controller.ctrl_high
@@ -70,7 +70,7 @@ def default_sampling(
     return replace(sampling, **ranges)
 
 
-def _positions(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+def position_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest ``qpos``; quaternions are yet to be normalised."""
     low, high, reaches = model.qpos0.copy(), model.qpos0.copy(), _reaches(model)
     for joint in range(model.njnt):
@@ -145,7 +145,7 @@ def _stable(
     """
     free, rng = copy.copy(model), np.random.default_rng(0)
     free.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    (low, high), data = _positions(model), mujoco.MjData(free)
+    (low, high), data = position_ranges(model), mujoco.MjData(free)
     controls = np.array((controller.ctrl_low, controller.ctrl_high)).reshape(2, -1)
     for halvings in range(MAX_HALVINGS):
         slower, num_lost = speeds / 2.0**halvings, 0

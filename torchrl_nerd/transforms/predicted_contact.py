@@ -46,14 +46,13 @@ class PredictedPenetration(nn.Module):
         self.kinematics = PointKinematics(
             scene.model, scene.base, points.bodies, points.positions
         )
-        times = num_times(scene)
-        one = np.arange(times) / times
+        one = times_of(scene)
         two, three = one**2, one**3
         blend = 3.0 * two - 2.0 * three
         keep_constants(  # polynomials at the K times, by their values at the ends
             self,
             radii=points.radii,
-            parabola=np.stack((1.0 - two, one - two, two)),  # (3, K)
+            parabola=parabola(one),
             cubic=np.stack((1.0 - blend, one - 2.0 * two + three, blend, three - two)),
         )
 
@@ -108,6 +107,20 @@ class PredictedPenetration(nn.Module):
 def num_times(scene: Scene) -> int:
     """K: number of predicted times per step."""
     return min(scene.substeps // scene.reference_ratio, MAX_TIMES)
+
+
+def times_of(scene: Scene) -> np.ndarray:
+    """The predicted times as shares of the step, ``(K,)``."""
+    return np.arange(num_times(scene)) / num_times(scene)
+
+
+def parabola(times: np.ndarray) -> np.ndarray:
+    """What a parabola at ``times (K,)`` is of its start, its first slope and its end.
+
+    ``(3, K)``: shares of the three, for a parabola over the times from 0 to 1.
+    """
+    square = times**2
+    return np.stack((1.0 - square, times - square, square))
 
 
 class PredictedForce(nn.Module):

@@ -7,12 +7,14 @@ from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.contact_features import ContactFeatures
 from torchrl_nerd.transforms.robot_centric import RobotCentric
+from torchrl_nerd.transforms.self_contact import SelfContactFeatures
 
 
 class SceneFeatures(nn.Module):
-    """`RobotCentric`, drive and `ContactFeatures` of a state, concatenated.
+    """Robot, drive, contacts with the ground and with itself of a state, concatenated.
 
-    The drive is joint torques, servos' controls and what the model is told, see `drive_of`.
+    See `RobotCentric`, `ContactFeatures` and `SelfContactFeatures`. The drive is joint
+    torques, servos' controls and what the model is told, see `drive_of`.
 
     Raises:
         ValueError: a model that is told parameters, of a scene that does not vary.
@@ -23,7 +25,9 @@ class SceneFeatures(nn.Module):
         self.config = config
         self.robot = RobotCentric(scene, config)
         self.contact = ContactFeatures(scene, config)
-        self.size = sum((*self.robot.sizes.values(), *self.contact.sizes.values()))
+        self.own = SelfContactFeatures(scene, config)
+        parts = self.robot, self.contact, self.own
+        self.size = sum(size for part in parts for size in part.sizes.values())
         self.variation = scene.variation if config.parameters else None
         if config.parameters and self.variation is None:
             raise ValueError(
@@ -43,4 +47,5 @@ class SceneFeatures(nn.Module):
         """Raw features ``(*batch, F)`` in the dtype of the state."""
         state = self.robot.state_features(qpos, qvel)
         contacts = self.contact.contact_features(qpos, qvel, terrain, drive)
-        return torch.cat((state, drive, *contacts), -1)
+        own = self.own.self_contact_features(qpos, qvel)
+        return torch.cat((state, drive, *contacts, *own), -1)
