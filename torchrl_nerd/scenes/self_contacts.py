@@ -1,8 +1,8 @@
 """Pairs of a robot's own shapes that come near each other, each shape as a capsule.
 
-Spheres and capsules are exact. Any other shape is a capsule along the longest axis of its
-box (a mesh: of the box about it): as long as the box, its radius the mean of half the other
-two sides. It is off by as much as those differ, and at corners by up to 0.73 of its radius.
+Spheres and capsules are exact. Any other shape is a capsule along the longest side of a
+cuboid about it, as long as that, its radius the mean of half the other two sides. It is off
+by as much as those differ, and at corners by up to 0.73 of its radius.
 """
 
 from dataclasses import dataclass
