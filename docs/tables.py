@@ -261,7 +261,21 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
         about = (
             f"Mean error of {quantity} (rad) over 100 steps, and time for the history:"
         )
-        parts += [about, rows(table), made_by(record)]
+        parts += [about, rows(table)]
+        head = ["what changes", "model", "before", "after", "steps until it is back"]
+        table = [["times", *head]]
+        for row in record["results"]["changes"]:
+            errors = number(row["before"]), number(row["first"])
+            back = row["steps_until_back"]
+            times = f"{row['factor']:.2f}", row["parameter"], row["name"]
+            table.append([*times, *errors, "-" if back is None else str(back)])
+        parts += ["Median error of one step when a parameter changes:", rows(table)]
+        table = [["band", "control steps per second", "ring (KiB per env)"]]
+        for row in record["results"]["rates"]:
+            rate = f"{row['steps_per_s']:,.0f}"
+            table.append([str(row["band"]), rate, number(row["ring_kib_per_env"])])
+        parts += ["A transformer 2x64, 512 envs, not compiled:", rows(table)]
+        parts.append(made_by(record))
     return "\n\n".join(parts)
 
 
