@@ -32,8 +32,8 @@ def expect_count(least: int, **settings: object) -> None:
         SettingError: naming the first such setting.
     """
     for name, value in settings.items():
-        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
-        if not is_whole or int(value) < least:
+        is_number = isinstance(value, Integral) and not isinstance(value, bool)
+        if not is_number or int(value) < least:  # pyright: ignore
             raise SettingError(
                 f"expected {name}, a whole number of at least {least}, got {value!r}"
             )
