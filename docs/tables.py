@@ -2,7 +2,7 @@
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
 ``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
-``gpu_errors`` or ``hidden_parameters``.
+``gpu_errors``, ``hidden_parameters`` or ``robots_that_load``.
 """
 
 import json
@@ -279,6 +279,34 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
     return "\n\n".join(parts)
 
 
+def robots_table(folder: Path = RESULTS) -> str:
+    """Third-party robots: how many load, each that does, and why others do not."""
+    record = one("robots_that_load", folder)
+    if record is None:
+        return ""
+    found, refused = record["results"], []
+    table = [["robot", "contact points", "beyond them (mm)", "against mj_step"]]
+    table[0] += ["dropped (%)", "99% slower than (rad/s)"]
+    for row in found:
+        name = f"{row['source']}: {row['robot']}"
+        if not row["loads"]:
+            refused.append(f"- {name}: {row['why'].partition(': ')[2]}.")
+            continue
+        points, error = row["contact_points"], 1e3 * row["contact_error_m"]
+        speed = number(row["speed_p99"].get("rad_per_s"))
+        share = f"{100.0 * row['dropped']:.0f}"
+        same = number(row["difference"])
+        table.append([name, str(points), f"{error:.1f}", same, share, speed])
+    sources = dict.fromkeys(row["source"] for row in found)
+    loads = [["source", "robots", "load"]]
+    for source in sources:
+        own = [row["loads"] for row in found if row["source"] == source]
+        loads.append([source, str(len(own)), str(sum(own))])
+    loads.append(["all", str(len(found)), str(len(table) - 1)])
+    why = "Refused:\n\n" + "\n".join(refused) if refused else ""
+    return "\n\n".join((rows(loads), rows(table), why, made_by(record)))
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
@@ -290,11 +318,14 @@ TABLES = {
     "gpu_rates": gpu_rates_table,
     "gpu_errors": gpu_errors_table,
     "hidden_parameters": hidden_parameters_tables,
+    "robots_that_load": robots_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
 COMMANDS |= {"state_dtype": MEASURED, "gpu_rates": "make gpu", "gpu_errors": "make gpu"}
 COMMANDS |= {"hidden_parameters": "python -m experiments.hidden_parameters"}
+ROBOTS = "python experiments/robots_that_load.py --json results/robots_that_load.json"
+COMMANDS |= {"robots_that_load": ROBOTS}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

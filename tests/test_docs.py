@@ -374,6 +374,10 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     precise = {"steps": 5, "float64": {"x": 0.1}, "float32": {"x": 0.2}}
     precise |= {"float64_us": 3.0, "float32_us": 1.5}
     chain |= {"positions_ms": 0.123, "with_velocities_ms": 1.5}
+    robot = {"source": "suite", "robot": "dog"}
+    loaded = {"source": "suite", "robot": "cat", "loads": True, "contact_points": 5}
+    loaded |= {"contact_error_m": 0.0021, "difference": 0.0, "dropped": 0.04}
+    loaded |= {"speed_p99": {"rad_per_s": 12.0}}
     for name, results in (
         ("eval_robot", {"errors": errors}),
         ("bench_robot", {"errors": errors, "rates": [rate], "steps": 100}),
@@ -381,6 +385,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
         ("kinematics_libraries", [chain]),
         ("transfer_franka_reach_osc_x", {"policy": "runs/p", "returns": [earned]}),
         ("state_dtype", {"ant": precise}),
+        ("robots_that_load", [loaded, {**robot, "loads": False, "why": "b: muscles"}]),
         (
             "gpu/b_rates",
             {"items": {"tiny streaming, graph, 512": {"steps_per_s": 2e6}}},
@@ -402,6 +407,8 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "| tiny | graph | 2 | - |" in shown and "| ant | MJX | - | 0.05 |" in shown
     assert "| ant | x, 5 | 0.1 | 0.2 | 3.0 | 1.5 |" in shown
     assert "| a | x | 0.123 | 0.123 | 0.123 |" in shown
+    assert "| suite | 2 | 1 |" in shown and "- suite: dog: muscles." in shown
+    assert "| suite: cat | 5 | 2.1 | 0 | 4 | 12 |" in shown
     assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
 
 

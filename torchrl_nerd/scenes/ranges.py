@@ -1,7 +1,9 @@
 """Ranges of training states and torques that follow from a compiled model.
 
 Positions fill the joint limits (half a turn or a metre to both sides where there is none).
-Torques are the largest the actuators can give. A hinge's speed is what gravity and its own
+Torques are the largest the actuators can give. Where one of them, held over a control
+step, changes a joint's speed by more than four times its range, none changes it by more
+than a sixteenth, and all speeds are halved. A hinge's speed is what gravity and its own
 torque together reach over half its range, against its inertia and armature, less where its
 damper allows less. A slide's is that of a fall over twice its reach, or what its own force
 reaches. None crosses its range in less than `CROSSING`. All are halved until MuJoCo does
@@ -27,6 +29,7 @@ from torchrl_nerd.scenes.support import silence_mujoco
 
 FREE_SLIDE = 1.0  # m
 CROSSING = 0.1  # s
+MAX_GAIN = 4.0  # changes of speed in a control step over a joint's speed range
 PROP_ROOM = 0.1  # m: how far from its place a prop starts at least
 LEAST_REACH = 0.01  # m
 START_PENETRATION = 1e-3  # m: about what a resting robot's soft contacts give
@@ -36,10 +39,14 @@ DRAWS = 4096  # of actions and states, to find the largest torques
 
 
 def default_sampling(
-    model: mujoco.MjModel, controller: ActuatorController, **ranges: Any
+    model: mujoco.MjModel,
+    controller: ActuatorController,
+    control_step: float,
+    **ranges: Any,
 ) -> Sampling:
     """Sampling ranges from limits and strengths of a compiled model.
 
+    ``control_step``: s, over which a torque is held.
     ``ranges``: fields of `Sampling` to use in place of the default ones; ValueError where
     one is none.
     """
@@ -55,6 +62,12 @@ def default_sampling(
     low, high = (tuple(x.tolist()) for x in position_ranges(model))
     torque = _largest_torques(model, controller, low, high)
     speed = _speeds(model, controller, torque).tolist()
+    dofs = list(controller.dof_addresses)
+    inertia, damping = model.dof_M0[dofs], model.dof_damping[dofs]
+    gentle = np.array(speed)[dofs] * (inertia / control_step + damping)
+    if np.any(np.array(torque) > MAX_GAIN * gentle):  # no damper, and far too strong
+        torque = np.minimum(torque, gentle / MAX_GAIN**2).tolist()
+        speed = [0.5 * v for v in speed]
     controls = controller.ctrl_low, controller.ctrl_high
     sampling = Sampling(
         qpos_low=low[skipped_q:],

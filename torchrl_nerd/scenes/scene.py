@@ -131,7 +131,8 @@ class Scene:
     ) -> "Scene":
         check_supported(name, model)
         controller = ActuatorController.from_model(model)
-        sampling = default_sampling(model, controller, **ranges)
+        control_step = substeps * model.opt.timestep
+        sampling = default_sampling(model, controller, control_step, **ranges)
         scene = cls(name, model, substeps, controller, sampling)
         terrain = scene.terrain  # refuses a ground without features right away
         if terrain is not None and terrain.is_per_row and not scene.sampling.ground:
