@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import mujoco
@@ -33,15 +33,12 @@ from torchrl_nerd.geometry.manifold import FREE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.support import silence_mujoco
 
 SHARED = Path(__file__).parents[2] / "shared" / "robots"
-ROWS, STEPS, COMPARED = (
-    64,
-    100,
-    50,
-)  # trajectories, control steps, and of these compared
-CHECKED = 4  # trajectories that are compared
+ROWS, STEPS = 64, 100  # random trajectories, control steps
+CHECKED, COMPARED = 4, 50  # of these, compared with plain MuJoCo
 
 
 @dataclass
@@ -88,7 +85,7 @@ def difference(scene: Scene, generator: torch.Generator) -> float:
     start, _ = scene.sample_initial(CHECKED, generator)
     size = CHECKED, COMPARED, scene.controller.num_actions
     action = 2.0 * torch.rand(size, generator=generator).double() - 1.0
-    ctrl = scene.controller.ctrl(action)
+    ctrl = cast(ActuatorController, scene.controller).ctrl(action)
     dynamics = MujocoDynamics(scene, num_threads=1)
     state = TensorDict({key: start[key] for key in (QPOS, QVEL)}, [CHECKED])
     dynamics.reset(state)
@@ -102,9 +99,8 @@ def difference(scene: Scene, generator: torch.Generator) -> float:
             if data.warning.number.any():
                 break  # MuJoCo gave up on it, here and there
             for key, want in ((QPOS, data.qpos), (QVEL, data.qvel)):
-                worst = max(
-                    worst, float(abs(path[key][row, step].numpy() - want).max())
-                )
+                gap = np.abs(path[key][row, step].numpy() - np.asarray(want))
+                worst = max(worst, float(gap.max()))
     return worst
 
 
@@ -124,12 +120,12 @@ def speeds(scene: Scene, qvel: torch.Tensor) -> dict[str, float]:
 
 def measure(name: str, seed: int) -> dict[str, Any]:
     """Everything about one robot, or the sentence that refuses it."""
+    generator = torch.Generator().manual_seed(seed)
     try:
         scene = load_scene(name)
+        data = simulate(scene, ROWS, STEPS, generator)
     except ValueError as error:
         return {"loads": False, "why": str(error)}
-    generator = torch.Generator().manual_seed(seed)
-    data = simulate(scene, ROWS, STEPS, generator)
     sound = is_sound(data)
     return {
         "loads": True,
@@ -139,7 +135,7 @@ def measure(name: str, seed: int) -> dict[str, Any]:
         "contact_error_m": scene.contacts.error,
         "difference": difference(scene, generator),
         "dropped": float((~sound).double().mean()),
-        "speed_p99": speeds(scene, data[sound]["next", QVEL]),
+        "speed_p99": speeds(scene, cast(TensorDict, data[sound])["next", QVEL]),
     }
 
 

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants, keep_indices
-from torchrl_nerd.geometry.kinematics import PointKinematics, cross
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.motion import cross
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, rows_last
 from torchrl_nerd.geometry.spd import BranchSparsity, spd_inverse
 from torchrl_nerd.scenes.contact_points import shape_points

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.analytic.frozen_dynamics import DynamicsEvaluation, FrozenDynamics
 from torchrl_nerd.geometry.base import JointAxes, keep_constants, keep_indices
-from torchrl_nerd.geometry.kinematics import cross
+from torchrl_nerd.geometry.motion import cross
 from torchrl_nerd.geometry.spd import matvec
 from torchrl_nerd.scenes.penalty_law import (
     PenaltyLaw,

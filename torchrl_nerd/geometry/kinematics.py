@@ -11,20 +11,24 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import Base, BasePose, is_free, root_pose
+from torchrl_nerd.geometry.base import Base, is_free
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import BALL, SLIDE
+from torchrl_nerd.geometry.motion import (
+    Motion,
+    cross,
+    join,
+    keep,
+    matmul,
+    pick,
+    rotate_by,
+)
+from torchrl_nerd.geometry.other_trees import OtherTrees
 from torchrl_nerd.geometry.rotations import (
     matrix_from_quat,
     quat_matrix,
     quat_normalize,
 )
-
-Motion = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Of n bodies in N robots: origins ``(3, n, N)`` m, rotations ``(3, 3, n, N)``, angular
-velocities rad/s and velocities of the origins m/s, both ``(3, n, N)``, in B_t and relative
-to it. N is 1 where all robots are alike; velocities may be of the first robots alone. The
-batch comes last: products of many small matrices are few operations on long rows."""
 
 
 class PointKinematics(nn.Module):
@@ -78,7 +82,7 @@ class PointKinematics(nn.Module):
             above = {body: index for index, body in enumerate(ordered)}
             order += ordered
         self.body_of_point = [order.index(body) for body in bodies]
-        _keep(self, points=np.asarray(positions).reshape(-1, 3))
+        keep(self, points=np.asarray(positions).reshape(-1, 3))
 
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """Positions and velocities of the points, as seen from the base; both in B_t.
@@ -109,66 +113,12 @@ class PointKinematics(nn.Module):
         identity = torch.eye(3, dtype=q.dtype, device=q.device)[..., None, None]
         above = zero, identity, still, still  # the base itself, seen from the base
         if self.trees is not None:
-            above = _join([above, self.trees(q, v)])
+            above = join([above, self.trees(q, v)])
         motions = [above] if self.shows_roots else []
         for groups in self.depths:
-            above = _join([group(above, q, v) for group in groups])  # pyright: ignore
+            above = join([group(above, q, v) for group in groups])  # pyright: ignore
             motions.append(above)
-        return _pick(_join(motions), self.body_of_point)
-
-
-class OtherTrees(nn.Module):
-    """Motion of the roots of the moving trees beside the robot's, as seen from B_t.
-
-    A free body's own motion; of a tree that stands in the world, that of its place.
-    """
-
-    position: Tensor  # (3, n, 1), m, world, of those that stand
-    rotation: Tensor  # (3, 3, n, 1)
-
-    def __init__(self, model: mujoco.MjModel, base: Base) -> None:
-        super().__init__()
-        self.base, self.pose = base, BasePose(model, base)
-        self.addresses: list[tuple[int, int] | None] = []
-        for root in base.others:
-            joint = int(model.body_jntadr[root])
-            at = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-            self.addresses.append(at if is_free(model, root) else None)
-        places, turns = zip(*(root_pose(model, r) for r in base.others), strict=True)
-        _keep(self, position=places, rotation=turns)
-
-    def forward(self, qpos: Tensor, qvel: Tensor) -> Motion:
-        """From ``qpos (nq, N)`` and ``qvel (nv, M)``, of all robots or the first M."""
-        moving = slice(qvel.shape[-1])
-        place, turn = self.pose(qpos.T)
-        place, inverse = place.T[:, None], turn.permute(2, 1, 0)[:, :, None]
-        zero = qvel.new_zeros(3, qvel.shape[-1])
-        motions = []
-        for i, address in enumerate(self.addresses):
-            position = self.position[:, i].expand(3, qpos.shape[-1])
-            rotation = self.rotation[:, :, i].expand(3, 3, qpos.shape[-1])
-            linear = spin = zero
-            if address is not None:
-                q, v = address
-                position = qpos[q : q + 3]
-                quat = quat_normalize(qpos[q + 3 : q + 7].T)
-                rotation = matrix_from_quat(quat).permute(1, 2, 0)
-                linear, spin = qvel[v : v + 3], qvel[v + 3 : v + 6]
-            motions.append((position, rotation, spin, linear))
-        world, axes, spin, linear = (
-            torch.stack(same, -2) for same in zip(*motions, strict=True)
-        )  # (3, n, N), (3, 3, n, N), ...
-        position = rotate_by(inverse, world - place)
-        rotation = matmul(inverse, axes)
-        spin = rotate_by(rotation[..., moving], spin)
-        linear = rotate_by(inverse[..., moving], linear)
-        if self.base.is_floating:
-            v = self.base.dof_address
-            own, turning = qvel[v : v + 3, None], qvel[v + 3 : v + 6, None]
-            linear = linear - rotate_by(inverse[..., moving], own)
-            linear = linear - cross(turning.expand_as(spin), position[..., moving])
-            spin = spin - turning
-        return position, rotation, spin, linear
+        return pick(join(motions), self.body_of_point)
 
 
 class _Group(nn.Module):
@@ -200,11 +150,11 @@ class _Group(nn.Module):
         for joints in slots:  # the first joints of all bodies, then the second ones
             self.joints.append(_Joint(model, list(joints), turns))
             turns = [np.eye(3)] * len(bodies)
-        _keep(self, offset=offsets, turn=turns)
+        keep(self, offset=offsets, turn=turns)
 
     def forward(self, above: Motion, qpos: Tensor, qvel: Tensor) -> Motion:
         """From the motion of the depth above: places in the parents, then joints."""
-        position, rotation, omega, velocity = _pick(above, self.parents)
+        position, rotation, omega, velocity = pick(above, self.parents)
         offset = rotate_by(rotation, self.offset)
         velocity = velocity + cross(omega, offset[..., : qvel.shape[-1]])
         motion = position + offset, rotation, omega, velocity
@@ -243,7 +193,7 @@ class _Joint(nn.Module):
         rest = np.zeros(len(joints)) if self.kind == BALL else model.qpos0[self.qpos_at]
         crosses = [np.cross(np.eye(3), axis) for axis in axes]
         pairs = list(zip(turns, crosses, strict=True))
-        _keep(
+        keep(
             self,
             axis=[r @ axis for r, axis in zip(turns, axes, strict=True)],
             start=[r @ anchor for r, anchor in zip(turns, anchors, strict=True)],
@@ -282,54 +232,6 @@ class _Joint(nn.Module):
             velocity = velocity - cross(omega + spin, after[..., moving])
             position = position + before - after
         return position, turned, omega + spin, velocity
-
-
-def rotate_by(rotation: Tensor, vector: Tensor) -> Tensor:
-    """``rotation (3, 3, n, N)`` applied to ``vector (3, n, N)``."""
-    x, y, z = vector.unbind(0)
-    product = torch.addcmul(rotation[:, 0] * x, rotation[:, 1], y)
-    return torch.addcmul(product, rotation[:, 2], z)
-
-
-def matmul(a: Tensor, b: Tensor) -> Tensor:
-    """Products of matrices ``(3, 3, n, N)``."""
-    product = torch.addcmul(a[:, :1] * b[0], a[:, 1:2], b[1])
-    return torch.addcmul(product, a[:, 2:], b[2])
-
-
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross products of vectors ``(3, n, N)``: twice as fast as torch's own here."""
-    pairs = (1, 2), (2, 0), (0, 1)
-    return torch.stack([a[i] * b[j] - a[j] * b[i] for i, j in pairs])
-
-
-def _pick(motion: Motion, places: list[int]) -> Motion:
-    """The motions of the bodies at these places, in this order."""
-    if places == list(range(motion[0].shape[-2])):
-        return motion
-    return tuple(take(x, places, -2) for x in motion)  # pyright: ignore
-
-
-def _join(motions: list[Motion]) -> Motion:
-    """The motions of all bodies side by side."""
-    if len(motions) == 1:
-        return motions[0]
-    return tuple(_side_by_side(same) for same in zip(*motions, strict=True))  # pyright: ignore
-
-
-def _side_by_side(parts: tuple[Tensor, ...]) -> Tensor:
-    counts = [part.shape[-1] for part in parts]
-    rows = min(counts) and max(counts)  # a batch may be empty
-    return torch.cat([part.expand(*part.shape[:-1], rows) for part in parts], -2)
-
-
-@torch.inference_mode(False)
-def _keep(module: nn.Module, **per_body: object) -> None:
-    """Keep numbers of n bodies ``(n, *size)`` as buffers ``(*size, n, 1)``."""
-    for name, value in per_body.items():
-        tensor = torch.as_tensor(np.array(value), dtype=torch.float64)
-        tensor = tensor.movedim(0, -1)[..., None].contiguous()
-        module.register_buffer(name, tensor, persistent=False)
 
 
 def _joints(model: mujoco.MjModel, body: int) -> range:

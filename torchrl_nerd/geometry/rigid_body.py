@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base, JointAxes, keep_constants
 from torchrl_nerd.geometry.constants import take
-from torchrl_nerd.geometry.kinematics import cross
+from torchrl_nerd.geometry.motion import cross
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.geometry.spd import matvec, spd_solve
 

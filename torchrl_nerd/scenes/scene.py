@@ -102,10 +102,8 @@ class Scene:
     def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":
         """The robot of a dm_control suite task, at the task's control step.
 
-        Such as ``"cheetah", "run"``; ``ranges`` as for `from_mjcf`.
-
-        Raises:
-            ValueError: no such task, or a robot with something not supported (named).
+        Such as ``"cheetah", "run"``; ``ranges`` as for `from_mjcf`. Raises ValueError: no
+        such task, or a robot with something not supported (named).
         """
         env = importer.load_suite(domain, task)
         model = env.physics.model.ptr
@@ -117,9 +115,7 @@ class Scene:
         """The robot of a Gymnasium MuJoCo environment, at the environment's step.
 
         Such as ``"Ant-v5"``: version 5 names its file. ``ranges`` as for `from_mjcf`.
-
-        Raises:
-            ValueError: no such environment, or a robot with something not supported.
+        Raises ValueError: no such environment, or a robot with something not supported.
         """
         path, frame_skip = importer.gymnasium_file(env_id)
         model, _ = importer.read_mjcf(path, None)
@@ -151,9 +147,8 @@ class Scene:
         """The same scene, its control step cut into another number of substeps."""
         model = copy.copy(self.model)
         model.opt.timestep = self.control_step / substeps
-        model.opt.integrator = (
-            model.opt.integrator if integrator is None else integrator
-        )
+        if integrator is not None:
+            model.opt.integrator = integrator
         return replace(self, model=model, substeps=substeps)
 
     def vary(self, ranges: Ranges) -> "Scene":
@@ -187,8 +182,7 @@ class Scene:
     @cached_property
     def gravity_direction(self) -> tuple[float, float, float]:
         """Unit vector of gravity in the world; where there is none, against z."""
-        x, y, z = unit_gravity(self.model).tolist()
-        return x, y, z
+        return tuple(unit_gravity(self.model).tolist())  # pyright: ignore
 
     @cached_property
     def actuated(self) -> list[int]:
@@ -265,17 +259,13 @@ class Scene:
             qpos, q = state["qpos"], self.base.qpos_address
             gaps, normals = self._ground(qpos, state.get("terrain"))
             if self.base.others:  # the robot's own points count, not the props'
-                gaps = torch.where(self._is_own(), gaps, torch.inf)
+                trees = self.model.body_treeid
+                own = trees[self.contacts.bodies] == trees[self.base.body]
+                gaps = torch.where(torch.from_numpy(own), gaps, torch.inf)
             lowest, point = gaps.min(-1)
             normal = normals[torch.arange(len(qpos)), point]  # (rows, 3), in B_t
             up = (self.base_pose(qpos)[1] @ normal[..., None])[..., 0]
             qpos[:, q : q + 3] += (gap - lowest)[:, None] * up
-
-    def _is_own(self) -> Tensor:
-        """Which contact points are on the robot's own tree, ``(P,)`` bool."""
-        trees = self.model.body_treeid
-        own = trees[self.contacts.bodies] == trees[self.base.body]
-        return torch.from_numpy(own)
 
     def _ground(self, qpos: Tensor, terrain: Tensor | None) -> tuple[Tensor, Tensor]:
         """Gap ``(*batch, P)``, m, and the ground's normal ``(*batch, P, 3)`` in B_t."""

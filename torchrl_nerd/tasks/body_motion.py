@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import BasePose, keep_constants, over_ground
-from torchrl_nerd.geometry.kinematics import PointKinematics, cross, rotate_by
+from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.motion import cross, rotate_by
 from torchrl_nerd.scenes import Scene
 
 

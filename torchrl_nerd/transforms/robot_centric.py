@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.constants import constant, take
-from torchrl_nerd.geometry.kinematics import OtherTrees
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
+from torchrl_nerd.geometry.other_trees import OtherTrees
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import (
     CTRL,
