@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 import torch
 from ablations import paper_input as paper
-from helpers import every_scene, random_transitions
+from helpers import HANDMADE, random_transitions
 
 from torchrl_nerd.geometry.manifold import FREE
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
-from torchrl_nerd.robots import load_scene
+from torchrl_nerd.robots import SCENES, load_scene
 
 ROWS = 40
+PLAIN = [*map(load_scene, SCENES), HANDMADE["floater"], HANDMADE["arm"]]
+each_robot = pytest.mark.parametrize("scene", PLAIN, ids=lambda scene: scene.name)
+"""Robots alone: the paper has no props."""
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
@@ -67,7 +70,7 @@ def seen_by_mujoco(scene, row):
     return found
 
 
-@every_scene
+@each_robot
 def test_the_papers_input_is_what_mujoco_sees(scene, generator):
     states = random_transitions(scene, ROWS, generator)
     module, ground = paper.PaperInput(scene), states.get(TERRAIN, None)
@@ -83,7 +86,7 @@ def test_the_papers_input_is_what_mujoco_sees(scene, generator):
             )
 
 
-@every_scene
+@each_robot
 def test_torques_stand_at_their_joints_and_passive_ones_are_zero(scene, generator):
     states, module = random_transitions(scene, ROWS, generator), paper.PaperInput(scene)
     inputs = states[QPOS], states[QVEL], states[JOINT_TORQUE], states.get(TERRAIN, None)

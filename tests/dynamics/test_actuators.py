@@ -124,6 +124,7 @@ def test_dm_control_steps_servos_as_its_own_physics(tmp_path, generator):
     for row, one in enumerate(physics):
         with one.reset_context():
             one.data.qpos[:], one.data.qvel[:] = state[QPOS][row], state[QVEL][row]
+        mujoco.mj_fwdVelocity(one.model.ptr, one.data.ptr)  # it left out its actuators
     for action in random_actions(scene, generator)[:10]:
         torque, ctrl = actuate(scene.controller, action, state[QPOS], state[QVEL])
         state = dynamics.step(state, torque, None, ctrl)

@@ -1,12 +1,15 @@
 """dm_control's own Physics, driven by hand, gives the same bits."""
 
 import copy
+import pickle
 
 import mujoco
 import numpy as np
 import torch
 from dm_control.mujoco import Physics, wrapper
 from dynamics_helpers import random_drive, roll
+from servo_helpers import servo_scene
+from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import DMControlDynamics, MujocoDynamics
 
@@ -55,12 +58,36 @@ def test_a_state_written_from_outside_is_where_a_row_goes_on(scene, generator):
         assert torch.equal(moved, expected)
 
 
-def test_a_history_that_was_restored_stays_as_it_was(scene, generator):
+def test_a_row_goes_on_from_its_history_and_in_a_copy(scene, generator):
+    """A step that is taken back leaves no trace; a history can be restored again."""
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
-    dynamics = DMControlDynamics(scene)
-    after = roll(dynamics, start, torques, terrain)[:, -1]
-    past = dynamics.history()
-    kept = np.stack([physics.data.qpos for physics in past])
-    dynamics.restore(past, torch.ones(ROWS, dtype=torch.bool))
-    dynamics.step(after, torques[0], terrain)
-    np.testing.assert_array_equal([physics.data.qpos for physics in past], kept)
+    expected = roll(DMControlDynamics(scene), start, torques, terrain)
+    dynamics, half, all_rows = (
+        DMControlDynamics(scene),
+        STEPS // 2,
+        torch.ones(ROWS) > 0,
+    )
+    now = roll(dynamics, start, torques[:half], terrain)[:, -1]
+    past, copied = dynamics.history(), pickle.loads(pickle.dumps(dynamics))
+    for _ in range(2):
+        roll(dynamics, now, -0.5 * torques[half:], terrain)
+        dynamics.restore(past, all_rows)
+    for other in (dynamics, copied):
+        found = roll(other, now, torques[half:], terrain)
+        for key in ("qpos", "qvel"):
+            assert torch.equal(found[key], expected[key][:, half:])
+
+
+def test_servos_know_their_speed_in_a_state_that_was_written(tmp_path, generator):
+    scene = servo_scene(tmp_path)
+    state, _ = scene.sample_initial(ROWS, generator)
+    state = TensorDict(state, [ROWS])
+    torque = torch.zeros(ROWS, len(scene.actuated), dtype=torch.float64)
+    ctrl = torch.rand(ROWS, scene.model.nu, dtype=torch.float64, generator=generator)
+    ends = []
+    for dynamics in (DMControlDynamics(scene), MujocoDynamics(scene)):
+        dynamics.reset(state)
+        ends.append(dynamics.step(state, torque, None, ctrl))
+    for key in ("qpos", "qvel"):
+        scale = 1.0 + ends[1][key].abs().max()
+        assert (ends[0][key] - ends[1][key]).abs().max() < 1e-9 * scale

@@ -111,3 +111,22 @@ def test_servos_of_a_row_are_as_strong_and_late_as_it_says(tmp_path, generator):
             mujoco.mj_step(model, data, scene.substeps)
         assert np.array_equal(state[row][QPOS], data.qpos)
         assert np.array_equal(state[row][QVEL], data.qvel)
+
+
+def test_without_parameters_all_rows_are_the_scenes_own_again(generator):
+    scene = load_scene("cartpole").vary({"mass:pole": (3.0, 3.0), "delay": (1, 1)})
+    start, torques, _ = random_drive(scene, ROWS, STEPS, generator)
+    plain = start.select(QPOS, QVEL)
+    varied = plain.clone().set(
+        PARAMETERS, torch.tensor([3.0, 1.0]).double().expand(ROWS, 2)
+    )
+    nominal = MujocoDynamics(load_scene("cartpole"))
+    used = MujocoDynamics(scene)
+    nominal.reset(plain)
+    used.reset(plain)
+    expected = nominal.step(plain, torques[0])
+    moved = used.step(varied, torques[0])
+    assert not torch.equal(moved[QVEL], expected[QVEL])
+    used.reset(plain)
+    again = used.step(plain, torques[0])
+    assert torch.equal(again[QVEL], expected[QVEL])

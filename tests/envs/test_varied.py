@@ -143,3 +143,47 @@ def test_a_warm_env_goes_on_as_if_it_had_seen_the_motion(network, generator):
 def test_engines_of_one_robot_refuse(engine):
     with pytest.raises(ValueError, match="expected MuJoCo for the varied scene"):
         GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), engine)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mass:pole", 0.0),
+        ("motor", -1.0),
+        ("delay", 3.0),
+        ("delay", 0.5),
+        ("delay", -1),
+    ],
+)
+def test_parameters_that_no_robot_has_are_refused(name, value):
+    env = GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), num_envs=ROWS)
+    td = env.reset()
+    td[PARAMETERS][2, list(RANGES).index(name)] = value
+    with pytest.raises(ValueError, match=f"a possible '{name}', got {value:g}"):
+        env.reset(td, set_state=True)
+    td[PARAMETERS] = env.state[PARAMETERS]
+    td[PARAMETERS][:, 0] = 20.0  # beyond its range, and possible
+    assert (env.reset(td, set_state=True)[PARAMETERS][:, 0] == 20.0).all()
+
+
+def test_late_torques_and_a_fallback_do_not_go_together():
+    task = make_task("cartpole/swingup").vary(RANGES)
+    with pytest.raises(ValueError, match="without delay for the guard 'fallback'"):
+        NeRDEnv(task, "cartpole", guard="fallback")
+
+
+def test_a_history_that_shows_nothing_is_refused():
+    env = GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), num_envs=2)
+    state = env.reset().select(QPOS, QVEL, PARAMETERS)
+    history = torch.stack(3 * [state], 1)
+    history[JOINT_TORQUE] = torch.zeros(2, 3, 1).double()
+    env.warm_up(history)
+    for bad, words in (
+        (history[:1], "a history of 2 envs"),
+        (history[:, :0], "at least one step"),
+        (history[:, 0], "at least one step"),
+        (history.exclude("next"), "joint_torque.*got none"),
+        (history.exclude(QPOS), "'qpos' in a history"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            env.warm_up(bad)

@@ -223,7 +223,8 @@ def test_actions_become_torque_through_the_tasks_controller(name, random_actions
     state = start
     ground_truth.reset(state)
     for step in range(steps):
-        torque = again(step, state)
+        torque, ctrl = again(step, state)
+        assert ctrl is None
         idle = task.controller(
             torch.zeros(3, 12)[:, : torque.shape[1]], **state_of(state)
         )

@@ -130,6 +130,13 @@ def test_presets_name_what_is_there(name):
         ({"motor:hinge": (0.5, 2)}, "a joint with a motor"),
         ({"payload_x:pole": (0, 1)}, "expected 'payload:pole' beside"),
         ({"slope": (0, 1)}, "slope:x or slope:y"),
+        ({"slope:x": (-2, 2)}, "possible range"),
+        ({"friction": (1e-300, 1e300)}, "possible range"),
+        ({"mass": 3.0}, "lowest and the highest value of 'mass', got 3.0"),
+        ({"mass": (1, 2, 3)}, "lowest and the highest"),
+        ({"mass": ("a", "b")}, "lowest and the highest"),
+        ({5: (1, 2)}, "expected a kind of mass"),
+        (["mass"], "expected parameters and their ranges"),
     ],
 )
 def test_what_cannot_be_is_refused(ranges, words):

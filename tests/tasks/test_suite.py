@@ -192,7 +192,7 @@ def test_a_model_of_one_task_serves_another_of_the_same_robot(generator, tmp_pat
     ("name", "sentence"),
     [
         ("dm_control/cheetah-fly", "unknown task in 'dm_control/cheetah-fly'"),
-        ("dm_control/cheetah", "unknown task in 'dm_control/cheetah-'"),
+        ("dm_control/cheetah", "unknown task in 'dm_control/cheetah'"),
         ("dm_control/lqr-lqr_2_1", "has no time limit: not supported"),
         ("dm_control/point_mass-hard", "changes its robot at every reset"),
     ],

@@ -53,6 +53,10 @@ def scene_of(name: str, reference: str | None, vary: tuple[str, ...] = ()) -> Sc
     ranges: dict[str, Sequence[float]] = {}
     for given in vary:
         if given == "preset":
+            if not preset_of(name).variation:
+                raise ValueError(
+                    f"expected NAME=LOW:HIGH for '{name}', which has no preset to vary"
+                )
             ranges |= preset_of(name).variation
             continue
         parameter, _, ends = given.partition("=")
@@ -60,6 +64,8 @@ def scene_of(name: str, reference: str | None, vary: tuple[str, ...] = ()) -> Sc
             low, high = map(float, ends.split(":"))
         except ValueError:
             raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
+        if parameter in {name.partition("=")[0] for name in vary if name != given}:
+            raise ValueError(f"expected '{parameter}' once, got it several times")
         ranges[parameter] = low, high
     scene = scene.reference if reference else scene
     return scene.vary(ranges) if ranges else scene

@@ -90,7 +90,7 @@ class Play(DeviceCommand):
         rollouts = []
         for name, kind, total in zip(pair.names, pair.kinds, pair.returns, strict=True):
             rollouts.append({"dynamics": name, "kind": kind, "return": total})
-            print(f"{name:<20}{kind:<14}{total:.1f} return")
+            print(f"{name:<20} {kind:<14}{total:.1f} return")
         return {
             "task": self.task,
             "video": out,

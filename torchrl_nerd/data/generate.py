@@ -158,7 +158,8 @@ def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
     ranges = None if scene.variation is None else scene.variation.ranges
     if card.get("variation") != ranges:
         raise ValueError(
-            f"the data in {folder} vary {card.get('variation')}, expected {ranges}"
+            f"expected data that vary {ranges or 'nothing'}, got {folder}, which vary "
+            f"{card.get('variation') or 'nothing'}: give --vary as the data were drawn"
         )
     config = _check_counts(card, folder)
     if card["trajectories"] + card["dropped"] < config.trajectories:

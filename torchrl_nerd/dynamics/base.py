@@ -66,7 +66,18 @@ def warm_up(dynamics: Dynamics, history: TensorDictBase) -> None:
         dynamics: any; the ground truth learns of late torques.
         history: ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any,
             ``ctrl``, ``terrain`` and ``parameters``, ``[num_envs, T]``, oldest first.
+
+    Raises:
+        ValueError: no step at all, or a key that is missing.
     """
+    if history.batch_dims != 2 or not history.batch_size[1]:
+        raise ValueError(
+            "expected a history [num_envs, T] of at least one step, got "
+            f"{list(history.batch_size)}"
+        )
+    for key in (QPOS, QVEL, JOINT_TORQUE):
+        if history.get(key, None) is None:
+            raise ValueError(f"expected {key!r} in a history to warm up with, got none")
     for step, then in enumerate(history.unbind(1)):
         state = then.select(QPOS, QVEL, PARAMETERS, strict=False)
         if step == 0:

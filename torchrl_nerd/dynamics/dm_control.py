@@ -3,6 +3,7 @@
 import warnings
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -23,6 +24,8 @@ from torchrl_nerd.scenes.scene import Scene
 if TYPE_CHECKING:
     from dm_control.mujoco import Physics
 
+INTEGRATED = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
 
 def make_physics(scene: Scene, has_actuators: bool) -> "Physics":
     """A dm_control `Physics` of the scene, see `engine_model`.
@@ -39,7 +42,8 @@ class DMControlDynamics:
     """The same envs on dm_control `Physics` objects, bit for bit what it would give.
 
     An env whose state is the one its `Physics` was left in goes on from there, as an
-    episode of dm_control does; any other state is written in first. For many envs
+    episode of dm_control does; any other state is written in first, with the speeds of
+    servos, which dm_control itself takes as zero in that substep. For many envs
     `MujocoDynamics` is faster: here every env costs a Python call.
 
     Args:
@@ -58,8 +62,14 @@ class DMControlDynamics:
         self._rows: list[Physics] = []
 
     def __getstate__(self) -> dict:
-        """A copy in another process builds its own `Physics` objects."""
-        return self.__dict__ | {"_rows": []}
+        """A copy in another process builds its own `Physics` objects, which go on."""
+        return self.__dict__ | {"_rows": self.history()}
+
+    def __setstate__(self, state: dict) -> None:
+        past = state.pop("_rows")
+        self.__dict__.update(state)
+        self._rows = [self._new() for _ in past]
+        self.restore(past, torch.ones(len(past), dtype=torch.bool))
 
     def _new(self) -> "Physics":
         return make_physics(self.scene, self._has_actuators)
@@ -74,17 +84,25 @@ class DMControlDynamics:
             if rows is None or rows[row]:
                 physics.reset()
 
-    def history(self) -> list["Physics"]:
-        """See `Dynamics.history`."""
-        return [physics.copy(share_model=True) for physics in self._rows]
+    def history(self) -> list[np.ndarray]:
+        """See `Dynamics.history`: all that MuJoCo integrates, warm start and time too."""
+        pasts = []
+        for physics in self._rows:
+            where = physics.model.ptr, physics.data.ptr
+            pasts.append(np.empty(mujoco.mj_stateSize(where[0], INTEGRATED)))
+            mujoco.mj_getState(*where, pasts[-1], INTEGRATED)
+        return pasts
 
-    def restore(self, history: list["Physics"], rows: Tensor) -> None:
+    def restore(self, history: list[np.ndarray], rows: Tensor) -> None:
         """See `Dynamics.restore`."""
         for row in rows.nonzero()[:, 0].tolist():
-            if history:  # which may be restored again
-                self._rows[row] = history[row].copy(share_model=True)
-            else:
+            if not history:
                 self._rows[row] = self._new()
+                continue
+            where = self._rows[row].model.ptr, self._rows[row].data.ptr
+            mujoco.mj_resetData(*where)  # warnings of a step that is taken back
+            mujoco.mj_setState(*where, history[row], INTEGRATED)
+            mujoco.mj_step1(*where)  # with which `Physics` ends a step
 
     @uncompiled
     def step(
@@ -144,3 +162,5 @@ def _place(
         data.qpos[:], data.qvel[:] = qpos, qvel
         if pose is not None:
             data.mocap_pos.flat, data.mocap_quat.flat = pose[:size], pose[size:]
+    # `Physics` does this without actuators, whose speeds its next substep needs
+    mujoco.mj_fwdVelocity(physics.model.ptr, data.ptr)

@@ -37,7 +37,8 @@ class GuardedDynamics:
         guard: what to do with the others.
 
     Raises:
-        ValueError: an unknown guard, or a model that does not know what it was trained on.
+        ValueError: an unknown guard, a model that does not know what it was trained on, or
+            a fallback where torques may be late.
     """
 
     patience = PATIENCE
@@ -49,6 +50,12 @@ class GuardedDynamics:
             raise ValueError(
                 "expected a model that knows what it was trained on, got weights of an "
                 "older version: train or fine-tune it again"
+            )
+        varied = learned.scene.variation
+        if guard == "fallback" and varied is not None and varied.max_delay:
+            raise ValueError(
+                "expected torques without delay for the guard 'fallback', whose MuJoCo "
+                f"starts anew at every step, got up to {varied.max_delay} steps"
             )
         self.scene, self.learned = learned.scene, learned
         self.kind, self.guard = learned.kind, guard

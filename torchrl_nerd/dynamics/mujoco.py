@@ -194,7 +194,7 @@ class MujocoDynamics:
         batch = self._batch
         if batch is not None and length:
             pose = ground_pose(self.scene, terrain)
-            self._vary(batch, state)
+            batch = self._vary(batch, state)
             self._place(batch, as_numpy(state[QPOS]), as_numpy(state[QVEL]), pose)
             commands, is_whole = as_numpy(command), np.ones(rows, bool)
             for t in range(length):
@@ -203,14 +203,23 @@ class MujocoDynamics:
         values = {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
         return TensorDict(values, [rows, length]).to(state[QPOS].device)
 
-    def _vary(self, batch: Batch, state: TensorDictBase) -> None:
-        """Give every simulation the parameters of its state, where there are any."""
-        given = state.get(PARAMETERS, None)
-        if given is None or self.scene.variation is None:
-            return
+    def _vary(self, batch: Batch, state: TensorDictBase) -> Batch:
+        """The batch, every simulation with the parameters of its state if there are any.
+
+        Raises:
+            ValueError: parameters that no robot can have.
+        """
+        given, variation = state.get(PARAMETERS, None), self.scene.variation
+        if variation is None or (given is None and self._own is None):
+            return batch
+        if given is None:  # the scene's own robot again
+            self._start(*self.history())
+            assert self._batch is not None  # for the type checker: it has rows
+            return self._batch
         if self._own is None:
-            self._own = RowParameters(self.scene.variation, batch)
+            self._own = RowParameters(variation, batch)
         self._own.write(as_numpy(given))
+        return batch
 
     def _place(
         self, batch: Batch, qpos: np.ndarray, qvel: np.ndarray, pose: Tensor | None

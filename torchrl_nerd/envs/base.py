@@ -218,15 +218,16 @@ class SceneEnv(RenderedEnv):
         set_state: bool = False,
         **kwargs: object,
     ) -> TensorDict:
-        rows = None if tensordict is None else tensordict.get("_reset", None)
-        if rows is None:
-            rows = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        rows = every if tensordict is None else tensordict.get("_reset", every)
         rows = rows.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
         given: dict[str, Tensor] = {}
         if set_state:
             dtype = self._state()[QPOS].dtype
             given = given_state(tensordict, rows, self._state_sizes, dtype)
             given[QPOS] = normalize_pos(self.scene.layout, given[QPOS])
+            if PARAMETERS in given and self.scene.variation is not None:
+                self.scene.variation.check(given[PARAMETERS][rows])
             if not self._is_differentiable:
                 given = {key: value.detach() for key, value in given.items()}
         old = self._state()
@@ -243,6 +244,9 @@ class SceneEnv(RenderedEnv):
     @unaffected
     def warm_up(self, history: TensorDictBase) -> None:
         """Show the dynamics a recorded motion up to the present state, see `warm_up`."""
+        if history.batch_size[:1] != self.batch_size:
+            count, got = self.batch_size.numel(), list(history.batch_size)
+            raise ValueError(f"expected a history of {count} envs, got {got}")
         warm_up(self.dynamics, history)
 
     @unaffected

@@ -78,7 +78,8 @@ def load_suite(domain: str, task: str) -> "Environment":
         tasks = [t for d, t in suite.ALL_TASKS if d == domain]
         known = tasks or dict.fromkeys(d for d, _ in suite.ALL_TASKS)
         raise ValueError(
-            f"unknown {'task' if tasks else 'domain'} in 'dm_control/{domain}-{task}', "
+            f"unknown {'task' if tasks else 'domain'} in "
+            f"'dm_control/{domain}{'-' if task else ''}{task}', "
             f"expected one of {', '.join(known)}"
         )
     return suite.load(domain, task, task_kwargs={"random": 0})

@@ -35,7 +35,13 @@ class Kind:
     target: str  # a kind of MuJoCo's objects; "axis", or "" where there is none
     unit: str  # "factor" for a factor
     write: Write | None = None  # None: not by itself
-    least: float = -np.inf  # of its values
+    least: float = -np.inf  # of its values; of a factor, above zero
+    most: float = np.inf
+
+    @property
+    def lowest(self) -> float:
+        """The lowest value that a robot can have."""
+        return float(np.nextafter(0.0, 1.0)) if self.unit == "factor" else self.least
 
 
 def _times(*names: str) -> Write:
@@ -105,6 +111,7 @@ def _payload(fields: Fields, bodies: list[int], given: np.ndarray) -> None:
 MOTOR = _times("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 """What makes the strength of actuators times the value."""
 
+STEEPEST = 1.5  # rad: gravity turns by less than a right angle
 KINDS = {
     "mass": Kind("body", "factor", _times("body_mass", "body_inertia")),
     **{
@@ -120,6 +127,6 @@ KINDS = {
     "delay": Kind("", "control steps", least=0.0),
     "friction": Kind("geom", "factor", _times("geom_friction")),
     "stiffness": Kind("geom", "factor", _stiffness),
-    "slope": Kind("axis", "rad", _slope),
+    "slope": Kind("axis", "rad", _slope, -STEEPEST, STEEPEST),
 }
 """By name, in the order in which they change a model."""

@@ -82,6 +82,8 @@ class Variation:
     def __init__(
         self, model: mujoco.MjModel, actuated: list[int], ranges: Ranges
     ) -> None:
+        if not isinstance(ranges, Mapping):
+            raise ValueError(f"expected parameters and their ranges, got {ranges!r}")
         self.model, self.actuated = model, actuated
         self.parameters = [_parameter(model, *item) for item in ranges.items()]
         self._columns = {p.name: i for i, p in enumerate(self.parameters)}
@@ -129,6 +131,23 @@ class Variation:
         shape = (rows, self.size)
         u = torch.rand(shape, dtype=torch.float64, generator=generator)
         return self.values(u)
+
+    def check(self, parameters: Tensor) -> None:
+        """Refuse values ``(*batch, size)`` that no robot can have.
+
+        Ranges may be left, but for a delay, whose longest is kept.
+
+        Raises:
+            ValueError: naming the first such parameter.
+        """
+        for p, value in zip(self.parameters, parameters.unbind(-1), strict=True):
+            about, most = KINDS[p.kind], KINDS[p.kind].most
+            wrong = ~((value >= about.lowest) & (value <= most))
+            if p.kind == "delay":
+                wrong |= (value != value.floor()) | (value > p.high)
+            if wrong.any():
+                found = float(value[wrong][0])
+                raise ValueError(f"expected a possible '{p.name}', got {found:g}")
 
     def shares(self, parameters: Tensor) -> Tensor:
         """Where parameters ``(*batch, size)`` lie in their ranges: -1 to 1."""
@@ -198,13 +217,19 @@ class Variation:
 
 def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Parameter:
     """A parameter and its target's indices; refuses what cannot be."""
-    kind, _, target = name.partition(":")
+    kind, _, target = str(name).partition(":")
     if kind not in KINDS:
         raise ValueError(f"expected a kind of {', '.join(KINDS)}, got '{name}'")
-    about, (low, high) = KINDS[kind], (float(x) for x in given)
-    least = np.nextafter(0.0, 1.0) if about.unit == "factor" else about.least
+    about = KINDS[kind]
+    try:
+        low, high = (float(x) for x in given)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"expected the lowest and the highest value of '{name}', got {given!r}"
+        ) from None
     is_whole = kind != "delay" or (low.is_integer() and high.is_integer())
-    if not (least <= low <= high and isfinite(low) and isfinite(high) and is_whole):
+    is_finite = isfinite(high - low) and (low <= 0.0 or isfinite(high / low))
+    if not (about.lowest <= low <= high <= about.most and is_finite and is_whole):
         raise ValueError(
             f"expected a possible range for '{name}', got {low:g}:{high:g}"
         )
