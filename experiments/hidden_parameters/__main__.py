@@ -82,7 +82,7 @@ def of_model(
     dynamics, first = NeRDDynamics(model), cast(TensorDict, future[:, 0])
     dynamics.reset(first)
     if history.batch_size[1]:
-        warm_up(dynamics, history)
+        warm_up(dynamics, history, len(history))
     return roll(dynamics, scene, future, first[PARAMETERS])
 
 

@@ -179,7 +179,7 @@ def test_a_history_that_shows_nothing_is_refused():
     history[JOINT_TORQUE] = torch.zeros(2, 3, 1).double()
     env.warm_up(history)
     for bad, words in (
-        (history[:1], "a history of 2 envs"),
+        (history[:1], "a history of 2 envs and"),
         (history[:, :0], "at least one step"),
         (history[:, 0], "at least one step"),
         (history.exclude("next"), "joint_torque.*got none"),

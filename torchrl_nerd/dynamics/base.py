@@ -57,7 +57,7 @@ class Dynamics(Protocol):
         ...
 
 
-def warm_up(dynamics: Dynamics, history: TensorDictBase) -> None:
+def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
     """Give a dynamics the past that a recorded motion has; what it had is forgotten.
 
     A rollout from the state after the motion then starts adapted to what the motion shows.
@@ -66,14 +66,15 @@ def warm_up(dynamics: Dynamics, history: TensorDictBase) -> None:
         dynamics: any; the ground truth learns of late torques.
         history: ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any,
             ``ctrl``, ``terrain`` and ``parameters``, ``[num_envs, T]``, oldest first.
+        num_envs: that step together.
 
     Raises:
-        ValueError: no step at all, or a key that is missing.
+        ValueError: another number of envs, no step at all, or a key that is missing.
     """
-    if history.batch_dims != 2 or not history.batch_size[1]:
+    size = list(history.batch_size)
+    if len(size) != 2 or size[0] != num_envs or not size[1]:
         raise ValueError(
-            "expected a history [num_envs, T] of at least one step, got "
-            f"{list(history.batch_size)}"
+            f"expected a history of {num_envs} envs and at least one step, got {size}"
         )
     for key in (QPOS, QVEL, JOINT_TORQUE):
         if history.get(key, None) is None:

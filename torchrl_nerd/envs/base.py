@@ -244,10 +244,7 @@ class SceneEnv(RenderedEnv):
     @unaffected
     def warm_up(self, history: TensorDictBase) -> None:
         """Show the dynamics a recorded motion up to the present state, see `warm_up`."""
-        if history.batch_size[:1] != self.batch_size:
-            count, got = self.batch_size.numel(), list(history.batch_size)
-            raise ValueError(f"expected a history of {count} envs, got {got}")
-        warm_up(self.dynamics, history)
+        warm_up(self.dynamics, history, self.batch_size.numel())
 
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
