@@ -404,7 +404,7 @@ def test_all_reasons_are_named_at_once(tmp_path):
         ("gymnasium/Unicycle-v5", "unknown environment 'Unicycle-v5'"),
         ("dm_control/unicycle-ride", "unknown domain .* expected one of acrobot"),
         ("dm_control/cheetah-fly", "unknown task .* expected one of run$"),
-        ("dm_control/cheetah", "unknown task in .*cheetah-', expected one of run$"),
+        ("dm_control/cheetah", "unknown task in .*cheetah', expected one of run$"),
         ("gymnasium/", "unknown environment '' of Gymnasium"),
         ("nowhere/robot.xml", "expected an MJCF file, found none at nowhere"),
     ],
