@@ -20,7 +20,7 @@ import tyro
 from torch import Generator, Tensor
 
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import simulate
+from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors

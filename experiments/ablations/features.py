@@ -11,9 +11,9 @@ from torchrl_nerd.keys import (
     CONTACT_NORMAL,
     CONTACT_VELOCITY,
 )
-from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.transforms import ContactFeatures
+from torchrl_nerd.transforms.scene_features import SceneFeatures
 
 from .paper_input import BaseFrame, PaperInput
 

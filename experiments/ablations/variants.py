@@ -6,12 +6,13 @@ from typing import cast
 
 from tensordict import TensorDict
 
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
+from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import GRUConfig, MLPConfig, NetworkConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.samples import stats_of
 from torchrl_nerd.transforms import StateDelta, Stats
+from torchrl_nerd.transforms.scene_features import SceneFeatures
 
 from . import features, targets
 from .networks import LSTMConfig, MarkovConfig
