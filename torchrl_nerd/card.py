@@ -20,6 +20,7 @@ from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import GRUConfig, MLPConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
+from torchrl_nerd.scenes.variation import ranges_of
 from torchrl_nerd.settings import SettingError
 
 FORMAT = 2
@@ -46,7 +47,7 @@ def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str,
         "scene_hash": scene.hash,
         "reference_ratio": scene.reference_ratio,
         "control_step": scene.control_step,
-        "variation": None if scene.variation is None else scene.variation.ranges,
+        "variation": ranges_of(scene.variation),
         "network": None,
         "step": None,
     }

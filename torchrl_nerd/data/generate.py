@@ -31,6 +31,7 @@ from torchrl_nerd.data.store import (
 )
 from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.variation import ranges_of
 from torchrl_nerd.seeds import fold_in
 
 CHUNK = 2048  # trajectories simulated together; a killed process loses at most these
@@ -155,7 +156,7 @@ def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
             f"the data in {folder} are of scene '{card.get('scene')}' "
             f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
         )
-    ranges = None if scene.variation is None else scene.variation.ranges
+    ranges = ranges_of(scene.variation)
     if card.get("variation") != ranges:
         raise ValueError(
             f"expected data that vary {ranges or 'nothing'}, got {folder}, which vary "
@@ -188,7 +189,7 @@ def _open_card(
         "config": asdict(config),
         "strategy": strategy,
         "ranges": scene.sampling.ranges(),
-        "variation": None if scene.variation is None else scene.variation.ranges,
+        "variation": ranges_of(scene.variation),
         "mujoco": mujoco.__version__,
         "torchrl_nerd": __version__,
         **dict.fromkeys(("trajectories", "dropped", "chunks_done"), 0),

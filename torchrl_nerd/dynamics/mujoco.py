@@ -204,11 +204,7 @@ class MujocoDynamics:
         return TensorDict(values, [rows, length]).to(state[QPOS].device)
 
     def _vary(self, batch: Batch, state: TensorDictBase) -> Batch:
-        """The batch, every simulation with the parameters of its state if there are any.
-
-        Raises:
-            ValueError: parameters that no robot can have.
-        """
+        """The batch, every simulation with the parameters of its state if there are any."""
         given, variation = state.get(PARAMETERS, None), self.scene.variation
         if variation is None or (given is None and self._own is None):
             return batch

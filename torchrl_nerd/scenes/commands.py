@@ -59,6 +59,11 @@ def idle(scene: Scene, *batch: int) -> Tensor:
     return scene.sampling.commands[0].expand(*batch, -1)
 
 
+def command_key(scene: Scene) -> tuple[str, str]:
+    """Where transitions hold the command."""
+    return JOINT_TORQUE if scene.servos is None else CTRL
+
+
 def command_of(scene: Scene, data: TensorDictBase) -> Tensor:
     """The command of transitions ``[*batch]``."""
-    return data[JOINT_TORQUE if scene.servos is None else CTRL]
+    return data[command_key(scene)]

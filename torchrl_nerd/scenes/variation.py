@@ -215,6 +215,11 @@ class Variation:
         return np.where(is_on, model.jnt_dofadr[joint], -1)
 
 
+def ranges_of(variation: Variation | None) -> dict[str, list[float]] | None:
+    """What cards say of a scene's variation: its ranges; None where nothing varies."""
+    return None if variation is None else variation.ranges
+
+
 def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Parameter:
     """A parameter and its target's indices; refuses what cannot be."""
     kind, _, target = str(name).partition(":")

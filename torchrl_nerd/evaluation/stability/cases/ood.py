@@ -16,10 +16,16 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
 from torchrl_nerd.evaluation.stability.case import Metric, Trial, hard_case
-from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.commands import command_of, drive, drive_of, idle
+from torchrl_nerd.scenes.commands import (
+    command_key,
+    command_of,
+    drive,
+    drive_of,
+    idle,
+)
 
 COUNT, LENGTH, STEPS, DRIVEN = 200, 40, 60, 5
 FASTEST = 4.0  # speeds and torques relative to those of training, at most
@@ -61,8 +67,7 @@ def inputs(
     outside = outside.clone()
     factor = 1.0 + (FASTEST - 1.0) * torch.rand(len(outside), 1, generator=generator)
     kind = torch.randint(3, (len(outside), 1), generator=generator)
-    command = JOINT_TORQUE if scene.servos is None else CTRL
-    for unscaled, key in enumerate((QVEL, command)):  # kind 2 scales both
+    for unscaled, key in enumerate((QVEL, command_key(scene))):  # kind 2 scales both
         value = outside[key]
         outside[key] = torch.where(kind == unscaled, value, factor.double() * value)
     return inside, calibration, outside
