@@ -19,6 +19,10 @@ except ImportError:  # their base class
     COMPILER_ERRORS = (RuntimeError,)
 """What `torch.compile` raises where no compiler works."""
 
+TRUSTING = {"cpp.vec_isa_ok": True}
+"""Take the processor's vector instructions from its name: to try each out, as torch does
+on a machine that has not compiled before, takes the compiler twenty seconds."""
+
 
 def compile_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of `torch.compile` that this torch knows.
@@ -28,7 +32,10 @@ def compile_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     known = signature(torch.compile).parameters
     isolated = {"isolate_recompiles": True} if "isolate_recompiles" in known else {}
-    return {**isolated, **options}
+    if options.keys() & {"mode", "backend"}:
+        return {**isolated, **options}
+    own = options.get("options", {})
+    return {**isolated, **options, "options": {**TRUSTING, **own}}
 
 
 def graph_break() -> None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.streams import uniforms
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.transformer import FullLinear, KeyValueCache
@@ -69,8 +70,8 @@ class InPlaceEnv:
         self.reward.copy_(found["reward"])
         self.done.copy_(found["done"][:, 0])
         moved = {key: found[key] for key in self.state}
-        streams = env._keys, self.episode, env._offsets
-        start = env._restart(moved, self.done, streams, {})
+        drawn = uniforms(env._keys, self.episode, env._offsets, moved[QPOS].dtype)
+        start = env._restart(moved, self.done, drawn, {})
         for key, value in self.state.items():
             value.copy_(start[key])
         kept = torch.where(

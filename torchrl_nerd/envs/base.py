@@ -19,9 +19,8 @@ from torchrl_nerd.envs.faults import FaultRecorder
 from torchrl_nerd.envs.pixels import RenderedEnv
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
-from torchrl_nerd.envs.streams import row_keys, stream_offsets
+from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
 from torchrl_nerd.envs.transition import Transition, drive_sizes, given_state
-from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import ACTION, FAULT, PARAMETERS, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_count, expect_device
@@ -109,8 +108,8 @@ class SceneEnv(RenderedEnv):
         ):
             setattr(self, name, spec)
         zeros = torch.zeros(num_envs, dtype=state_dtype, device=self.device)
-        for name in ("_episode", "_age"):
-            self.register_buffer(name, zeros.long())
+        self.register_buffer("_episode", zeros.long())
+        self.register_buffer("_age", zeros.long())
         for key, size in self._state_sizes.items():  # (num_envs, size) each
             self.register_buffer(f"_state_{key}", zeros[:, None].repeat(1, size))
         drawn = task.num_uniforms + self._state_sizes.get(PARAMETERS, 0)
@@ -211,6 +210,18 @@ class SceneEnv(RenderedEnv):
         kept = cast(dict[str, Tensor], self._buffers)
         return {key: kept[f"_state_{key}"] for key in self._state_sizes}
 
+    def _begin(
+        self, state: dict[str, Tensor], rows: Tensor, given: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        drawn = uniforms(self._keys, self._episode, self._offsets, state[QPOS].dtype)
+        with self._gradients():
+            return self._restart(state, rows, drawn, given)
+
+    def _gradients(self) -> torch.set_grad_enabled:
+        """None where the dynamics has none: compiled code is one, however called."""
+        recorded = self._is_differentiable and torch.is_grad_enabled()
+        return torch.set_grad_enabled(recorded)
+
     @unaffected
     def _reset(
         self,
@@ -221,21 +232,14 @@ class SceneEnv(RenderedEnv):
         every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         rows = every if tensordict is None else tensordict.get("_reset", every)
         rows = rows.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
-        given: dict[str, Tensor] = {}
+        old, given = self._state(), {}
         if set_state:
-            dtype = self._state()[QPOS].dtype
-            given = given_state(tensordict, rows, self._state_sizes, dtype)
-            given[QPOS] = normalize_pos(self.scene.layout, given[QPOS])
-            if PARAMETERS in given and self.scene.variation is not None:
-                self.scene.variation.check(given[PARAMETERS][rows])
-            if not self._is_differentiable:
-                given = {key: value.detach() for key, value in given.items()}
-        old = self._state()
+            sizes, dtype = self._state_sizes, old[QPOS].dtype
+            given = given_state(self.scene, tensordict, rows, sizes, dtype)
         # nothing of the past is left: no gradients of it either
         if self._is_differentiable and rows.all():
             old = {key: value.detach() for key, value in old.items()}
-        streams = self._keys, self._episode, self._offsets
-        found = self._restart(old, rows, streams, given)
+        found = self._begin(old, rows, given)
         episode, age = self._episode + rows, self._age.masked_fill(rows, 0)
         result = self._hand_out(found, {"_episode": episode, "_age": age})
         self.dynamics.reset(result, rows)
@@ -254,12 +258,11 @@ class SceneEnv(RenderedEnv):
                 f"expected an action of shape {tuple(self.action_spec.shape)}, "
                 f"got {tuple(action.shape)}"
             )
-        if not self._is_differentiable:
-            action = action.detach()
         state, moves = self._state(), tensordict.get("_step", None)
         held = None if moves is None else ~moves.reshape(self.batch_size)
         past = None if held is None else self.dynamics.history()
-        found, age = self._transit(state, action, self._age), self._age + 1
+        with self._gradients():
+            found, age = self._transit(state, action, self._age), self._age + 1
         if held is not None:
             self.dynamics.restore(past, held)
             found = self._hold(found, held, tensordict)
@@ -275,8 +278,7 @@ class SceneEnv(RenderedEnv):
 
         Flags are those of ``tensordict``; a transform may have changed its observation.
         """
-        none, streams = rows & False, (self._keys, self._episode, self._offsets)
-        shown = self._restart(self._state(), none, streams, {})
+        shown = self._begin(self._state(), rows & False, {})
         flags = (FAULT, TRUST, "done", "terminated", "truncated")
         for key in (*drive_sizes(self.task), *flags):
             shown[key] = tensordict.get(key, shown[key])

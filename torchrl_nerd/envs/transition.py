@@ -14,7 +14,7 @@ from torchrl_nerd.compat import graph_break
 from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.envs.faults import find_faults
-from torchrl_nerd.envs.streams import uniforms
+from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import (
     ACTION,
     FAULT,
@@ -28,6 +28,7 @@ from torchrl_nerd.keys import (
 )
 from torchrl_nerd.scenes.commands import actuate, num_ctrl
 from torchrl_nerd.scenes.controllers import ActuatorController
+from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
@@ -155,7 +156,7 @@ class Transition:
         self,
         state: Tensors,
         rows: Tensor,
-        streams: tuple[Tensor, Tensor, Tensor],
+        drawn: Tensor,
         given: Tensors,
     ) -> Tensors:
         """New episodes for some envs; the others stay bitwise as they are.
@@ -163,15 +164,15 @@ class Transition:
         Args:
             state: as in `step`.
             rows: ``(num_envs,)`` bool: which.
-            streams: of the envs' random numbers, see `streams.uniforms`.
+            drawn: ``(num_envs, numbers)``, uniform in [0, 1), for all envs, so that shapes
+                stay the same. An argument, since the compiler would write the hash that
+                they come from into each of their uses.
             given: what of a start is not left to chance.
 
         Returns:
             As `step`, without reward: zero torque and control, no fault, full trust, not
             done.
         """
-        # drawn for all envs, then selected: shapes stay the same
-        drawn = uniforms(*streams, state[QPOS].dtype)
         fresh = self.task.initial_state(drawn[:, : self.task.num_uniforms])
         if (variation := self.task.scene.variation) is not None:
             fresh[PARAMETERS] = variation.values(drawn[:, self.task.num_uniforms :])
@@ -195,21 +196,24 @@ class Transition:
 
 
 def given_state(
+    scene: Scene,
     tensordict: TensorDictBase | None,
     rows: Tensor,
     sizes: Mapping[str, int],
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
-    """The state that ``reset(td, set_state=True)`` asks for, copies.
+    """The state that ``reset(td, set_state=True)`` asks for, copies, of unit quaternions.
 
     Args:
+        scene: what the state is of.
         tensordict: with ``qpos``, ``qvel`` and, where they vary, the task's parameters.
         rows: ``(num_envs,)``, envs that are reset; only their state must be finite.
         sizes: width of each key of the state.
         dtype: of the state.
 
     Raises:
-        ValueError: a key that is missing, of another shape or not finite.
+        ValueError: a key that is missing, of another shape or not finite; parameters of
+            no robot.
     """
     given = {} if tensordict is None else tensordict
     missing = [key for key in (QPOS, QVEL) if key not in given.keys()]
@@ -227,4 +231,7 @@ def given_state(
         if not value[rows].isfinite().all():
             raise ValueError(f"expected finite {key} to set the state to")
         values[key] = value.to(rows.device, dtype, copy=True)
+    values[QPOS] = normalize_pos(scene.layout, values[QPOS])
+    if PARAMETERS in values and scene.variation is not None:
+        scene.variation.check(values[PARAMETERS][rows])
     return values

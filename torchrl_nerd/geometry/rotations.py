@@ -41,8 +41,9 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
     """R(q) v: from the frame of ``q`` to its parent; ``(*batch, 4), (*batch, 3)``."""
     w, u = q[..., :1], q[..., 1:]
     u, v = torch.broadcast_tensors(u, v)
-    t = 2.0 * torch.linalg.cross(u, v)
-    return v + w * t + torch.linalg.cross(u, t)
+    along, square = torch.linalg.vecdot(u, v), torch.linalg.vecdot(u, u)
+    turned = w * torch.linalg.cross(u, v) + along[..., None] * u - square[..., None] * v
+    return v + 2.0 * turned
 
 
 def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
