@@ -1,0 +1,288 @@
+"""Policies learned in a learned model alone, beside PPO in MuJoCo at equal frames.
+
+    python experiments/policies_in_the_model.py dm_control/walker-walk --json FILE
+
+1. Random trajectories of the robot in MuJoCo, and a network that learns from them.
+2. In rounds: PPO in the model alone, where an episode fails as soon as a step is unlike the
+   data; trajectories along the policy in MuJoCo, from which the model goes on learning.
+3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
+   policy had in the model, one for as many as the model's data cost the robot.
+4. All play whole episodes in MuJoCo, from the same held-out starts.
+
+The two ways take a processor each at the same time, so that their wall times compare.
+"""
+
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import cast
+
+import torch
+import tyro
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Transform, TransformedEnv
+from tyro.conf import Positional
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+import ppo
+
+from torchrl_nerd import NeRDEnv, make_env
+from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.data.simulate import is_sound, simulate
+from torchrl_nerd.envs.actor import Actor
+from torchrl_nerd.evaluation.policy import make_actor, save_policy
+from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
+from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TRUST
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import make_task
+from torchrl_nerd.seeds import fold_in
+from torchrl_nerd.tasks import Task
+from torchrl_nerd.tasks.suite import SuiteTask
+from torchrl_nerd.training.policy_data import policy_data
+from torchrl_nerd.training.trainer import Trainer
+
+SEGMENT = 100  # control steps of a training trajectory
+WATCHED = 64  # episodes of a point of the learning curves
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to learn, and for how long."""
+
+    name: Positional[str]  # a task with rewards, such as dm_control/cheetah-run
+    hold: int = 4  # control steps that an action of a suite task is held
+    trajectories: int = 1000  # random ones of 100 control steps
+    updates: int = 4000  # of the model, on them
+    rounds: int = 10  # of PPO in the model; data are added between two of them
+    along: int = 64  # trajectories along the policy before a round
+    length: int = 1000  # control steps of each, until the robot falls
+    more_updates: int = 1000  # of the model, after the first round
+    trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
+    network: str = "mlp-4x128"
+    noise: float = 0.3  # of actions along the policy, largest standard deviation
+    frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
+    num_envs: int = 512
+    horizon: int = 32
+    minibatch: int = 4096
+    lr: float = 1e-3
+    gamma: float = 0.99
+    widths: tuple[int, ...] = (128, 128)
+    episodes: int = 256  # of the report, in each dynamics
+    seed: int = 0
+    out: Path = Path("runs/policies")
+    json: Path | None = None
+    """Write the results to this file."""
+
+    @property
+    def folder(self) -> Path:
+        """Of models and policies."""
+        return self.out / self.name.replace("/", "-")
+
+
+class Trusted(Transform):
+    """Ends an episode as failed where the model is asked for what it has no data of."""
+
+    def __init__(self, least: float) -> None:
+        super().__init__()
+        self.least = least
+
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
+        lost = next_tensordict[TRUST] < self.least  # (num_envs, 1)
+        for key in ("done", "terminated"):
+            next_tensordict[key] = next_tensordict[key] | lost
+        return next_tensordict
+
+
+@dataclass
+class Clock:
+    """Wall time of each kind of work, s."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _began: float = field(default_factory=time.monotonic)
+
+    def note(self, kind: str) -> None:
+        """Count the time since the last note, or the beginning, as that of a kind."""
+        now = time.monotonic()
+        self.seconds[kind] = self.seconds.get(kind, 0.0) + now - self._began
+        self._began = now
+
+
+class Learner:
+    """PPO that keeps its policy, critic and step size when it changes envs."""
+
+    def __init__(self, cfg: Config, env: TransformedEnv) -> None:
+        names = ("num_envs", "horizon", "minibatch", "lr", "gamma", "widths", "seed")
+        kept = {name: getattr(cfg, name) for name in names}
+        self.cfg = ppo.Run(total_frames=cfg.frames, **kept)
+        self.policy, critic = ppo.make_policy_and_critic(env, self.cfg)
+        self.actor = make_actor(self.policy)
+        self.parts = ppo.make_learning(self.actor, critic, self.cfg)
+        self.batch = cfg.num_envs * cfg.horizon
+        self.updates, self.done = max(1, cfg.frames // self.batch), 0
+
+    def learn(self, env: TransformedEnv, share: float) -> float:
+        """A share of all frames in an env; the mean reward of the last batch."""
+        count, optimizer = max(1, round(share * self.updates)), self.parts[2]
+        how, reward = replace(self.cfg, total_frames=count * self.batch), 0.0
+        for batch in ppo.collect(how, env, self.actor):
+            reward = float(batch["next", "reward"].mean())
+            for group in optimizer.param_groups:
+                left = 1.0 - self.done / self.updates
+                group["lr"] = self.cfg.lr * max(0.0, left)
+            ppo.update(batch, *self.parts, self.cfg)
+            self.policy.standardize.fit(batch["observation"])
+            self.done += 1
+        return reward
+
+
+def task_of(cfg: Config) -> Task:
+    """The task; actions of the suite's are held, as is usual there."""
+    task = make_task(cfg.name)
+    return SuiteTask(cfg.name, cfg.hold) if isinstance(task, SuiteTask) else task
+
+
+def begin(cfg: Config) -> tuple[Task, Clock]:
+    """One processor for this process, and the task."""
+    torch.set_num_threads(1)
+    os.environ["NERD_THREADS"] = "1"
+    torch.manual_seed(cfg.seed)
+    return task_of(cfg), Clock()
+
+
+def returns_of(cfg: Config, actor: Actor, count: int, seed: int) -> Tensor:
+    """Of whole episodes in MuJoCo, ``(count,)``."""
+    return policy_returns(make_env(task_of(cfg), "mujoco", count, seed), actor)
+
+
+def along_the_policy(task: Task, actor: Actor, cfg: Config, number: int) -> TensorDict:
+    """Pieces ``[n, SEGMENT]`` of trajectories in MuJoCo, begun before the robot fell."""
+    draw, noise = fold_in(cfg.seed, 1 + number), cfg.noise
+    length = cfg.length // SEGMENT * SEGMENT
+    data = policy_data(task, actor, cfg.along, length, draw, noise=noise)
+    data = cast(TensorDict, data[is_sound(data)])
+    fell = task.terminated({QPOS: data[NEXT_QPOS], QVEL: data[NEXT_QVEL]})  # (rows, T)
+    late = fell.long().cumsum(1)[:, SEGMENT - 1 :: SEGMENT] > 0  # by the end of a piece
+    begins = torch.cat((torch.ones_like(late[:, :1]), ~late[:, :-1]), 1)
+    pieces = cast(TensorDict, data.reshape(len(data), -1, SEGMENT))
+    return cast(TensorDict, pieces[begins])
+
+
+def train_model(
+    task: Task, data: TensorDict, cfg: Config, number: int, start: NeRD | None
+) -> NeRD:
+    """The model of a round, from scratch or from the one before."""
+    how = TrainConfig(
+        network=cfg.network,
+        steps=cfg.updates if start is None else cfg.more_updates,
+        rollout_steps=0,
+        single_step_fraction=1.0,
+        loss_eps=0.02,
+        lr=0.01 if start is None else 0.005,
+        adamw_lr=3e-3 if start is None else 1.5e-3,
+        validate_every=10**9,  # at the end alone
+        save_every=10**9,
+        seed=cfg.seed,
+    )
+    folder = cfg.folder / f"model_{number}"
+    given = {"quiet": True, "logger": "csv", "init_from": start, "horizons": (20, 100)}
+    return Trainer(task.scene, data, task.scene, how, folder, **given).run().eval()
+
+
+def in_the_model(cfg: Config) -> dict:
+    """A policy learned in models alone, what it took, and how it does."""
+    task, clock = begin(cfg)
+    data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
+    data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
+    learner = Learner(cfg, TransformedEnv(make_env(task, "mujoco", 8, cfg.seed)))
+    for number in range(cfg.rounds):
+        more = along_the_policy(task, learner.actor, cfg, number)
+        data = cast(TensorDict, TensorDict.cat((data, more)))
+        clock.note("data")
+        model = train_model(task, data, cfg, number, model)
+        clock.note("model")
+        inner = NeRDEnv(task, model, cfg.num_envs, cfg.seed + number, guard="flag")
+        env = TransformedEnv(inner, Trusted(cfg.trust))
+        reward = learner.learn(env, 1.0 / cfg.rounds)
+        clock.note("policy")
+        found = float(returns_of(cfg, learner.actor, WATCHED, cfg.seed + 100).mean())
+        frames = SEGMENT * len(data)
+        curve.append({"robot_frames": frames, "return": found, "reward": reward})
+        print(f"model, round {number + 1}: {curve[-1]}", flush=True)
+        clock.note("watching")  # no part of the method
+    assert model is not None
+    save_policy(learner.policy, cfg.folder / "policy", {})
+    seed, count = cfg.seed + 10_000, cfg.episodes
+    believed = policy_returns(NeRDEnv(task, model, count, seed), learner.actor)
+    truth = returns_of(cfg, learner.actor, count, seed)
+    return {
+        "curve": curve,
+        "robot_frames": SEGMENT * len(data),
+        "seconds": clock.seconds,
+        "truth": truth,
+        "believed": believed,
+    }
+
+
+def in_mujoco(cfg: Config) -> dict:
+    """A policy learned in MuJoCo, what it took, and how it does."""
+    task, clock = begin(cfg)
+    env = TransformedEnv(make_env(task, "mujoco", cfg.num_envs, cfg.seed))
+    learner, curve = Learner(cfg, env), []
+    for _ in range(cfg.rounds):
+        learner.learn(env, 1.0 / cfg.rounds)
+        clock.note("policy")
+        found = float(returns_of(cfg, learner.actor, WATCHED, cfg.seed + 100).mean())
+        robot_frames = learner.done * learner.batch * task.frame_skip
+        curve.append({"robot_frames": robot_frames, "return": found})
+        print(f"MuJoCo, {curve[-1]}", flush=True)
+        clock.note("watching")
+    truth = returns_of(cfg, learner.actor, cfg.episodes, cfg.seed + 10_000)
+    return {"curve": curve, "seconds": clock.seconds, "truth": truth}
+
+
+def few_frames(cfg: Config, robot_frames: int) -> Tensor:
+    """Returns of a policy that learned from as many robot frames as the model had."""
+    actions = robot_frames // task_of(cfg).frame_skip
+    return in_mujoco(replace(cfg, frames=actions, rounds=1))["truth"]
+
+
+def main(cfg: Config) -> None:
+    """Both ways side by side, then the report."""
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        ways = pool.submit(in_the_model, cfg), pool.submit(in_mujoco, cfg)
+        learned, rival = (way.result() for way in ways)
+        few = pool.submit(few_frames, cfg, learned["robot_frames"]).result()
+    truth, believed = learned.pop("truth"), learned.pop("believed")
+    theirs = rival.pop("truth")
+    how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
+    same = "ground truth"
+    returns = {
+        "learned in the model, in MuJoCo": summarize(truth, theirs, same),
+        "learned in the model, in the model": summarize(believed, truth),
+        "learned in MuJoCo": summarize(theirs, theirs, same),
+        "learned in MuJoCo, the model's robot frames": summarize(few, theirs, same),
+    }
+    for name, found in returns.items():
+        print(f"{name}: {found.mean:.1f} +- {found.interval:.1f}")
+    spent = {
+        name: {k: v for k, v in way["seconds"].items() if k != "watching"}
+        for name, way in (("model", learned), ("mujoco", rival))
+    }
+    print({name: round(sum(times.values())) for name, times in spent.items()}, "s")
+    if cfg.json is not None:
+        found = {name: asdict(summary) for name, summary in returns.items()}
+        results = {"configuration": how, "returns": found, "seconds": spent}
+        results |= {"model": learned["curve"], "mujoco": rival["curve"]}
+        write_results(cfg.json, results, cfg.seed)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
