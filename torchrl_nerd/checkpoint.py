@@ -73,19 +73,16 @@ def read_checkpoint(
             f"expected {WEIGHTS} and {CARD} in {folder}, found no checkpoint"
         )
     card = read_json(folder / CARD)
-    if card.get("format") != FORMAT:
-        raise ValueError(
-            f"expected a card of format {FORMAT} in {folder}, got {card.get('format')!r}"
-        )
+    if (got := card.get("format")) != FORMAT:
+        raise ValueError(f"expected a card of format {FORMAT} in {folder}, got {got!r}")
     scene = scene or _scene_of(card, folder)
     solver_scene = _solver_scene(card, scene)
     _compare(card, solver_scene, folder)
     tensors = read_tensors(folder / WEIGHTS)
     model = _build(card, scene, solver_scene, tensors, folder)
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
-    expect_fit(
-        weights, model.state_dict(), f"weights in {folder}", f"scene '{scene.name}'"
-    )
+    about = f"weights in {folder}", f"scene '{scene.name}'"
+    expect_fit(weights, model.state_dict(), *about)
     model.load_state_dict(weights)
     model.eval()
     if isinstance(model, NeRD):
@@ -152,12 +149,10 @@ def model_name(name: str | Path, scene: Scene | None = None) -> str:
 
 def _known() -> str:
     """All that ``dynamics=`` takes."""
-    names, steps = ", ".join((*KINDS, *ENGINES)), ", ".join(STEPS)
-    shipped = ", ".join(shipped_models())
-    return (
-        f"{names}, an analytic step ({steps}), a shipped model ({shipped}) or a "
-        "checkpoint folder"
-    )
+    parts = (*KINDS, *ENGINES), STEPS, shipped_models()
+    names, steps, shipped = map(", ".join, parts)
+    steps, shipped = f"an analytic step ({steps})", f"a shipped model ({shipped})"
+    return f"{names}, {steps}, {shipped} or a checkpoint folder"
 
 
 def shipped_models(scene: Scene | None = None) -> list[str]:
@@ -265,8 +260,5 @@ def _compare(card: dict[str, Any], scene: Scene, folder: Path) -> None:
         if stored.get(key) != value
     ]
     if differing:
-        warnings.warn(
-            f"the checkpoint in {folder} was made for other physics: "
-            + ", ".join(differing),
-            stacklevel=3,
-        )
+        said = f"the checkpoint in {folder} was made for other physics: "
+        warnings.warn(said + ", ".join(differing), stacklevel=3)

@@ -24,9 +24,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     try:
         _replace(path, write)
     except OSError as error:
-        raise ValueError(
-            f"{path} cannot be written: {error.strerror or error}"
-        ) from None
+        reason = error.strerror or error
+        raise ValueError(f"{path} cannot be written: {reason}") from None
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
@@ -88,9 +87,8 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text())
     except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"expected JSON in {path}, got something else: {error}"
-        ) from None
+        said = f"expected JSON in {path}, got something else: {error}"
+        raise ValueError(said) from None
     if not isinstance(content, dict):
         kind = type(content).__name__
         raise ValueError(f"expected a JSON object in {path}, got a {kind}")

@@ -148,16 +148,13 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         env, begins = self.env, self._is_over  # (num_envs,): whose action is ignored
         given = torch.as_tensor(np.asarray(actions), dtype=torch.float32).to(env.device)
         after = env.step(TensorDict({ACTION: given}, env.batch_size))["next"]
-        observation, reward = (
-            _numpy(after[OBSERVATION]),
-            _numpy(after["reward"].double()),
-        )
-        terminated, truncated = _numpy(after["terminated"]), _numpy(after["truncated"])
+        observation, reward = _numpy(after[OBSERVATION]), after["reward"].double()
+        columns = reward, after["terminated"], after["truncated"]  # (num_envs, 1) each
+        reward, terminated, truncated = (_numpy(x[:, 0]) for x in columns)
         if begins.any():
             observation[begins] = self._begin(begins)[begins]
-            for column in (reward, terminated, truncated):  # (num_envs, 1) each
+            for column in (reward, terminated, truncated):
                 column[begins] = 0
-        reward, terminated, truncated = reward[:, 0], terminated[:, 0], truncated[:, 0]
         self._is_over, self._shown = terminated | truncated, observation
         return observation.copy(), reward, terminated, truncated, {}
 
@@ -176,11 +173,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
-    Args:
-        task: id of a task, or a task.
-        dynamics: as for `make_env`.
-        render_mode: ``"rgb_array"`` or None.
-        settings: other arguments of `GymnasiumVectorEnv`, but ``num_envs``.
+    Arguments are those of `GymnasiumVectorEnv`, but for ``num_envs``.
 
     Raises:
         TypeError: ``num_envs``, or an unknown argument.
@@ -198,11 +191,8 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         settings |= {"render_mode": render_mode}
         self.vector = GymnasiumVectorEnv(task, dynamics, 1, **settings)
-        self.metadata = {
-            **self.metadata,
-            "render_fps": self.vector.metadata["render_fps"],
-        }
-        self.render_mode = render_mode
+        fps = {"render_fps": self.vector.metadata["render_fps"]}
+        self.metadata, self.render_mode = {**self.metadata, **fps}, render_mode
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 

@@ -16,7 +16,7 @@ from torchrl_nerd.dynamics import Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.commands import drive
+from torchrl_nerd.scenes.commands import command_key, drive
 
 PREFIX = "check."  # of the names of what is stored
 ROWS = 8
@@ -45,29 +45,22 @@ def stored_steps(model: Model, scene: Scene) -> dict[str, Tensor]:
     if isinstance(model, NeRD) and (told := model.scene_features.variation) is not None:
         start[PARAMETERS] = told.draw(ROWS, Generator().manual_seed(0))
     middle, half = scene.sampling.commands
-    given = {**start, _command(scene): middle + scale * half}
+    given = {**start, command_key(scene)[1]: middle + scale * half}
     return {PREFIX + k: v for k, v in (given | _steps(model, scene, given)).items()}
 
 
 def self_check(
     model: Model, scene: Scene, tensors: dict[str, Tensor], where: str
 ) -> SelfCheck | None:
-    """Step the stored states again; None where there are none.
+    """Step the states among a checkpoint's tensors again; None where there are none.
 
-    Args:
-        model: as it was loaded.
-        scene: see `stored_steps`.
-        tensors: of the checkpoint, steps among them.
-        where: they were read from, for the sentence.
+    ``scene`` is that of `stored_steps`; ``where`` names the file, for the sentence.
 
     Raises:
         ValueError: states of another robot.
     """
-    stored = {
-        key.removeprefix(PREFIX): value
-        for key, value in tensors.items()
-        if key.startswith(PREFIX)
-    }
+    found = (item for item in tensors.items() if item[0].startswith(PREFIX))
+    stored = {key.removeprefix(PREFIX): value for key, value in found}
     if not stored:
         return None
     try:
@@ -97,7 +90,7 @@ def _steps(model: Model, scene: Scene, given: dict[str, Tensor]) -> dict[str, Te
     """One step of MuJoCo and of the model."""
     kept = {key: given[key] for key in (QPOS, QVEL, PARAMETERS) if key in given}
     state = TensorDict(kept, [len(given[QPOS])])
-    driven = drive(scene, given[_command(scene)], state[QPOS], state[QVEL])
+    driven = drive(scene, given[command_key(scene)[1]], state[QPOS], state[QVEL])
     (torque, ctrl), terrain = driven, given.get(TERRAIN)
     made, mujoco = {}, MujocoDynamics(scene, num_threads=1)
     for kind, dynamics in (("mujoco", mujoco), ("model", dynamics_of(model))):
@@ -105,11 +98,6 @@ def _steps(model: Model, scene: Scene, given: dict[str, Tensor]) -> dict[str, Te
         after = dynamics.step(state, torque, terrain, ctrl)
         made |= {f"{kind}_{key}": after[key] for key in (QPOS, QVEL)}
     return made
-
-
-def _command(scene: Scene) -> str:
-    """What the stored steps call the command."""
-    return "joint_torque" if scene.servos is None else "ctrl"
 
 
 def _difference(a: Tensor, b: Tensor) -> float:

@@ -13,9 +13,7 @@ LFS_POINTER = b"version https://git-lfs"
 
 
 def write_tensors(
-    path: Path,
-    tensors: Mapping[str, Tensor],
-    about: Mapping[str, str] | None = None,
+    path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None
 ) -> None:
     """Replace the file by these tensors of any device; ``about``: words kept with them.
 
@@ -44,9 +42,8 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     try:
         return load_file(path)
     except SafetensorError as error:
-        raise ValueError(
-            f"{path} is truncated or no safetensors file: {error}"
-        ) from None
+        said = f"{path} is truncated or no safetensors file: {error}"
+        raise ValueError(said) from None
 
 
 def expect_fit(
@@ -62,17 +59,13 @@ def expect_fit(
     """
     shapes, own = ({k: tuple(v.shape) for k, v in x.items()} for x in (expected, found))
     for key in sorted(shapes.keys() | own.keys()):
-        if shapes.get(key) != own.get(key):
-            raise ValueError(
-                f"{what} do not fit {of}: expected {key!r} of shape {shapes.get(key)}, "
-                f"got {own.get(key)}"
-            )
-        types = found[key].dtype, expected[key].dtype
+        said = f"{what} do not fit {of}: expected {key!r} of"
+        want, got = shapes.get(key), own.get(key)
+        if want != got:
+            raise ValueError(f"{said} shape {want}, got {got}")
+        want, got = expected[key].dtype, found[key].dtype
         # loading may change the type from one kind of float to another alone
-        if types[0] != types[1] and not all(t.is_floating_point for t in types):
-            raise ValueError(
-                f"{what} do not fit {of}: expected {key!r} of type "
-                f"{expected[key].dtype}, got {found[key].dtype}"
-            )
+        if want != got and not (want.is_floating_point and got.is_floating_point):
+            raise ValueError(f"{said} type {want}, got {got}")
         if not found[key].to(expected[key].dtype).isfinite().all():
             raise ValueError(f"expected finite {what}, got NaN or infinity in {key!r}")

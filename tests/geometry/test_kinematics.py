@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import every_scene, random_quats, random_states, random_tree
 
-from torchrl_nerd.geometry.base import Base, fixed_base_pose
+from torchrl_nerd.geometry.base import Base, root_pose
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rotations import matrix_from_quat
 
@@ -39,7 +39,7 @@ def seen_by_the_base(model, base, mount, data, body, point):
 
 def check_against_mujoco(model, rng):
     base, data = Base.from_model(model), mujoco.MjData(model)
-    mount = fixed_base_pose(model, base)
+    mount = root_pose(model, base.body)
     bodies, places = random_points(model, base, rng)
     qpos, qvel = random_states(model, ROWS, rng)
     positions, velocities = PointKinematics(model, base, bodies, places)(qpos, qvel)

@@ -37,16 +37,10 @@ def free_acceleration(scene, rows, period=0.0, torque=None):
     model = scene.model
     axes = JointAxes.of(model, scene.base)
     motion = RigidBodyDynamics(model, scene.base, axes, list(range(model.nv)))
-    bodies = axes.bodies + motion.bodies
-    positions = np.concatenate((axes.positions, motion.positions))
-    points, _ = PointKinematics(model, scene.base, bodies, positions)(
-        rows[QPOS], rows[QVEL][:0]
-    )
-    count = len(axes.bodies)
+    points = motion.bodies, motion.positions
+    places, _ = PointKinematics(model, scene.base, *points)(rows[QPOS], rows[QVEL][:0])
     rotation = scene.base_pose(rows[QPOS])[1]
-    corners, places = points[:, count:], points[:, :count]
-    where = rotation, corners, places
-    return motion(rows[QPOS], rows[QVEL], torque, *where, period)
+    return motion(rows[QPOS], rows[QVEL], torque, rotation, places, period)
 
 
 def mujoco_acceleration(scene, rows, period=0.0, torque=None):

@@ -34,9 +34,7 @@ STEPS: dict[str, StepConfig] = {
     "penalty-contact": PenaltyContactConfig(),
     "penalty-contact-2-outer-steps": PenaltyContactConfig(num_outer_steps=2),
     "penalty-contact-1-stage": PenaltyContactConfig(num_stages=1),
-    "penalty-contact-1-stage-merged": PenaltyContactConfig(
-        num_stages=1, merged_substeps=2
-    ),
+    "penalty-contact-1-stage-merged": PenaltyContactConfig(1, merged_substeps=2),
 }
 
 

@@ -142,13 +142,9 @@ class FreeBodyPenaltyStep(AnalyticStep):
         spring, damper = ke / soften, (kd + h * ke) / soften
         slip = kf / (1.0 + h * kf / self.lightest)
         axes = torch.eye(3, dtype=points.dtype, device=points.device)
-        cross = torch.linalg.cross(
-            points[:, None], axes[None]
-        )  # (P, 3, 3): w -> w x point
+        cross = torch.linalg.cross(points[:, None], axes[None])  # w -> w x point
         cross = cross.reshape(-1, 3)  # (3 P, 3): force -> point x force
-        fall = torch.zeros_like(qvel[:1, :3])
-        fall[:, 2] = 1.0
-        fall = fall * (h * gravity)
+        fall = axes[2] * (h * gravity)
         quat, angular = qpos[:, 3:], qvel[:, 3:]
         rotation = self._rotation(quat)
         position = qpos[:, :3] + rotation @ centre

@@ -49,19 +49,16 @@ class DynamicsEvaluation(nn.Module):
         self.num_points, self.num_axes = len(points), len(axes.joints)
         self.branches = BranchSparsity.of(model)
         self.rigid_body = RigidBodyDynamics(model, scene.base, axes, scene.actuated)
-        bodies = points.bodies + axes.bodies + self.rigid_body.bodies
-        places = points.positions, axes.positions, self.rigid_body.positions
-        places = np.concatenate(places)
+        bodies = points.bodies + self.rigid_body.bodies
+        places = np.concatenate((points.positions, self.rigid_body.positions))
         self.kinematics = PointKinematics(model, scene.base, bodies, places)
-        self.pose = BasePose(scene.model, scene.base)
+        self.pose = BasePose(model, scene.base)
         self.ground = TerrainDistance(scene.terrain, float(points.margins.max()))
         # linear ones, which move every point; the base's angular ones come next
         self.num_base_dofs = 3 * scene.base.is_floating
         # points of several bodies in one place act together, each moved by its own joints
-        weights = (
-            points.merged
-            @ axes.ancestry(shape_points(model, scene.max_contact_points)[0]).T
-        )
+        every, *_ = shape_points(model, scene.max_contact_points)
+        weights = points.merged @ axes.ancestry(every).T
         weights /= points.merged.sum(1, keepdims=True)  # (P, J)
         longest = int((weights > 0.0).sum(1).max(initial=0))
         # a point's own joints first, then others of weight zero, to fill the row
@@ -91,19 +88,19 @@ class DynamicsEvaluation(nn.Module):
         ``dtype``: of the result but for the base's rotation, which is float64.
         """
         found, _ = self.kinematics(qpos, qvel)
-        sizes = self.num_points, 2 * self.num_axes, len(self.rigid_body.bodies)
-        points, places, corners = found.split(sizes, -2)
+        sizes = self.num_points, len(self.rigid_body.bodies)
+        points, places = found.split(sizes, -2)
         position, rotation = self.pose(qpos)
         distance, normal = self.ground(points, terrain, position, rotation)
-        matrix, force = self.rigid_body.mass_matrix_and_force(
-            qpos, qvel, joint_torque, rotation, corners, places, self.damping_period
-        )
-        inverse, qacc = spd_inverse(matrix, force, self.branches)
+        given = qpos, qvel, joint_torque, rotation, places, self.damping_period
+        motion = self.rigid_body.mass_matrix_and_force(*given)
+        inverse, qacc = spd_inverse(*motion, self.branches)
         depth, normal = self.radii - distance.mT, rows_last(normal, 2)
         # a sphere's contact is halfway between its surface and the ground, as MuJoCo's
         inwards = self.radii - 0.5 * depth.clamp_min(0.0)  # (P, N), m
         points = rows_last(points, 2) - inwards * normal
-        jacobian = self._jacobian(points, rows_last(places, 2))
+        axes = places[..., : 2 * self.num_axes, :]
+        jacobian = self._jacobian(points, rows_last(axes, 2))
         parts = jacobian, normal, depth, qacc, inverse
         frozen = (x.to(dtype).contiguous() for x in parts)
         return FrozenDynamics(*frozen, rotation=rotation)

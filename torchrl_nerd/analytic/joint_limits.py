@@ -79,18 +79,15 @@ class JointLimits(nn.Module):
         mass matrix. The forces are solved anew in ``num_solves`` equal parts of the period.
         ``lag``, s: substep of semi-implicit Euler; positions move by the new velocity.
         """
-        step, force = (
-            period / max(num_solves, 1),
-            torch.zeros_like(qpos[: len(self.joints)]),
-        )
+        step = period / max(num_solves, 1)
+        force = torch.zeros_like(qpos[: len(self.joints)])
         coupling = take(take(inverse, self.joints, 0), self.joints, 1)
         for _ in range(num_solves):
             position, velocity = (take(x, self.joints, 0) for x in (qpos, qvel))
             smooth = take(acceleration, self.joints, 0)
             force, side = self._solve(position, velocity, smooth, coupling, force)
-            qacc = acceleration + (take(inverse, self.joints, 1) * (side * force)).sum(
-                1
-            )
+            columns = take(inverse, self.joints, 1)
+            qacc = acceleration + (columns * (side * force)).sum(1)
             qpos = qpos + step * (qvel + 0.5 * (step + lag) * qacc)
             qvel = qvel + step * qacc
         return qpos, qvel

@@ -58,9 +58,8 @@ class PenaltyContactStep(AnalyticStep):
         if num_stages not in (1, 2):
             raise ValueError(f"expected 1 or 2 stages, got {num_stages}")
         check_supported(scene)
-        config = PenaltyContactConfig(
-            num_stages, num_outer_steps, merged_substeps, precision
-        )
+        given = num_stages, num_outer_steps, merged_substeps, precision
+        config = PenaltyContactConfig(*given)
         super().__init__(scene, config, num_outer_steps * scene.layout.nv)
         if scene.model.opt.integrator != EULER:
             found = mujoco.mjtIntegrator(scene.model.opt.integrator).name
@@ -69,9 +68,9 @@ class PenaltyContactStep(AnalyticStep):
             )
         substeps = max(1, scene.substeps // merged_substeps)
         if num_outer_steps < 1 or substeps % num_outer_steps:
+            got = f"got {num_outer_steps}"
             raise ValueError(
-                f"expected outer steps that divide {substeps} substeps, got "
-                f"{num_outer_steps}"
+                f"expected outer steps that divide {substeps} substeps, {got}"
             )
         self.num_stages, self.num_outer_steps = num_stages, num_outer_steps
         self.num_substeps = substeps // num_outer_steps  # of each outer step
@@ -80,9 +79,8 @@ class PenaltyContactStep(AnalyticStep):
         axes = JointAxes.of(scene.model, scene.base)
         self.evaluation = DynamicsEvaluation(scene, axes, 2.0 * self.step_size)
         self.layout, self.dtype = scene.layout, getattr(torch, precision)
-        self.integrator = SubstepIntegrator(
-            scene, axes, self.evaluation, self.step_size
-        )
+        parts = axes, self.evaluation, self.step_size
+        self.integrator = SubstepIntegrator(scene, *parts)
 
     def _step(
         self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None

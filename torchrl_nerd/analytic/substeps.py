@@ -117,9 +117,8 @@ class SubstepIntegrator(nn.Module):
         jacobian_rate, qacc_rate = None, None
         if between:
             turn = last.rotation.mT @ first.rotation
-            jacobian, normal = (
-                _rotated(x, turn) for x in (first.jacobian, first.normal)
-            )
+            jacobian = _rotated(first.jacobian, turn)
+            normal = _rotated(first.normal, turn)
             qacc_smooth = self.to_base_frame(first.qacc_smooth, turn)
             depth, rate = first.depth, 1.0 / between  # per substep
             jacobian_rate = rate * (last.jacobian - jacobian)

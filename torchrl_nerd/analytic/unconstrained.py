@@ -8,7 +8,6 @@ adding its own. Joint limits change faster and are solved anew several times per
 """
 
 import mujoco
-import numpy as np
 from torch import Tensor
 
 from torchrl_nerd.analytic.base import AnalyticStep, StepResult, check_supported
@@ -46,10 +45,9 @@ class UnconstrainedStep(AnalyticStep):
         self.lag = has_lag * float(model.opt.timestep)
         axes = JointAxes.of(model, scene.base)
         self.rigid_body = RigidBodyDynamics(model, scene.base, axes, scene.actuated)
-        bodies = axes.bodies + self.rigid_body.bodies
-        positions = np.concatenate((axes.positions, self.rigid_body.positions))
-        self.kinematics = PointKinematics(model, scene.base, bodies, positions)
-        self.pose = BasePose(scene.model, scene.base)
+        points = self.rigid_body.bodies, self.rigid_body.positions
+        self.kinematics = PointKinematics(model, scene.base, *points)
+        self.pose = BasePose(model, scene.base)
         self.layout = scene.layout
         is_limited = model.jnt_limited[axes.joints] != 0
         self.limits, self.num_solves = None, 1
@@ -78,14 +76,11 @@ class UnconstrainedStep(AnalyticStep):
 
         The inverse is None where no limit needs it.
         """
-        points, _ = self.kinematics(qpos, qvel)
-        count = len(self.rigid_body.bodies)
-        places, corners = points.split((points.shape[-2] - count, count), -2)
-        _, rotation = self.pose(qpos)
-        where = qpos, qvel, joint_torque, rotation, corners, places, period
+        places, _ = self.kinematics(qpos, qvel)
+        given = qpos, qvel, joint_torque, self.pose(qpos)[1], places, period
         if self.limits is None:
-            return self.rigid_body(*where), None
-        inverse, qacc = spd_inverse(*self.rigid_body.mass_matrix_and_force(*where))
+            return self.rigid_body(*given), None
+        inverse, qacc = spd_inverse(*self.rigid_body.mass_matrix_and_force(*given))
         return qacc.mT, inverse
 
     def _integrate(

@@ -60,13 +60,10 @@ class Dynamics(Protocol):
 def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
     """Give a dynamics the past that a recorded motion has; what it had is forgotten.
 
-    A rollout from the state after the motion then starts adapted to what the motion shows.
-
-    Args:
-        dynamics: any; the ground truth learns of late torques.
-        history: ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any,
-            ``ctrl``, ``terrain`` and ``parameters``, ``[num_envs, T]``, oldest first.
-        num_envs: that step together.
+    A rollout from the state after the motion then starts adapted to what the motion shows;
+    the ground truth learns of late torques. ``history [num_envs, T]``, oldest first, holds
+    ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any, ``ctrl``,
+    ``terrain`` and ``parameters``.
 
     Raises:
         ValueError: another number of envs, no step at all, or a key that is missing.

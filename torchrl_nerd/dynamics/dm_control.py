@@ -139,12 +139,8 @@ class DMControlDynamics:
         values = {QPOS: next_qpos, QVEL: next_qvel}
         if feels_forces(self.scene):
             values[SENSORDATA] = felt
-        device = state[QPOS].device
-        return TensorDict(
-            {key: torch.from_numpy(value).to(device) for key, value in values.items()},
-            batch_size=[len(qpos)],
-            device=state.device,
-        )
+        after = {key: torch.from_numpy(value) for key, value in values.items()}
+        return TensorDict(after, [len(qpos)]).to(state[QPOS].device)
 
 
 def _place(

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -51,9 +51,8 @@ SINGLE_THREADED = {
         "guard_filter_fn": _keep_tensor_guards,
     },
 }
-MIN_WORK = (
-    2048  # envs times dofs of a part: handing over less takes longer than it saves
-)
+# envs times dofs of a part: handing over less takes longer than it saves
+MIN_WORK = 2048
 
 
 class TorchDynamics:
@@ -152,11 +151,8 @@ class TorchDynamics:
         given = qpos, qvel, drive, ground, self._memory, is_scored
         with torch.set_grad_enabled(self.differentiable):
             next_qpos, next_qvel, score = self._run(given)
-        after = TensorDict(
-            {QPOS: next_qpos.to(there), QVEL: next_qvel.to(there)},
-            batch_size=state.batch_size,
-            device=state.device,
-        )
+        moved = {QPOS: next_qpos.to(there), QVEL: next_qvel.to(there)}
+        after = TensorDict(moved, state.batch_size, device=state.device)
         if PARAMETERS in state.keys():
             after[PARAMETERS] = state[PARAMETERS]
         return after, None if score is None else score.to(there)
@@ -206,17 +202,15 @@ class NeRDDynamics(TorchDynamics):
         compile: bool = False,
         differentiable: bool = False,
     ) -> None:
-        if inference not in ("streaming", "window"):
-            raise ValueError(
-                f"expected inference 'streaming' or 'window', got '{inference}'"
-            )
+        if inference not in get_args(Inference):
+            known = " or ".join(map(repr, get_args(Inference)))
+            raise ValueError(f"expected inference {known}, got '{inference}'")
         if window < 1:
             raise ValueError(f"expected a window of at least 1 token, got {window}")
         self.model = model.eval()
-        network = cast(Network, model.network)
+        self.network = cast(Network, model.network)
         if inference == "window":
-            network = WindowNetwork(model.network, window, model.token_size)
-        self.network: Network = network
+            self.network = WindowNetwork(model.network, window, model.token_size)
         super().__init__(model, compile, differentiable)
 
     @unaffected
@@ -256,11 +250,9 @@ class NeRDDynamics(TorchDynamics):
         def network_step(token: Tensor) -> Tensor:
             return self.network.step(token, memory)
 
-        model = self.model
-        next_qpos, next_qvel, features = model.step(
-            (qpos, qvel), drive, terrain, network_step
-        )
-        score = model.ood_score(features) if is_scored else None
+        given = (qpos, qvel), drive, terrain, network_step
+        next_qpos, next_qvel, features = self.model.step(*given)
+        score = self.model.ood_score(features) if is_scored else None
         return next_qpos, next_qvel, score
 
 
@@ -286,7 +278,5 @@ def dynamics_of(model: Model, **how: Any) -> NeRDDynamics | AnalyticDynamics:
     """
     if isinstance(model, NeRD):
         return NeRDDynamics(model, **how)
-    of_history = ("inference", "window")
-    return AnalyticDynamics(
-        model, **{k: v for k, v in how.items() if k not in of_history}
-    )
+    how = {k: v for k, v in how.items() if k not in ("inference", "window")}
+    return AnalyticDynamics(model, **how)

@@ -105,12 +105,11 @@ class MujocoDynamics:
 
     def __getstate__(self) -> dict:
         """Threads do not travel: a copy in another process starts its own."""
-        kept = ("scene", "num_threads")
-        state = {name: self.__dict__[name] for name in kept}
-        return {**state, "past": self.history()}
+        made_of = self.scene, self.num_threads
+        return {"made_of": made_of, "past": self.history()}
 
     def __setstate__(self, state: dict) -> None:
-        self.__init__(state["scene"], state["num_threads"])
+        self.__init__(*state["made_of"])
         self._start(*state["past"])
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
@@ -142,9 +141,7 @@ class MujocoDynamics:
         """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
         controls = None if ctrl is None else ctrl[:, None]
         states = self.rollout(state, joint_torque[:, None], terrain, controls)
-        last = TensorDict(
-            {key: x[:, 0] for key, x in states.items()}, len(joint_torque)
-        )
+        last = TensorDict({k: x[:, 0] for k, x in states.items()}, len(joint_torque))
         if feels_forces(self.scene):
             felt = np.zeros((0, self._model.nsensordata))
             if self._batch is not None:

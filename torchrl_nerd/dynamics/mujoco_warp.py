@@ -64,9 +64,8 @@ class MujocoWarpDynamics:
         try:
             self._place = self._warp.device_from_torch(self.device)
         except (RuntimeError, ValueError) as error:
-            raise ValueError(
-                f"MuJoCo Warp finds no device '{self.device}' here"
-            ) from error
+            said = f"MuJoCo Warp finds no device '{self.device}' here"
+            raise ValueError(said) from error
         self._source = engine_model(self.scene, self.has_actuators)
         if not self.has_actuators:
             _weaken_actuators(self._source)

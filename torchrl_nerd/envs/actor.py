@@ -5,5 +5,4 @@ from collections.abc import Callable
 from tensordict import TensorDictBase
 
 Actor = Callable[[TensorDictBase], TensorDictBase]
-"""Any TorchRL policy: reads ``observation``, writes ``action``; see
-`frame_stack_of`."""
+"""Any TorchRL policy: reads ``observation``, writes ``action``; see `frame_stack_of`."""

@@ -20,7 +20,7 @@ from torchrl_nerd.envs.pixels import RenderedEnv
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
-from torchrl_nerd.envs.transition import Transition, drive_sizes, given_state
+from torchrl_nerd.envs.transition import FLAGS, Transition, drive_sizes, given_state
 from torchrl_nerd.keys import ACTION, FAULT, PARAMETERS, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_count, expect_device
@@ -86,26 +86,21 @@ class SceneEnv(RenderedEnv):
                 f"the task is for scene '{task.scene.name}', the dynamics for "
                 f"'{dynamics.scene.name}'"
             )
-        super().__init__(
-            device=expect_device(str(device)), batch_size=torch.Size([num_envs])
-        )
+        place = expect_device(str(device))
+        super().__init__(device=place, batch_size=torch.Size([num_envs]))
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
         self.model_name: str | None = None
         self._renderer = Renderer(task)
         self.guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
         self._transition = Transition(task, dynamics)
-        self._transit = self._transition.step
-        self._restart = self._transition.restart
         inner = self._torch_dynamics
         self._is_differentiable = inner is not None and inner.differentiable
         self.recorder: FaultRecorder | None = None
         if dump_dir is not None:
             about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
             self.recorder = FaultRecorder(Path(dump_dir), about)
-        sizes, is_guarded = self._state_sizes, self.guard is not None
-        for name, spec in make_specs(
-            task, sizes, self.batch_size, self.device, is_guarded, state_dtype
-        ):
+        of = task, self._state_sizes, self.batch_size, self.device
+        for name, spec in make_specs(*of, self.guard is not None, state_dtype):
             setattr(self, name, spec)
         zeros = torch.zeros(num_envs, dtype=state_dtype, device=self.device)
         self.register_buffer("_episode", zeros.long())
@@ -118,6 +113,7 @@ class SceneEnv(RenderedEnv):
         self.register_buffer("_keys", zeros.long(), persistent=False)
         self.register_buffer("_seed", zeros[0].long())
         self._set_seed(secrets.randbits(SEED_BITS) if seed is None else seed)
+        self.eager()
 
     def __repr__(self) -> str:
         model = "" if self.model_name is None else f", model={self.model_name!r}"
@@ -279,8 +275,7 @@ class SceneEnv(RenderedEnv):
         Flags are those of ``tensordict``; a transform may have changed its observation.
         """
         shown = self._begin(self._state(), rows & False, {})
-        flags = (FAULT, TRUST, "done", "terminated", "truncated")
-        for key in (*drive_sizes(self.task), *flags):
+        for key in (*drive_sizes(self.task), FAULT, TRUST, *FLAGS):
             shown[key] = tensordict.get(key, shown[key])
         held = rows[:, None]
         return {k: torch.where(held, shown.get(k, 0.0), v) for k, v in found.items()}

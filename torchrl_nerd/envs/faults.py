@@ -28,15 +28,10 @@ HISTORY = 16  # control steps in a dump
 def find_faults(
     action: Tensor, state: Mapping[str, Tensor], moved: Mapping[str, Tensor]
 ) -> Tensor:
-    """The reason of each env's fault, an index of `REASONS`.
+    """The reason of each env's fault, an index of `REASONS`, int64 ``(num_envs, 1)``.
 
-    Args:
-        action: ``(num_envs, num_actions)``.
-        state: before the step; a model may slow down what ran away.
-        moved: next ``qpos (num_envs, nq)`` and ``qvel (num_envs, nv)``.
-
-    Returns:
-        ``(num_envs, 1)``, int64.
+    Of ``action (num_envs, num_actions)``, the ``state`` before the step, since a model may
+    slow down what ran away, and the next ``qpos`` and ``qvel`` in ``moved``.
     """
     qpos, qvel = moved[QPOS], moved[QVEL]
     far, fast = (torch.maximum(state[k].abs(), moved[k].abs()) for k in (QPOS, QVEL))
@@ -65,13 +60,10 @@ class FaultRecorder:
     def record(
         self, state: Mapping[str, Tensor], action: Tensor, torque: Tensor, fault: Tensor
     ) -> None:
-        """Keep a step; write a dump of each kind of fault that is new.
+        """Keep a step, ``(num_envs, size)`` each; dump each kind of fault that is new.
 
-        Args:
-            state: before the step, ``(num_envs, size)`` each.
-            action: ``(num_envs, num_actions)``, as it was given.
-            torque: ``(num_envs, num_actuated)``.
-            fault: ``(num_envs, 1)`` from `find_faults`.
+        The ``state`` before it, the ``action`` as it was given, the joint ``torque`` and
+        the ``fault`` from `find_faults`.
         """
         step = {**state, "action": action, "joint_torque": torque}
         self._steps.append({k: v.detach().cpu().clone() for k, v in step.items()})
@@ -82,9 +74,8 @@ class FaultRecorder:
 
     def _write(self, kind: int, row: int) -> None:
         steps = self._steps  # at most `HISTORY`, the oldest first
-        tensors = {
-            k: torch.stack([s[k][row] for s in steps]) for k in steps[0]
-        }  # (T, n)
+        # (T, n) each
+        tensors = {k: torch.stack([s[k][row] for s in steps]) for k in steps[0]}
         about = {**self.about, "reason": REASONS[kind], "env": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
         write_tensors(path, tensors, about)

@@ -43,10 +43,8 @@ def append_frame(
 ) -> Tensor:
     """What `stack_frames` shows, ``(*batch, frame_stack * D)``, for a loop without an env.
 
-    Args:
-        recent: what this function gave one action ago; None at the start.
-        observation: ``(*batch, D)``.
-        frame_stack: how many observations.
+    From an ``observation (*batch, D)`` and ``recent``, what this function gave one action
+    ago; None at the start.
     """
     if recent is None:
         return observation.tile(frame_stack)

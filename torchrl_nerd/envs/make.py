@@ -9,13 +9,13 @@ import torch
 from torchrl_nerd.checkpoint import from_pretrained, model_name
 from torchrl_nerd.dynamics import (
     ENGINES,
+    Guard,
     GuardedDynamics,
+    Inference,
     Model,
     NeRDDynamics,
     dynamics_of,
 )
-from torchrl_nerd.dynamics.guarded import Guard
-from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.pixels import image_size
 from torchrl_nerd.geometry.constants import cast_constants
@@ -54,13 +54,12 @@ class GroundTruthEnv(SceneEnv):
         state_dtype: torch.dtype = torch.float64,
     ) -> None:
         if engine not in ENGINES:
-            raise ValueError(
-                f"unknown engine {engine!r}, expected one of {', '.join(ENGINES)}"
-            )
+            known = ", ".join(ENGINES)
+            raise ValueError(f"unknown engine {engine!r}, expected one of {known}")
         task = task if isinstance(task, Task) else make_task(task)
         dynamics = ENGINES[engine](task.scene, expect_device(str(device)))
-        how = dump_dir, state_dtype
-        super().__init__(task, dynamics, num_envs, seed, device, *how)
+        shared = num_envs, seed, device, dump_dir, state_dtype
+        super().__init__(task, dynamics, *shared)
 
 
 class NeRDEnv(SceneEnv):
@@ -114,13 +113,12 @@ class NeRDEnv(SceneEnv):
         model = model.to(expect_device(str(device)))
         how = {"differentiable": differentiable, "inference": inference}
         dynamics = dynamics_of(model, **how)
-        if isinstance(dynamics, NeRDDynamics):
-            if guard is not None:
-                dynamics = GuardedDynamics(dynamics, guard)
-        else:
+        if not isinstance(dynamics, NeRDDynamics):
             _refuse_network_options(name, guard, inference)
-        how = dump_dir, state_dtype
-        super().__init__(task, dynamics, num_envs, seed, device, *how)
+        elif guard is not None:
+            dynamics = GuardedDynamics(dynamics, guard)
+        shared = num_envs, seed, device, dump_dir, state_dtype
+        super().__init__(task, dynamics, *shared)
         self.model_name = name
 
 
@@ -170,10 +168,8 @@ def make_env(
     shared = num_envs, seed, device
     if isinstance(dynamics, str) and dynamics in ENGINES:
         if differentiable:
-            raise ValueError(
-                "expected learned, hybrid or analytic dynamics for gradients, got "
-                f"'{dynamics}'"
-            )
+            wanted = "learned, hybrid or analytic dynamics for gradients"
+            raise ValueError(f"expected {wanted}, got '{dynamics}'")
         _refuse_network_options(dynamics, guard)
         env: SceneEnv = GroundTruthEnv(task, dynamics, *shared, dump_dir, state_dtype)
     else:
@@ -193,6 +189,5 @@ def _refuse_network_options(
     """Refuse what dynamics without a network would ignore."""
     if guard is not None or inference != "streaming":
         option = f"inference '{inference}'" if guard is None else f"guard '{guard}'"
-        raise ValueError(
-            f"expected learned or hybrid dynamics for {option}, got '{dynamics}'"
-        )
+        wanted = f"learned or hybrid dynamics for {option}"
+        raise ValueError(f"expected {wanted}, got '{dynamics}'")

@@ -59,8 +59,8 @@ class RenderedEnv(EnvBase):
 
         Args:
             num_envs: so many envs, from the first; all by default.
-            height: pixels; that of ``render_size`` by default.
-            width: pixels; that of ``render_size`` by default.
+            height: pixels; that of ``render_size`` by default, as is ``width``.
+            width: pixels.
             camera_id: number or name of a camera; ``env.camera_id`` by default.
 
         Raises:
@@ -93,14 +93,14 @@ class RenderedEnv(EnvBase):
         """
         self.from_pixels, self.pixels_only = True, pixels_only
         shape = torch.Size((*self.batch_size, *self.render_size, 3))
-        seen: dict[Any, Any] = (
-            {} if pixels_only else dict(self.observation_spec.items())
-        )
-        seen[PIXELS] = Bounded(0, 255, shape, self.device, torch.uint8)
-        how = {"shape": self.batch_size, "device": self.device}
+        how, seen = {"shape": self.batch_size, "device": self.device}, {}
+        self._hidden: tuple[Any, ...] = ()
         if pixels_only:
             self.state_spec = Composite(**how)
-        self._hidden = tuple(self.observation_spec.keys()) if pixels_only else ()
+            self._hidden = tuple(self.observation_spec.keys())
+        else:
+            seen.update(self.observation_spec.items())
+        seen[PIXELS] = Bounded(0, 255, shape, self.device, torch.uint8)
         self.observation_spec = Composite(seen, **how)
         return self
 

@@ -44,6 +44,8 @@ renderer.close()
 print("rendered", flush=True)
 """
 
+Camera = mujoco.MjvCamera | int | str
+
 
 def find_gl() -> str | None:
     """The first OpenGL library that works here, such as ``"egl"``, or None.
@@ -133,13 +135,14 @@ class Renderer:
         width: int = 320,
         camera_id: int | str | None = None,
     ) -> np.ndarray:
-        """Images ``(n, height, width, 3)``, uint8.
+        """Images ``(n, height, width, 3)``, uint8; sizes are in pixels.
+
+        Lower ones than `SMALL` are drawn without shadows and smoothing, which is faster.
 
         Args:
             state: ``qpos (n, nq)`` and the task's parameters.
-            height: of an image, pixels. Images lower than `SMALL` are drawn without
-                shadows and smoothing, which is faster.
-            width: of an image, pixels.
+            height: of an image.
+            width: of an image.
             camera_id: number or name of a camera; -1 for the free one.
 
         Raises:
@@ -166,12 +169,7 @@ class Renderer:
             renderer.render(out=images[i])
         return images
 
-    def _draw(
-        self,
-        row: State,
-        renderer: "mujoco.Renderer",
-        camera: mujoco.MjvCamera | int | str,
-    ) -> None:
+    def _draw(self, row: State, renderer: "mujoco.Renderer", camera: Camera) -> None:
         model, data, scene = self._model, self._data, self.task.scene
         data.qpos[:] = as_numpy(row[QPOS][0])
         pose = ground_pose(scene, row.get(TERRAIN))
@@ -195,7 +193,7 @@ class Renderer:
             )
             seen.ngeom += 1
 
-    def _camera(self, camera_id: int | str | None) -> mujoco.MjvCamera | int | str:
+    def _camera(self, camera_id: int | str | None) -> Camera:
         model, camera = self.task.scene.model, mujoco.MjvCamera()
         if camera_id is None:
             is_fixed = model.cam_mode == int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
@@ -224,9 +222,8 @@ class Renderer:
         # MuJoCo made its own choice when it was imported, see above
         # needs an OpenGL library, which envs that are not drawn do without
         gl_context = import_module("mujoco.rendering.classic.gl_context")
-        vars(gl_context)["GLContext"] = import_module(
-            f"mujoco.{require_gl()}"
-        ).GLContext
+        library = import_module(f"mujoco.{require_gl()}")
+        vars(gl_context)["GLContext"] = library.GLContext
         renderer = mujoco.Renderer(self._model, height, width)
         _DREW[:] = [os.getpid()]
         atexit.unregister(_close_all)  # before MuJoCo gives the display back

@@ -6,7 +6,7 @@ import torch
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from torchrl_nerd.envs.faults import REASONS
-from torchrl_nerd.envs.transition import drive_sizes
+from torchrl_nerd.envs.transition import FLAGS, drive_sizes
 from torchrl_nerd.keys import FAULT, OBSERVATION, TRUST
 from torchrl_nerd.tasks import Task
 
@@ -19,15 +19,10 @@ def make_specs(
     is_guarded: bool,
     state_dtype: torch.dtype = torch.float64,
 ) -> Iterator[tuple[str, TensorSpec]]:
-    """Name and value of every spec.
+    """Name and value of every spec of an env of that task and batch size ``rows``.
 
-    Args:
-        task: what is observed and how wide an action is.
-        state_sizes: width of each key of the state.
-        rows: batch size of the env.
-        device: of all tensors.
-        is_guarded: whether steps have a ``trust``.
-        state_dtype: of the state and of torques.
+    ``state_sizes`` are the widths of the state's keys, whose type, and that of torques, is
+    ``state_dtype``; steps of guarded dynamics have a ``trust``.
     """
 
     def shape(width: int) -> torch.Size:
@@ -52,5 +47,5 @@ def make_specs(
     actions = shape(task.controller.num_actions)
     yield "action_spec", Bounded(-1.0, 1.0, actions, device, torch.float32)
     yield "reward_spec", Unbounded(shape(1), device, torch.float32)
-    flags = {k: column(2, torch.bool) for k in ("done", "terminated", "truncated")}
+    flags = {key: column(2, torch.bool) for key in FLAGS}
     yield "full_done_spec", Composite(flags, shape=rows, device=device)

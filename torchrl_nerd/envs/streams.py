@@ -38,18 +38,12 @@ def stream_offsets(count: int, device: torch.device | str = "cpu") -> Tensor:
 
 
 def uniforms(
-    keys: Tensor,
-    episode: Tensor,
-    offsets: Tensor,
-    dtype: torch.dtype = torch.float64,
+    keys: Tensor, episode: Tensor, offsets: Tensor, dtype: torch.dtype = torch.float64
 ) -> Tensor:
-    """Uniform numbers in [0, 1), ``(rows, count)``.
+    """Uniform numbers in [0, 1), ``(rows, count)``, of as many bits as their type holds.
 
-    Args:
-        keys: ``(rows,)``, see `row_keys`.
-        episode: ``(rows,)`` int64: how many episodes each env has begun.
-        offsets: ``(count,)``, see `stream_offsets`.
-        dtype: of the numbers: as many leading bits as it holds.
+    From the keys of `row_keys`, how many episodes each env has begun, int64 ``(rows,)``,
+    and the offsets of `stream_offsets`.
     """
     keys = _mix(keys + (episode + 1) * GOLDEN)
     bits = _mix(keys[:, None] + offsets)  # (rows, count)

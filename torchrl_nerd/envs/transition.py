@@ -32,6 +32,7 @@ from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
+FLAGS = ("done", "terminated", "truncated")
 
 
 def drive_sizes(task: Task) -> dict[str, int]:
@@ -86,9 +87,7 @@ class Transition:
             trust = None if trust is None else torch.minimum(trust, moved[TRUST])
         fault = find_faults(action, state, moved)  # (num_envs, 1)
         is_good = fault == 0
-        kept = {
-            key: torch.where(is_good, moved[key], state[key]) for key in (QPOS, QVEL)
-        }
+        kept = {k: torch.where(is_good, moved[k], state[k]) for k in (QPOS, QVEL)}
         after = state | kept
         shown = after | {ACTION: given}
         if SENSORDATA in moved:
@@ -153,11 +152,7 @@ class Transition:
         return self._move(*given)  # pyright: ignore
 
     def restart(
-        self,
-        state: Tensors,
-        rows: Tensor,
-        drawn: Tensor,
-        given: Tensors,
+        self, state: Tensors, rows: Tensor, drawn: Tensor, given: Tensors
     ) -> Tensors:
         """New episodes for some envs; the others stay bitwise as they are.
 
@@ -182,16 +177,13 @@ class Transition:
             key: torch.where(column, fresh[key].to(now.dtype), now)
             for key, now in state.items()
         }
-        flags = ("done", "terminated", "truncated")
+        sizes, zero = drive_sizes(self.task), start[QPOS].new_zeros
         return start | {
-            **{
-                key: start[QPOS].new_zeros(len(rows), size)
-                for key, size in drive_sizes(self.task).items()
-            },
+            **{key: zero(len(rows), size) for key, size in sizes.items()},
             FAULT: torch.zeros_like(column, dtype=torch.long),
             TRUST: torch.ones_like(column, dtype=torch.float32),
             OBSERVATION: self.task.observation(start).to(torch.float32),
-            **{flag: torch.zeros_like(column) for flag in flags},  # (num_envs, 1) each
+            **{flag: torch.zeros_like(column) for flag in FLAGS},  # (num_envs, 1) each
         }
 
 
@@ -204,12 +196,8 @@ def given_state(
 ) -> dict[str, Tensor]:
     """The state that ``reset(td, set_state=True)`` asks for, copies, of unit quaternions.
 
-    Args:
-        scene: what the state is of.
-        tensordict: with ``qpos``, ``qvel`` and, where they vary, the task's parameters.
-        rows: ``(num_envs,)``, envs that are reset; only their state must be finite.
-        sizes: width of each key of the state.
-        dtype: of the state.
+    Of the keys in ``sizes``, which have these widths, ``qpos`` and ``qvel`` must be there.
+    Only the state of ``rows (num_envs,)``, which are reset, must be finite.
 
     Raises:
         ValueError: a key that is missing, of another shape or not finite; parameters of
@@ -224,10 +212,8 @@ def given_state(
         value, expected = given.get(key, None), (len(rows), size)
         if value is None:
             continue
-        if value.shape != expected:
-            raise ValueError(
-                f"expected {key} of shape {expected}, got {tuple(value.shape)}"
-            )
+        if (got := tuple(value.shape)) != expected:
+            raise ValueError(f"expected {key} of shape {expected}, got {got}")
         if not value[rows].isfinite().all():
             raise ValueError(f"expected finite {key} to set the state to")
         values[key] = value.to(rows.device, dtype, copy=True)

@@ -74,13 +74,11 @@ def is_free(model: mujoco.MjModel, body: int) -> bool:
     return bool(model.jnt_type[model.body_jntadr[body]] == FREE)
 
 
-def fixed_base_pose(model: mujoco.MjModel, base: Base) -> tuple[np.ndarray, np.ndarray]:
-    """World position ``(3,)``, m, and rotation ``(3, 3)`` of a fixed base."""
-    return root_pose(model, base.body)
-
-
 def root_pose(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where a tree's root body stands before its joints move, as `fixed_base_pose`."""
+    """Where a tree's root body stands before its joints move.
+
+    World position ``(3,)``, m, and rotation ``(3, 3)``.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     parent = int(model.body_parentid[body])
@@ -98,7 +96,7 @@ class BasePose(nn.Module):
     def __init__(self, model: mujoco.MjModel, base: Base) -> None:
         super().__init__()
         self.base = base
-        position, rotation = fixed_base_pose(model, base)
+        position, rotation = root_pose(model, base.body)
         keep_constants(self, position=position, rotation=rotation)
 
     def forward(self, qpos: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,12 +16,7 @@ _kept: dict[tuple, Tensor] = {}
 
 
 def constant(like: Tensor, values: Any) -> Tensor:
-    """``values`` with the dtype and device of ``like``; never write to it.
-
-    Args:
-        like: a tensor.
-        values: numbers, in sequences as deep as the result has dimensions.
-    """
+    """``values``, nested numbers, in dtype and on device of ``like``; never write to it."""
     return _constant(_frozen(values), like.dtype, like.device)
 
 
@@ -57,18 +52,14 @@ def placed(module: Module, like: Tensor) -> Module:
 
 
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    if torch.compiler.is_compiling() and _bakes(device):
+    # compiled code holds constants itself; elsewhere than here it would copy them there
+    if torch.compiler.is_compiling() and device.type == "cpu":
         return torch.tensor(values, dtype=dtype, device=device)
     key = values, dtype, str(device)
     if key not in _kept:
         with torch.inference_mode(False):
             _kept[key] = torch.tensor(values, dtype=dtype, device=device)
     return _kept[key]
-
-
-def _bakes(device: torch.device) -> bool:
-    """Whether compiled code holds constants itself; elsewhere it would copy them there."""
-    return device.type == "cpu"
 
 
 def _frozen(values: Any) -> Any:

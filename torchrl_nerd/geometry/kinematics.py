@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base, is_free
 from torchrl_nerd.geometry.constants import take
-from torchrl_nerd.geometry.manifold import BALL, SLIDE
+from torchrl_nerd.geometry.manifold import BALL, SLIDE, body_joints
 from torchrl_nerd.geometry.motion import (
     Motion,
     cross,
@@ -34,13 +34,8 @@ from torchrl_nerd.geometry.rotations import (
 class PointKinematics(nn.Module):
     """Positions and velocities of body-fixed points, in and relative to the base frame.
 
-    Bodies of equal depth and kind are moved together: four legs cost as much as one.
-
-    Args:
-        model: compiled model.
-        base: its base, from `Base.from_model`.
-        bodies: body id of each of the P points.
-        positions: ``(P, 3)``, m, in the body's frame.
+    Bodies of equal depth and kind are moved together: four legs cost as much as one. The P
+    points are on ``bodies``, at ``positions (P, 3)``, m, in their frames.
 
     Raises:
         ValueError: a point on a body that does not move with the base.
@@ -73,7 +68,8 @@ class PointKinematics(nn.Module):
             by_kind: dict[tuple, list[int]] = {}
             for body in depth:
                 if depth[body] == level:
-                    kinds = tuple(int(model.jnt_type[j]) for j in _joints(model, body))
+                    joints = body_joints(model, body)
+                    kinds = tuple(model.jnt_type[joints].tolist())
                     by_kind.setdefault(kinds, []).append(body)
             members = by_kind.values()
             groups = (_Group(model, standing, alike, above) for alike in members)
@@ -146,7 +142,7 @@ class _Group(nn.Module):
                 offsets.append(model.body_pos[body])
                 turns.append(quat_matrix(model.body_quat[body]))
         self.joints = nn.ModuleList()
-        slots = zip(*(_joints(model, body) for body in bodies), strict=True)
+        slots = zip(*(body_joints(model, body) for body in bodies), strict=True)
         for joints in slots:  # the first joints of all bodies, then the second ones
             self.joints.append(_Joint(model, list(joints), turns))
             turns = [np.eye(3)] * len(bodies)
@@ -232,11 +228,6 @@ class _Joint(nn.Module):
             velocity = velocity - cross(omega + spin, after[..., moving])
             position = position + before - after
         return position, turned, omega + spin, velocity
-
-
-def _joints(model: mujoco.MjModel, body: int) -> range:
-    start = int(model.body_jntadr[body])
-    return range(start, start + int(model.body_jntnum[body]))
 
 
 def _bodies_on_path(

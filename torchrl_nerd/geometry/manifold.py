@@ -69,6 +69,12 @@ class JointLayout:
         return tuple((slice(q, q + n), slice(v, v + n)) for q, v, n in found)
 
 
+def body_joints(model: mujoco.MjModel, body: int) -> range:
+    """Ids of a body's joints."""
+    start = int(model.body_jntadr[body])
+    return range(start, start + int(model.body_jntnum[body]))
+
+
 def joint_label(model: mujoco.MjModel, joint: int) -> str:
     """A joint's name; ``joint 3`` where it has none."""
     return model.joint(joint).name or f"joint {joint}"

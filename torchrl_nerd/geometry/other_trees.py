@@ -5,13 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import Base, BasePose, is_free, root_pose
-from torchrl_nerd.geometry.motion import (
-    Motion,
-    cross,
-    keep,
-    matmul,
-    rotate_by,
-)
+from torchrl_nerd.geometry.motion import Motion, cross, keep, matmul, rotate_by
 from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_normalize
 
 

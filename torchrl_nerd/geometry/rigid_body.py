@@ -40,8 +40,8 @@ class _Inertia(NamedTuple):
 class RigidBodyDynamics(nn.Module):
     """Acceleration of a robot without contacts and limits; ``actuated``: driven dofs.
 
-    It needs the points ``positions (4 B, 3)``, m, of ``bodies``: four of every body with
-    mass, in the body's frame.
+    It needs the points ``positions (2 J + 4 B, 3)``, m, in the frames of ``bodies``: the
+    anchors, then the tips of all joint axes, then four points of each body with mass.
     """
 
     mass: Tensor  # (B, 1), kg
@@ -63,8 +63,9 @@ class RigidBodyDynamics(nn.Module):
         self.torque_at = [where.get(dof, len(actuated)) for dof in range(model.nv)]
         has_mass = (model.body_weldid != 0) & (model.body_mass > 0.0)
         found = np.flatnonzero(has_mass).tolist()
-        self.bodies = [body for body in found for _ in CORNERS]
-        self.positions = np.concatenate([_four_points(model, body) for body in found])
+        self.bodies = axes.bodies + [body for body in found for _ in CORNERS]
+        corners = (_four_points(model, body) for body in found)
+        self.positions = np.concatenate((axes.positions, *corners))
         self.num_base_dofs = 6 * base.is_floating  # dofs that move every body
         joints, below = axes.joints, axes.bodies[: len(axes.joints)]
         self.qpos_addresses = model.jnt_qposadr[joints].tolist()
@@ -92,7 +93,6 @@ class RigidBodyDynamics(nn.Module):
         qvel: Tensor,
         joint_torque: Tensor | None,
         rotation: Tensor,
-        corners: Tensor,
         places: Tensor,
         period: float | Tensor = 0.0,
     ) -> Tensor:
@@ -103,12 +103,11 @@ class RigidBodyDynamics(nn.Module):
             qvel: ``(*batch, nv)``.
             joint_torque: ``(*batch, num_actuated)``; None for none.
             rotation: of the base, ``(*batch, 3, 3)``.
-            corners: the points at ``positions``, ``(*batch, 4 B, 3)``, m, in B_t.
-            places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m, in B_t.
+            places: of the points at ``positions``, ``(*batch, 2 J + 4 B, 3)``, m, in B_t.
             period: s, over which damping is implicit (taken at its middle).
         """
-        where = rotation, corners, places
-        parts = self.mass_matrix_and_force(qpos, qvel, joint_torque, *where, period)
+        given = qpos, qvel, joint_torque, rotation, places, period
+        parts = self.mass_matrix_and_force(*given)
         acceleration = spd_solve(*parts).movedim(0, -1).reshape(qvel.shape)
         if not self.num_base_dofs:
             return acceleration
@@ -121,7 +120,6 @@ class RigidBodyDynamics(nn.Module):
         qvel: Tensor,
         joint_torque: Tensor | None,
         rotation: Tensor,
-        corners: Tensor,
         places: Tensor,
         period: float | Tensor = 0.0,
     ) -> tuple[Tensor, Tensor]:
@@ -131,7 +129,9 @@ class RigidBodyDynamics(nn.Module):
         frame that moves with the base.
         """  # noqa: D417
         rate, position = rows_last(qvel, 1), rows_last(qpos, 1)
-        spin, slide = self._axes(rows_last(places, 2))
+        count = 2 * len(self.is_slide)
+        axes, corners = places.split((count, places.shape[-2] - count), -2)
+        spin, slide = self._axes(rows_last(axes, 2))
         four = rows_last(corners, 2).unflatten(1, (-1, len(CORNERS)))
         second = (four[:, None] * four).sum(3) * (self.mass / len(CORNERS))
         bodies = _Inertia(self.mass, four.mean(2) * self.mass, second)

@@ -12,14 +12,9 @@ def between_segments(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The shortest way from each segment to another one, and where it begins and ends.
 
-    Of parallel segments it is one of the shortest. Source: Ericson, "Real-Time Collision
-    Detection" (2005), section 5.1.9.
-
-    Args:
-        start: of the segment, ``(*batch, 3)``, m; a point is a segment of no length.
-        end: as ``start``.
-        other_start: of the other segment.
-        other_end: as ``other_start``.
+    All ends are ``(*batch, 3)``, m; a point is a segment of no length. Of parallel segments
+    it is one of the shortest. Source: Ericson, "Real-Time Collision Detection" (2005),
+    section 5.1.9.
 
     Returns:
         ``(*batch, 3)``, m, and the shares ``(*batch, 1)`` of either segment, in [0, 1].
@@ -30,9 +25,8 @@ def between_segments(
     b, c, f = _dot(along, other), _dot(along, offset), _dot(other, offset)
     determinant = a * e - b * b
     is_parallel = determinant <= PARALLEL * a * e
-    first = ((b * f - c * e) / torch.where(is_parallel, 1.0, determinant)).clamp(
-        0.0, 1.0
-    )
+    first = (b * f - c * e) / torch.where(is_parallel, 1.0, determinant)
+    first = first.clamp(0.0, 1.0)
     second = ((b * first.masked_fill(is_parallel, 0.0) + f) / e).clamp(0.0, 1.0)
     first = ((b * second - c) / a).clamp(0.0, 1.0)
     way = torch.lerp(other_start, other_end, second) - torch.lerp(start, end, first)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.geometry.constants import take
-from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE, body_joints
 from torchrl_nerd.geometry.rotations import quat_matrix
 
 if TYPE_CHECKING:  # importing it takes a second: only who builds a chain waits for it
@@ -32,16 +32,10 @@ class EndEffector(NamedTuple):
 
 
 class SiteKinematics:
-    """Forward kinematics and Jacobian of a site on a robot whose base is fixed.
+    """Forward kinematics and Jacobian of a named site on a robot whose base is fixed.
 
-    | attribute | meaning |
-    |---|---|
-    | ``qpos_addresses``, ``dof_addresses`` | of the chain's n joints, from the base on |
-    | ``limits`` | lower and upper joint positions ``(n, 2)``; infinite where unlimited |
-
-    Args:
-        model: compiled model.
-        site: name of the site.
+    ``qpos_addresses`` and ``dof_addresses`` are those of the chain's n joints, from the
+    base on; ``limits (n, 2)`` their lowest and highest positions, infinite where unlimited.
 
     Raises:
         ValueError: no such site, or a joint on the way to it that is no hinge or slide.
@@ -62,10 +56,8 @@ class SiteKinematics:
         joints = qpos.reshape(batch.numel(), qpos.shape[-1])
         joints = take(joints, self.qpos_addresses)
         jacobian, pose = chain.jacobian_tensor(joints.double(), ret_eef_pose=True)
-        parts = pose[:, :3, 3], pose[:, :3, :3], jacobian
-        return EndEffector(
-            *(x.to(qpos.dtype).reshape(*batch, *x.shape[1:]) for x in parts)
-        )
+        parts = (x.to(qpos.dtype) for x in (pose[:, :3, 3], pose[:, :3, :3], jacobian))
+        return EndEffector(*(x.reshape(*batch, *x.shape[1:]) for x in parts))
 
     def chain(self, device: torch.device) -> "SerialChain":
         """The chain on a device: float64, the joints in the order of the attributes."""
@@ -86,11 +78,8 @@ def bias_acceleration(jacobian: Tensor, rates: Tensor) -> Tensor:
         angular = sum_j omega_j x (J_w,j q_j')
         linear = sum_j (omega_j x (J_v,j q_j') + v_j x (J_w,j q_j')) + omega_n x v_n
 
-    Args:
-        jacobian: ``(*batch, 6, n)``, as `EndEffector` has it.
-        rates: of the joints, from the base on, ``(*batch, n)``.
-
-    Source: Featherstone, Rigid Body Dynamics Algorithms, section 2.11.
+    ``jacobian (*batch, 6, n)`` is that of `EndEffector`, ``rates (*batch, n)`` those of the
+    joints. Source: Featherstone, Rigid Body Dynamics Algorithms, section 2.11.
     """
     twists = (jacobian * rates[..., None, :]).mT  # (*batch, n, 6)
     moved, turned = twists.split(3, -1)
@@ -137,19 +126,11 @@ def add_body(
 ) -> tuple["Frame", np.ndarray]:
     """Add a frame for each hinge and slide of a body, at the joint's anchor.
 
-    Args:
-        model: compiled model.
-        body: its id; its parent's joints are in ``last`` and above.
-        last: frame that the body's parent moves with.
-        offset: the parent in ``last``, ``(4, 4)``.
-
-    Returns:
-        The frame that the body moves with, and the body in it. MuJoCo's ``ref`` is in
-        these offsets.
+    Its parent stands at ``offset (4, 4)`` in the frame ``last``. Returns the frame that the
+    body moves with, and the body in it. MuJoCo's ``ref`` is in these offsets.
     """
     offset = offset @ _matrix(model.body_pos[body], model.body_quat[body])
-    start = int(model.body_jntadr[body])
-    for joint in range(start, start + int(model.body_jntnum[body])):
+    for joint in body_joints(model, body):
         axis, anchor = model.jnt_axis[joint], model.jnt_pos[joint]
         is_hinge, quat = model.jnt_type[joint] == HINGE, np.array([1.0, 0.0, 0.0, 0.0])
         ref = model.qpos0[model.jnt_qposadr[joint]]
@@ -192,8 +173,7 @@ def _bodies_to(model: mujoco.MjModel, site: str) -> list[int]:
 
 def _joints_to(model: mujoco.MjModel, site: str) -> list[int]:
     """Joints from the base to the site."""
-    starts = ((int(model.body_jntadr[b]), b) for b in _bodies_to(model, site))
-    joints = [j for at, b in starts for j in range(at, at + int(model.body_jntnum[b]))]
+    joints = [j for b in _bodies_to(model, site) for j in body_joints(model, b)]
     others = [j for j in joints if model.jnt_type[j] not in (HINGE, SLIDE)]
     if others or not joints:
         found = f"joint '{model.joint(others[0]).name}'" if others else "no joint"

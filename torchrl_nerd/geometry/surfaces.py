@@ -153,8 +153,7 @@ def _closest(vertices: Vector, dx: float, dy: float) -> Tensor:
 
 
 def _cut(vertices: Vector, rows: slice, columns: slice) -> Vector:
-    x, y, z = (part[..., rows, columns] for part in vertices)
-    return x, y, z
+    return tuple(part[..., rows, columns] for part in vertices)  # pyright: ignore
 
 
 def _shortest(vectors: Vector) -> Tensor:
@@ -189,8 +188,8 @@ def _on_face(
     low, high = (v, u) if below else (u, v)
     is_on = (low >= 0.0) & (low <= high) & (high <= 1.0)
     far = torch.full_like(z, torch.inf)
-    x, y, z = (torch.where(is_on, part, far) for part in (foot_x, foot_y, -share))
-    return x, y, z
+    foot = foot_x, foot_y, -share
+    return tuple(torch.where(is_on, part, far) for part in foot)  # pyright: ignore
 
 
 def _length_and_direction(vector: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:

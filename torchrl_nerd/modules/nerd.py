@@ -102,10 +102,8 @@ class NeRD(nn.Module):
         self.scene_features = scene_features or SceneFeatures(scene, features)
         self.state_delta = state_delta or StateDelta(scene)
         num_features, num_outputs = self.scene_features.size, self.state_delta.size
-        sizes: dict[NestedKey, int] = {TOKEN: num_features, TARGET: num_outputs}
-        self.normalize = Normalize(
-            stats or {key: Stats.unit(size) for key, size in sizes.items()}
-        )
+        unit = {TOKEN: Stats.unit(num_features), TARGET: Stats.unit(num_outputs)}
+        self.normalize = Normalize(stats or unit)
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
         self.network = network.build(self.token_size, num_outputs)

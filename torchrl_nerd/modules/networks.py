@@ -89,8 +89,8 @@ class HiddenState:
     value: Tensor  # (layers, rows, width)
 
     def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
-        self.value = stored(self.value, torch.where(rows[:, None], 0.0, self.value))
+        """See `History.clear`."""
+        self._put(rows, 0.0)
 
     def __copy__(self) -> "HiddenState":
         """Apart from the original, which is written to in place."""
@@ -98,7 +98,10 @@ class HiddenState:
 
     def restore(self, past: "HiddenState", rows: Tensor) -> None:
         """See `History.restore`."""
-        value = torch.where(rows[:, None], past.value, self.value)
+        self._put(rows, past.value)
+
+    def _put(self, rows: Tensor, value: Tensor | float) -> None:
+        value = torch.where(rows[:, None], value, self.value)
         self.value = stored(self.value, value)
 
 

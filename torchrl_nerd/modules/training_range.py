@@ -7,9 +7,11 @@ limited joints stop where the data end. Nothing inside the range is changed; wha
 outside stays finite and bounded.
 """
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.scenes.scene import Scene
@@ -39,16 +41,15 @@ class TrainingRange(nn.Module):
     def __init__(self, scene: Scene, num_features: int, num_outputs: int) -> None:
         super().__init__()
         model, self.vectors = scene.model, vector_dofs(scene)
-        self.limited = tuple(  # addresses in qpos and qvel of hinges and slides
-            (int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
-            for joint in range(model.njnt)
-            if model.jnt_limited[joint] and model.jnt_type[joint] in (HINGE, SLIDE)
-        )
-        self.joint_of = [0] * scene.model.nv  # qpos of each dof's joint, if limited
-        is_limited = torch.zeros(scene.model.nv, dtype=torch.float64)
+        is_scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
+        joints = np.flatnonzero(is_scalar & (model.jnt_limited != 0))
+        dofs = model.jnt_dofadr[joints].tolist()
+        # addresses in qpos and qvel of limited hinges and slides
+        self.limited = tuple(zip(model.jnt_qposadr[joints].tolist(), dofs, strict=True))
+        self.joint_of = [0] * model.nv  # qpos of each dof's joint, if limited
         for q, v in self.limited:
-            self.joint_of[v], is_limited[v] = q, 1.0
-        self.register_buffer("is_limited", is_limited, persistent=False)
+            self.joint_of[v] = q
+        keep_constants(self, is_limited=np.isin(range(model.nv), dofs))
         one = torch.ones((), dtype=torch.float64)
         sizes = {"feature": num_features, "target": num_outputs, "qpos": scene.model.nq}
         for name, size in sizes.items():
@@ -158,9 +159,8 @@ class OODScore(nn.Module):
 
     def mahalanobis(self, features: Tensor) -> Tensor:
         """Distance ``(*batch,)`` from the mean in units of the data's spread."""
-        return torch.linalg.vector_norm(
-            (features - self.center) @ self.whitening.T, dim=-1
-        )
+        white = (features - self.center) @ self.whitening.T
+        return torch.linalg.vector_norm(white, dim=-1)
 
     def forward(self, features: Tensor, excess: Tensor) -> Tensor:
         """Score ``(*batch,)``: up to 1 for 99% of training, above 1 outside the range.
@@ -184,8 +184,7 @@ class Sleep(nn.Module):
     | ``sleep_gain`` | ``(nv,)``: speed that the model adds to a resting robot in a step;
       one that gains more begins to move, as on a slope that friction does not hold |
 
-    Args:
-        scene: the robot; without a ground it never sleeps.
+    A robot without a ground never sleeps.
     """
 
     sleep_speed: Tensor

@@ -196,9 +196,8 @@ class FullLinear(nn.Linear):
 
 def make_head(width: int, num_outputs: int) -> nn.Sequential:
     """From a block's width to predictions; SiLU for the paper's ReLU: half the error."""
-    return nn.Sequential(
-        FullLinear(width, HEAD_WIDTH), nn.SiLU(), FullLinear(HEAD_WIDTH, num_outputs)
-    )
+    first, last = FullLinear(width, HEAD_WIDTH), FullLinear(HEAD_WIDTH, num_outputs)
+    return nn.Sequential(first, nn.SiLU(), last)
 
 
 def initialize(blocks: nn.ModuleList) -> None:

@@ -71,11 +71,7 @@ def load_scene(name: str | Path) -> Scene:
         return scene
     if is_import(name):
         return import_scene(name)
-    raise ValueError(
-        f"unknown scene {name!r}{_meant(name, SCENES)}, expected one of "
-        f"{', '.join(SCENES)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
-        f"{_not_loaded()}"
-    )
+    raise _unknown("scene", name, SCENES)
 
 
 def make_task(name: str | Path) -> Task:
@@ -99,24 +95,20 @@ def make_task(name: str | Path) -> Task:
             return SuiteTask(name)
         runs = name.removeprefix("gymnasium/") in LOCOMOTION
         return LocomotionTask(name) if runs else SceneTask(import_scene(name))
-    raise ValueError(
-        f"unknown task {name!r}{_meant(name, TASKS)}, expected one of "
-        f"{', '.join(TASKS)}, dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
-        f"{_not_loaded()}"
-    )
+    raise _unknown("task", name, TASKS)
 
 
-def _not_loaded() -> str:
-    """What of ``NERD_ROBOTS`` failed, or nothing."""
-    return "".join(f"; {sentence}" for sentence in NOT_LOADED)
-
-
-def _meant(name: object, known: Collection[str]) -> str:
-    """`` (did you mean 'ant/run'?)`` for the scene of a task, or the like; or nothing."""
+def _unknown(what: str, name: object, known: Collection[str]) -> ValueError:
+    """No such scene or task; which one was meant, and what of ``NERD_ROBOTS`` failed."""
     given = str(name)
     of_scene = [other for other in known if other.startswith(f"{given}/")]
     of_task = [other for other in known if given.startswith(f"{other}/")]
-    return did_you_mean(given, known, (*of_scene, *of_task))
+    meant = did_you_mean(given, known, (*of_scene, *of_task))
+    return ValueError(
+        f"unknown {what} {name!r}{meant}, expected one of {', '.join(known)}, "
+        "dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
+        + "".join(f"; {sentence}" for sentence in NOT_LOADED)
+    )
 
 
 def task_id(task: Task) -> str:

@@ -57,12 +57,10 @@ def register(robot: Robot) -> None:
     _check_types(robot)
     _check_names(robot)
     for field, table in TABLES.items():
-        given: Mapping[str, Any] = getattr(robot, field)
-        for name in given:
-            if name in table:
-                raise ValueError(
-                    f"'{name}' is among the {field} of another robot: expected a new name"
-                )
+        if taken := [name for name in getattr(robot, field) if name in table]:
+            raise ValueError(
+                f"'{taken[0]}' is among the {field} of another robot: expected a new name"
+            )
     for field, table in TABLES.items():
         table.update(getattr(robot, field))
     for listener in _LISTENERS:
@@ -123,23 +121,22 @@ def _check_names(robot: Robot) -> None:
             f"({', '.join(RESERVED)}), got {found}"
         )
 
-    def is_of(name: str, mark: str) -> bool:  # a scene's name may hold a dash
-        return any(name.startswith(scene + mark) for scene in scenes)
-
-    of_scenes = {
-        "tasks": ("SCENE/TASK", lambda name: is_of(name, "/")),
+    # a scene's name may hold a dash
+    starts = {mark: tuple(scene + mark for scene in scenes) for mark in "/-"}
+    of_scenes: dict[str, tuple[str, Callable[[str], bool]]] = {
+        "tasks": ("SCENE/TASK", lambda name: name.startswith(starts["/"])),
         "presets": ("SCENE", lambda name: name in scenes),
         "models": (
             "SCENE or SCENE-KIND",
-            lambda name: name in scenes or is_of(name, "-"),
+            lambda name: name in scenes or name.startswith(starts["-"]),
         ),
     }
     for field, (form, fits) in of_scenes.items():
         for name in getattr(robot, field):
             if not fits(name) or name.endswith("/"):
+                known = ", ".join(scenes)
                 raise ValueError(
-                    f"expected {form} of its scenes ({', '.join(scenes)}) as {field}, got "
-                    f"'{name}'"
+                    f"expected {form} of its scenes ({known}) as {field}, got '{name}'"
                 )
     for field in ("ppo", "policies"):
         for name in getattr(robot, field):

@@ -105,9 +105,9 @@ def gymnasium_file(env_id: str) -> tuple[Path, int]:
     settings, source = _constructor_defaults(str(spec.entry_point))
     settings |= spec.kwargs
     if not {"xml_file", "frame_skip"} <= settings.keys():
+        wanted = "an environment of Gymnasium with an xml_file and a frame_skip"
         raise ValueError(
-            f"expected an environment of Gymnasium with an xml_file and a frame_skip, "
-            f"as those of version 5 have, got '{env_id}'"
+            f"expected {wanted}, as those of version 5 have, got '{env_id}'"
         )
     file = os.path.expanduser(settings["xml_file"])
     return source.parent / "assets" / file, int(settings["frame_skip"])
@@ -121,14 +121,13 @@ def _constructor_defaults(entry_point: str) -> tuple[dict[str, Any], Path]:
     folders = found.submodule_search_locations if found else None
     source = Path(folders[0], *rest).with_suffix(".py") if folders else Path()
     tree = ast.parse(source.read_text(encoding="utf-8") if source.is_file() else "")
-    defaults = {}
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.ClassDef) or node.name != name:
-            continue
-        for part in node.body:
-            if isinstance(part, ast.FunctionDef) and part.name == "__init__":
-                names, values = part.args.args, part.args.defaults
-                pairs = zip(names[len(names) - len(values) :], values, strict=True)
-                plain = ((n.arg, v) for n, v in pairs if isinstance(v, ast.Constant))
-                defaults = {n: v.value for n, v in plain}
-    return defaults, source
+    kinds = (
+        x for x in ast.walk(tree) if isinstance(x, ast.ClassDef) and x.name == name
+    )
+    for part in (part for kind in kinds for part in kind.body):
+        if isinstance(part, ast.FunctionDef) and part.name == "__init__":
+            names, values = part.args.args, part.args.defaults
+            pairs = zip(names[len(names) - len(values) :], values, strict=True)
+            plain = ((n.arg, v) for n, v in pairs if isinstance(v, ast.Constant))
+            return {n: v.value for n, v in plain}, source
+    return {}, source

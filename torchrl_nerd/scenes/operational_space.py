@@ -93,9 +93,8 @@ class OperationalSpaceController:
                 f"none on '{name}'"
             )
         self.rigid_body = RigidBodyDynamics(model, base, axes, self.actuated)
-        bodies = axes.bodies + self.rigid_body.bodies
-        positions = np.concatenate((axes.positions, self.rigid_body.positions))
-        self.kinematics = PointKinematics(model, base, bodies, positions)
+        points = self.rigid_body.bodies, self.rigid_body.positions
+        self.kinematics = PointKinematics(model, base, *points)
         self.base_pose = BasePose(model, base)
 
     def _check(self, model: mujoco.MjModel) -> None:
@@ -105,11 +104,9 @@ class OperationalSpaceController:
             raise ValueError(
                 f"expected relative_to current or absolute, got {self.relative_to!r}"
             )
-        is_absolute, has_center = (
-            self.relative_to == "absolute",
-            self.center is not None,
-        )
-        if is_absolute != has_center or (has_center and self.num_actions > 3):
+        has_center = self.center is not None
+        fits = has_center == (self.relative_to == "absolute")
+        if not fits or (has_center and self.num_actions > 3):
             raise ValueError(
                 "expected center with three absolute actions and nowhere else, got "
                 f"{self.num_actions} actions and center {self.center}"
@@ -183,18 +180,15 @@ class OperationalSpaceController:
 
     def _equation_of_motion(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """Mass matrix ``(*batch, nv, nv)`` and forces to overcome ``(*batch, nv)``."""
-        batch, count = qpos.shape[:-1], len(self.rigid_body.bodies)
         for module in (self.kinematics, self.base_pose, self.rigid_body):
             module.to(qpos.device)
         still = qvel.new_zeros(0, qvel.shape[-1])  # no rows: positions alone
-        points, _ = self.kinematics(qpos, still)
-        places, corners = points.split((points.shape[-2] - count, count), -2)
-        _, rotation = self.base_pose(qpos)
-        where = rotation, corners, places
-        matrix, force = self.rigid_body.mass_matrix_and_force(qpos, qvel, None, *where)
-        nv = len(force)
-        matrix = matrix.movedim(-1, 0).reshape(*batch, nv, nv)
-        return matrix, -force.movedim(-1, 0).reshape(*batch, nv)
+        places, _ = self.kinematics(qpos, still)
+        given = qpos, qvel, None, self.base_pose(qpos)[1], places
+        matrix, force = self.rigid_body.mass_matrix_and_force(*given)
+        shape = *qpos.shape[:-1], *force.shape[:1]
+        matrix = matrix.movedim(-1, 0).reshape(*shape, len(force))
+        return matrix, -force.movedim(-1, 0).reshape(shape)
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

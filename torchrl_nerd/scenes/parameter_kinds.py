@@ -89,10 +89,8 @@ def _payload(fields: Fields, bodies: list[int], given: np.ndarray) -> None:
     for body in bodies:
         for row, (load, *place) in enumerate(given):
             mass = fields["body_mass"][row]
-            centre, quat, inertia = (
-                fields[name][row, body]
-                for name in ("body_ipos", "body_iquat", "body_inertia")
-            )
+            names = "body_ipos", "body_iquat", "body_inertia"
+            centre, quat, inertia = (fields[name][row, body] for name in names)
             arm = np.where(np.isnan(place), 0.0, place - centre)
             total = mass[body] + load
             if load and arm.any():
@@ -114,10 +112,9 @@ MOTOR = _times("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 STEEPEST = 1.5  # rad: gravity turns by less than a right angle
 KINDS = {
     "mass": Kind("body", "factor", _times("body_mass", "body_inertia")),
-    **{
-        f"com_{x}": Kind("body", "m", _plus("body_ipos", i))
-        for i, x in enumerate("xyz")
-    },
+    "com_x": Kind("body", "m", _plus("body_ipos", 0)),
+    "com_y": Kind("body", "m", _plus("body_ipos", 1)),
+    "com_z": Kind("body", "m", _plus("body_ipos", 2)),
     "payload": Kind("body", "kg", _payload, 0.0),
     **{f"payload_{axis}": Kind("body", "m") for axis in "xyz"},
     "damping": Kind("joint", "N s/m or N m s/rad", _to("dof_damping"), 0.0),

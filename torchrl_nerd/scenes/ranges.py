@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE, body_joints
 from torchrl_nerd.scenes.contact_points import contact_points, terrain_geoms
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling, uniform
@@ -194,8 +194,7 @@ def _reaches(model: mujoco.MjModel) -> list[float]:
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
         while body:  # every joint between the shape and the world
-            start = int(model.body_jntadr[body])
-            for joint in range(start, start + int(model.body_jntnum[body])):
+            for joint in body_joints(model, body):
                 offset = data.geom_xpos[geom] - data.xanchor[joint]
                 reach = float(np.linalg.norm(offset) + model.geom_rbound[geom])
                 reaches[joint] = max(reaches[joint], reach)

@@ -1,6 +1,6 @@
 """Where training trajectories start and what drives them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from math import log
 from typing import Any
@@ -45,10 +45,8 @@ class BaseSampling:
     def draw(self, rows: int, generator: Generator) -> tuple[Tensor, Tensor]:
         """``qpos (rows, 7)`` and ``qvel (rows, 6)`` of the free joint, float64."""
         position = uniform(self.low, self.high, rows, generator)
-        axis, angle = (
-            torch.rand(rows, size, dtype=torch.float64, generator=generator)
-            for size in (3, 1)
-        )
+        axis = torch.rand(rows, 3, dtype=torch.float64, generator=generator)
+        angle = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
         upright = torch.tensor(self.quat, dtype=torch.float64).expand(rows, 4)
         tilt = random_tilt(torch.cat((axis, angle), -1), self.tilt)
         quat = quat_multiply(upright, tilt)
@@ -113,14 +111,11 @@ class Sampling:
             if not 0.0 <= (value := getattr(self, name)) <= 1.0:
                 raise ValueError(f"expected {name} from 0 to 1, got {value}")
         if least is not None and not 0.0 < least <= 1.0:
-            raise ValueError(
-                f"expected a min_torque_scale above 0 and up to 1, got {least}"
-            )
+            wanted = "a min_torque_scale above 0 and up to 1"
+            raise ValueError(f"expected {wanted}, got {least}")
         if times is not None and not 0.0 < times[0] <= times[1]:
-            raise ValueError(
-                "expected two correlation times above 0 s, the lower first, got "
-                f"{times}"
-            )
+            wanted = "two correlation times above 0 s, the lower first"
+            raise ValueError(f"expected {wanted}, got {times}")
         if times is not None and self.drive is not None:
             raise ValueError(
                 "expected a correlation time or a drive, got both: a drive's torques "
@@ -160,28 +155,9 @@ def draw_initial(
     Raises:
         ValueError: no state within the ranges is clear of the ground.
     """
-    if sampling.starts is not None:
-        state = dict(sampling.starts(rows, generator))
-        torque_scale, _ = sample_scale(sampling, rows, generator)
-    else:
-        how = sampling, layout, rows, generator
-        qpos, qvel = _draw_clear(*how, clearances, depths)
-        torque_scale, speed_scale = sample_scale(sampling, rows, generator)
-        state = {"qpos": qpos, "qvel": speed_scale * qvel}
-    if sampling.ground is not None and "terrain" not in state:
-        state["terrain"] = sampling.ground(state["qpos"], generator)
-    return state, torque_scale
 
-
-def _draw_clear(
-    sampling: Sampling,
-    layout: JointLayout,
-    rows: int,
-    generator: Generator,
-    clearances: Callable[[Tensor], Tensor],
-    depths: Callable[[Tensor], Tensor],
-) -> tuple[Tensor, Tensor]:
-    """Positions and velocities within the ranges, clear of the ground and of the robot."""
+    def draw(rows: int) -> tuple[Tensor, Tensor]:
+        return _draw(sampling, layout, rows, generator)
 
     def excess(qpos: Tensor) -> tuple[Tensor, Tensor]:
         """By how much states are too near to the ground, and too deep, m, ``(n,)``."""
@@ -192,13 +168,31 @@ def _draw_clear(
             deep = (depths(qpos) - sampling.penetration).clamp_min(0.0)
         return low, deep
 
-    qpos, qvel = _draw(sampling, layout, rows, generator)
+    if sampling.starts is not None:
+        state = dict(sampling.starts(rows, generator))
+        torque_scale, _ = sample_scale(sampling, rows, generator)
+    else:
+        qpos, qvel = _draw_clear(rows, draw, excess)
+        torque_scale, speed_scale = sample_scale(sampling, rows, generator)
+        state = {"qpos": qpos, "qvel": speed_scale * qvel}
+    if sampling.ground is not None and "terrain" not in state:
+        state["terrain"] = sampling.ground(state["qpos"], generator)
+    return state, torque_scale
+
+
+def _draw_clear(
+    rows: int,
+    draw: Callable[[int], tuple[Tensor, Tensor]],
+    excess: Callable[[Tensor], tuple[Tensor, Tensor]],
+) -> tuple[Tensor, Tensor]:
+    """Positions and velocities, drawn again where they have an excess."""
+    qpos, qvel = draw(rows)
     low, deep = excess(qpos)
     for _ in range(MAX_REDRAWS):
         again = (low + deep > 0.0).nonzero()[:, 0]
         if not len(again):
             return qpos, qvel
-        new_qpos, new_qvel = _draw(sampling, layout, len(again), generator)
+        new_qpos, new_qvel = draw(len(again))
         new_low, new_deep = excess(new_qpos)
         better = new_low + new_deep < (low + deep)[again]
         chosen = again[better]
@@ -226,7 +220,9 @@ def _draw(
     return qpos, qvel
 
 
-def uniform(low: Row, high: Row, rows: int, generator: Generator) -> Tensor:
+def uniform(
+    low: Sequence[float], high: Sequence[float], rows: int, generator: Generator
+) -> Tensor:
     """Independent uniform numbers ``(rows, len(low))``, float64."""
     a, b = torch.tensor([low, high], dtype=torch.float64)
     u = torch.rand(rows, len(low), dtype=torch.float64, generator=generator)
@@ -247,8 +243,7 @@ def sample_commands(
     Their distance from the middle is times each row's scale ``(rows, 1)``.
     """
     rows, (middle, half) = len(scale), sampling.commands
-    high = tuple(half.tolist())
-    low = tuple(-x for x in high)
+    low, high = (-half).tolist(), half.tolist()
     draw = uniform(low, high, steps * rows, generator)
     return middle + scale[:, None] * draw.unflatten(0, (steps, rows)).transpose(0, 1)
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from torchrl_nerd.geometry.base import Base, BasePose, fixed_base_pose, keep_constants
+from torchrl_nerd.geometry.base import Base, BasePose, keep_constants, root_pose
 from torchrl_nerd.geometry.constants import placed
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import JointLayout
@@ -177,7 +177,7 @@ class Scene:
     @cached_property
     def fixed_base_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base."""
-        return fixed_base_pose(self.model, self.base)
+        return root_pose(self.model, self.base.body)
 
     @cached_property
     def gravity_direction(self) -> tuple[float, float, float]:

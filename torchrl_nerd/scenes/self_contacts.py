@@ -68,10 +68,8 @@ def capsule_pairs(model: mujoco.MjModel) -> CapsulePairs:
     poses = np.random.default_rng(0).uniform(low, high, (POSES, model.nq))
     shares = np.zeros(len(pairs))
     for some in np.split(poses, POSES // TOGETHER):
-        ends = torch.from_numpy(
-            np.stack([pairs.placed(data, qpos) for qpos in some], 2)
-        )
-        way, *_ = between_segments(*ends.flatten(0, 1))  # (TOGETHER, P, 3)
+        ends = np.stack([pairs.placed(data, qpos) for qpos in some], 2)
+        way, *_ = between_segments(*torch.from_numpy(ends).flatten(0, 1))
         gaps = np.linalg.norm(way, axis=-1) - pairs.radii
         shares += (gaps < NEAR * pairs.margins).sum(0) / POSES
     order = np.argsort(-shares, kind="stable")[:MAX_PAIRS]

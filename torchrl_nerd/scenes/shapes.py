@@ -78,16 +78,9 @@ def thin(
     """Which balls to keep so that each group's hull stays nearly the same.
 
     Again and again the ball that reaches farthest beyond its group's hull is added, until
-    none reaches farther than the tolerance or there are as many as allowed; one for every
-    group at least.
-
-    Args:
-        points: centres ``(n, 3)``, m.
-        radii: ``(n,)``, m.
-        groups: ``(n,)``, which body each is on.
-        kept: ``(n,)`` bool, those to keep in any case.
-        tolerance: m.
-        most: number of balls in all.
+    none reaches farther than the tolerance (m) or there are ``most``; one for every group
+    at least. Of the balls at ``points (n, 3)``, ``groups (n,)`` says which body each is on,
+    and ``kept (n,)`` which to keep in any case.
 
     Returns:
         Which are kept, ``(n,)`` bool, and an upper bound on how far a dropped one reaches
@@ -121,9 +114,8 @@ def _beyond(
     lies in the hull, and so |p0 - sum w p| + r0 - sum w r is such a bound.
     """
     size = np.abs(points - point).max() + 1e-12
-    rows = np.vstack(
-        ((points - point).T / size, radii / size, np.full(len(points), SUM))
-    )
+    away = (points - point).T / size
+    rows = np.vstack((away, radii / size, np.full(len(points), SUM)))
     aim = np.array([0.0, 0.0, 0.0, radius / size, SUM])
     shares, _ = nnls(rows, aim, maxiter=100 * len(points))
     shares /= shares.sum()

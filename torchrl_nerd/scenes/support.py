@@ -17,11 +17,7 @@ import numpy as np
 
 from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.locks import fork_safe_lock
-from torchrl_nerd.scenes.contact_points import (
-    body_label,
-    ground_geoms,
-    terrain_geoms,
-)
+from torchrl_nerd.scenes.contact_points import body_label, ground_geoms, terrain_geoms
 from torchrl_nerd.scenes.shapes import geom_kind
 
 DISABLE = mujoco.mjtDisableBit
@@ -109,10 +105,8 @@ def _parts(model: mujoco.MjModel, is_floating: bool) -> Iterator[Refusal]:
     unknown = np.zeros(model.ngeom, bool)
     unknown[ground_geoms(model)] = is_floating
     unknown[terrain_geoms(model)] = False
-    what = (
-        "ground of another shape than plane, box and height field, for a floating base"
-    )
-    yield what, unknown, model.geom
+    what = "ground of another shape than plane, box and height field"
+    yield f"{what}, for a floating base", unknown, model.geom
 
 
 def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:

@@ -96,13 +96,11 @@ def base_effects(
         return ()
     free = _without(model, LIMIT | CONTACT, has_servos)
     rng, q = np.random.default_rng(0), base.qpos_address
-    moves = {
-        f"base {axis}": (q + i, _shift(QPOS, q + i)) for i, axis in enumerate("xyz")
-    }
-    moves["base heading"] = (q + 3, _heading(base, unit_gravity(model)))
+    moves = [(f"base {x}", q + i, _shift(QPOS, q + i)) for i, x in enumerate("xyz")]
+    moves.append(("base heading", q + 3, _heading(base, unit_gravity(model))))
     return tuple(
         Effect(name, QPOS, at, _largest_change(free, substeps, rng, move, base))
-        for name, (at, move) in moves.items()
+        for name, at, move in moves
     )
 
 
@@ -167,9 +165,8 @@ def _largest_change(
         move(moved, rng)
         size = abs(data.qvel).max()
         with silence_mujoco():
-            change, moved_change = (
-                _change(model, d, substeps, base) for d in (data, moved)
-            )
+            change = _change(model, data, substeps, base)
+            moved_change = _change(model, moved, substeps, base)
         if data.warning.number.any() or moved.warning.number.any():
             continue  # MuJoCo reset the state: nothing to compare
         num_valid += 1

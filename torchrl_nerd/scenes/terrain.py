@@ -28,10 +28,7 @@ from torchrl_nerd.geometry.surfaces import (
     plane_distance,
     plane_in_frame,
 )
-from torchrl_nerd.scenes.contact_points import (
-    HEIGHT_FIELD,
-    PLANE,
-)
+from torchrl_nerd.scenes.contact_points import HEIGHT_FIELD, PLANE
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,21 +203,22 @@ class TerrainDistance(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Distance and normal to one surface; takes the row's ``planes`` in their order."""
         surface = self.terrain.surfaces[index]
+
+        def own(name: str) -> Tensor:
+            return self.get_buffer(f"{name}_{index}")
+
         if surface.kind == PLANE:
-            plane = (
-                planes.pop(0) if surface.mocap >= 0 else getattr(self, f"plane_{index}")
-            )
+            plane = planes.pop(0) if surface.mocap >= 0 else own("plane")
             plane = plane.expand(*points.shape[:-2], -1)
             return plane_distance(points, plane_in_frame(plane, position, rotation))
-        axes = getattr(self, f"rotation_{index}")
-        origin = getattr(self, f"position_{index}")
-        local, turn = into_frame(points, position, rotation, origin, axes)
+        frame = position, rotation, own("position"), own("rotation")
+        local, turn = into_frame(points, *frame)
         if surface.kind == HEIGHT_FIELD:
             half_x, half_y = (float(half) for half in surface.size[:2])
-            field = getattr(self, f"heights_{index}"), half_x, half_y, self.reach
+            field = own("heights"), half_x, half_y, self.reach
             distance, normal = height_field_distance(local, *field)
         else:
-            distance, normal = box_distance(local, getattr(self, f"size_{index}"))
+            distance, normal = box_distance(local, own("size"))
         return distance, normal @ turn
 
 

@@ -128,9 +128,8 @@ class Variation:
 
     def draw(self, rows: int, generator: Generator) -> Tensor:
         """Random parameters ``(rows, size)``, float64."""
-        shape = (rows, self.size)
-        u = torch.rand(shape, dtype=torch.float64, generator=generator)
-        return self.values(u)
+        shape = rows, self.size
+        return self.values(torch.rand(shape, dtype=torch.float64, generator=generator))
 
     def check(self, parameters: Tensor) -> None:
         """Refuse values ``(*batch, size)`` that no robot can have.
@@ -190,10 +189,8 @@ class Variation:
 
     def delay(self, parameters: np.ndarray) -> np.ndarray:
         """Control steps by which every torque is late, whole numbers ``(rows,)``."""
-        late = np.zeros(len(parameters))
-        for i, _ in self._of_kind("delay"):
-            late += parameters[:, i]
-        return late.astype(int)
+        columns = [i for i, _ in self._of_kind("delay")]
+        return parameters[:, columns].sum(1).astype(int)
 
     def model_of(self, parameters: Tensor) -> mujoco.MjModel:
         """A model of its own for one row's parameters ``(size,)``."""

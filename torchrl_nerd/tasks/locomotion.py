@@ -18,9 +18,8 @@ from torchrl_nerd.geometry.constants import constant, placed
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes import Scene, import_scene
-from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.tasks.body_motion import BodyMotion
-from torchrl_nerd.tasks.task import State, Task
+from torchrl_nerd.tasks.task import State, Task, own_actuators
 
 HORIZON = 1000  # control steps
 RARE = 1e-12  # a uniform number nearer to 0 or 1 would be an infinite normal one
@@ -102,8 +101,7 @@ class LocomotionTask(Task):
         model = self.scene.model
         self.num_uniforms = model.nq + model.nv
         self.observation_size = model.nq + model.nv - self.numbers.hidden
-        is_floating = self.scene.base.is_floating
-        self._height_at = 2 if is_floating else 1
+        self._height_at = 2 if self.scene.base.is_floating else 1
         self._start = model.qpos0.tolist()
         self._centre = BodyMotion(self.scene) if self.numbers.by_centre else None
 
@@ -129,9 +127,8 @@ class LocomotionTask(Task):
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
         """See the class."""
-        numbers, controller = self.numbers, self.controller
-        assert isinstance(controller, ActuatorController)
-        ctrl = controller.ctrl(action.to(state[QPOS].dtype))
+        numbers, dtype = self.numbers, state[QPOS].dtype
+        ctrl = own_actuators(self).ctrl(action.to(dtype))
         moved = self._place(next_state) - self._place(state)
         earned = numbers.forward * moved / self.step_size
         earned = earned - numbers.ctrl_cost * ctrl.square().sum(-1)

@@ -14,10 +14,9 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes import Scene, import_scene
-from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.importer import load_suite
 from torchrl_nerd.tasks.suite_formulas import FORMULAS
-from torchrl_nerd.tasks.task import State, Task
+from torchrl_nerd.tasks.task import State, Task, own_actuators
 
 SEEDS = 2**32  # of NumPy's RandomState, which the suite draws from
 FORCES = mujoco.mjtStage.mjSTAGE_ACC  # sensors of this stage need the contact forces
@@ -122,9 +121,7 @@ class SuiteTask(Task):
 
     def _ctrl(self, action: Tensor) -> Tensor:
         """MuJoCo's controls at an action, ``(*batch, nu)``."""
-        controller = self.controller
-        assert isinstance(controller, ActuatorController)
-        return controller.ctrl(action)
+        return own_actuators(self).ctrl(action)
 
     def _judged(self, state: State) -> Tensor:
         """Reward, end and observation of each env; the control is zero after a reset."""
@@ -183,11 +180,8 @@ class SuiteReward:
     def start(self, u: np.ndarray) -> np.ndarray:
         """Start of an episode by the suite's own ``initialize_episode``.
 
-        Args:
-            u: ``(1,)`` in [0, 1); the suite's random state is seeded with it.
-
-        Returns:
-            qpos, qvel and the targets' positions, ``(nq + nv + 3 targets,)``.
+        Its random state is seeded with ``u (1,)`` in [0, 1). Returns qpos, qvel and the
+        targets' positions, ``(nq + nv + 3 targets,)``.
         """
         self._task.random.seed(int(u[0] * SEEDS))
         with self._physics.reset_context():
@@ -196,14 +190,10 @@ class SuiteReward:
         return np.concatenate((self._data.qpos, self._data.qvel, target))
 
     def __call__(self, row: np.ndarray) -> np.ndarray:
-        """Judge one state.
+        """Reward, whether the episode ends (0 or 1), and observation of one state.
 
-        Args:
-            row: qpos, qvel, the targets' positions, ctrl and the `forces` felt, NaN where
-                nobody knows them: MuJoCo then computes them at this state.
-
-        Returns:
-            Reward, whether the episode ends (0 or 1), observation.
+        ``row``: qpos, qvel, the targets' positions, ctrl and the `forces` felt, NaN where
+        nobody knows them: MuJoCo then computes them at this state.
         """
         model, data = self._model, self._data
         sizes = (model.nq, model.nv, 3 * len(self.targets), model.nu)

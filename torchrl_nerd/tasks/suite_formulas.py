@@ -152,17 +152,9 @@ class Humanoid(Formula):
         motion = self.motion(qpos, qvel)
         torso = motion.rotation[..., 0, :, :]
         ends = motion.position[..., 2:, :] - motion.position[..., :1, :]
-        return torch.cat(
-            (
-                qpos[..., 7:],
-                motion.position[..., 1, Z:],
-                (ends @ torso).flatten(-2),
-                torso[..., Z, :],
-                motion.com_velocity,
-                qvel,
-            ),
-            -1,
-        )
+        height, ends = motion.position[..., 1, Z:], (ends @ torso).flatten(-2)
+        parts = qpos[..., 7:], height, ends, torso[..., Z, :], motion.com_velocity, qvel
+        return torch.cat(parts, -1)
 
     def reward(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, extra: Tensor) -> Tensor:
         """Head high, torso upright, little force, and the task's speed in any direction."""
@@ -262,16 +254,6 @@ def _small(ctrl: Tensor) -> Tensor:
 
 
 FORMULAS: dict[str, type[Formula]] = {
-    kind.__name__.lower(): kind
-    for kind in (
-        Acrobot,
-        Cartpole,
-        Cheetah,
-        Hopper,
-        Humanoid,
-        Pendulum,
-        Reacher,
-        Walker,
-    )
+    kind.__name__.lower(): kind for kind in Formula.__subclasses__()
 }
 """Domain -> its tasks' formulas."""

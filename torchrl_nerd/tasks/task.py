@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_nerd.keys import QVEL
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.controllers import Controller
+from torchrl_nerd.scenes.controllers import ActuatorController, Controller
 from torchrl_nerd.scenes.variation import Ranges
 
 State = Mapping[str, Tensor]
@@ -73,13 +73,15 @@ class Task(ABC):
         """Where the episode failed or succeeded, bool ``(*batch,)``; by default never."""
         return torch.zeros_like(next_state[QVEL][..., 0], dtype=torch.bool)
 
-    def show(  # noqa: B027
-        self, model: MjModel, data: MjData, state: State
-    ) -> None:
+    def show(self, model: MjModel, data: MjData, state: State) -> None:  # noqa: B027
         """Put what the task draws at a reset into an image; by default nothing.
 
-        Args:
-            model: a copy that only images are drawn with.
-            data: of the model; its joint positions and its ground are set.
-            state: of one env: ``qpos (nq,)`` and the task's parameters.
+        ``model`` is a copy that only images are drawn with; joint positions and ground are
+        set in its ``data``. The ``state`` of one env: ``qpos (nq,)`` and parameters.
         """
+
+
+def own_actuators(task: Task) -> ActuatorController:
+    """The controller of a task that leaves the robot to MuJoCo's own actuators."""
+    assert isinstance(task.controller, ActuatorController)
+    return task.controller

@@ -84,11 +84,8 @@ class ContactFeatures(FeatureTransform):
                 in_keys.append(TERRAIN)
             if features.predicted_force:
                 sizes[CONTACT_FORCE] = scene.layout.nv
-            plane = terrain.fixed_plane
-            is_level = (
-                plane is not None
-                and abs(float(plane[:3] @ scene.gravity_direction)) > 1.0 - 1e-12
-            )
+            plane, down = terrain.fixed_plane, scene.gravity_direction
+            is_level = plane is not None and abs(float(plane[:3] @ down)) > 1.0 - 1e-12
             if plane is None or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count
         super().__init__(in_keys, sizes)
@@ -99,21 +96,19 @@ class ContactFeatures(FeatureTransform):
         points = scene.contacts
         # one pass of kinematics: contact points, then joint axes, then inertia's points
         bodies, positions = points.bodies, points.positions
-        self.force, self.rigid_body, self.num_places = None, None, 0
+        self.force, self.rigid_body, self.num_axis_points = None, None, 0
         if features.predicted_force or features.unconstrained_motion:
-            axes = JointAxes.of(scene.model, scene.base)
-            self.num_places = len(axes.bodies)
-            bodies = bodies + axes.bodies
-            positions = np.concatenate((positions, axes.positions))
+            axes = further = JointAxes.of(scene.model, scene.base)
+            self.num_axis_points = len(axes.bodies)
             if features.predicted_force:
                 self.force = PredictedForce(scene, axes)
             if features.unconstrained_motion:
                 robot = scene.model, scene.base, axes, scene.actuated
-                self.rigid_body = RigidBodyDynamics(*robot)
-                bodies = bodies + self.rigid_body.bodies
-                positions = np.concatenate((positions, self.rigid_body.positions))
+                self.rigid_body = further = RigidBodyDynamics(*robot)
+            bodies = bodies + further.bodies
+            positions = np.concatenate((positions, further.positions))
         self.kinematics = PointKinematics(scene.model, scene.base, bodies, positions)
-        self.count, self.num_known = count, count + self.num_places
+        self.count = count
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         self.pose = BasePose(scene.model, scene.base)
         self.predicted_penetration = PredictedPenetration(scene, self.ground, self.pose)
@@ -128,18 +123,15 @@ class ContactFeatures(FeatureTransform):
     ) -> list[Tensor]:
         """The outputs in the order of ``out_keys``, in the dtype of the inputs.
 
-        Args:
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
-            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
-            drive: joint torques ``(*batch, num_actuated)`` of the coming step, and servos'
-                controls after them; None if unknown.
+        Of ``qpos (*batch, nq)``, ``qvel (*batch, nv)``, the ``terrain (*batch, n)``, None
+        for the scene's own ground, and the ``drive`` of the coming step: joint torques
+        ``(*batch, num_actuated)`` and servos' controls after them; None if unknown.
         """
         if self.terrain is None:
             return []
         found, velocity = self.kinematics(qpos, qvel)
-        sizes = (self.count, self.num_places, found.shape[-2] - self.num_known)
-        now, places, corners = found.split(sizes, -2)  # (*batch, P, 3), ...
+        sizes = (self.count, found.shape[-2] - self.count)
+        now, places = found.split(sizes, -2)  # (*batch, P, 3), ...
         velocity = velocity[..., : self.count, :]
         pose = self.pose(qpos)
         distance, normal = self.ground(now, terrain, *pose)
@@ -151,17 +143,17 @@ class ContactFeatures(FeatureTransform):
         sliding = velocity - speed[..., None] * normal
         gain = None
         if self.rigid_body is not None:
-            where = pose[1], corners, places
             torque = None if drive is None else drive[..., : self.num_torques]
-            gain = self.rigid_body(qpos, qvel, torque, *where, self.step_size)
-            gain = self.step_size * gain
+            given = qpos, qvel, torque, pose[1], places, self.step_size
+            gain = self.step_size * self.rigid_body(*given)
         motion = qpos, qvel, terrain, gain, self.radii - distance, speed
         depth = gate * self.predicted_penetration(*motion)  # (*batch, P, K)
         moving = gate * torch.cat((speed[..., None], sliding), -1)  # (*batch, P, 4)
         features = [beyond.clamp_max(0.0), moving.flatten(-2), depth.flatten(-2)]
         if self.force is not None:
             contact = now, normal, depth, speed[..., None], sliding
-            features.append(self.force(*contact, places))
+            axes = places[..., : self.num_axis_points, :]
+            features.append(self.force(*contact, axes))
         if CONTACT_NORMAL in self.sizes:
             features.append((gate * normal).flatten(-2))
         return features

@@ -9,12 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import (
-    BasePose,
-    JointAxes,
-    keep_constants,
-    over_ground,
-)
+from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants, over_ground
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.penalty_law import PenaltyLaw, friction_force, normal_force

@@ -4,8 +4,6 @@ NeRD section 3.3. Dynamics do not depend on horizontal position and heading, so 
 not features; nor is any other coordinate that `Scene.symmetries` found to be ignored.
 """
 
-from dataclasses import dataclass, field
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -65,7 +63,7 @@ class RobotCentric(FeatureTransform):
     why_no_inverse = "position and heading are not among its features"
 
     def __init__(self, scene: Scene, features: FeatureConfig = NO_PREDICTIONS) -> None:
-        joints = _JointFeatures.from_scene(scene, features)
+        joints = _JointFeatures(scene, features)
         trees = OtherTrees(scene.model, scene.base) if scene.base.others else None
         free = [] if trees is None else [at is not None for at in trees.addresses]
         # what stands in the world does not move from a fixed base
@@ -121,28 +119,20 @@ class RobotCentric(FeatureTransform):
         return features
 
 
-@dataclass(frozen=True)
 class _JointFeatures:
     """Addresses of the joints by the kind of feature they give."""
 
-    step_size: float  # control step, s
-    angles: list[int] = field(default_factory=list)  # qpos of unlimited hinges
-    positions: list[int] = field(default_factory=list)  # qpos that enter as they are
-    balls: list[int] = field(default_factory=list)  # qpos of ball joints' quaternions
-    velocities: list[int] = field(default_factory=list)  # dofs that enter as they are
-    limited: list[int] = field(default_factory=list)  # qpos of limited joints
-    # low, high, margin of each
-    limits: list[tuple[float, float, float]] = field(default_factory=list)
-    # (index into limited, dof): velocity near a limit
-    gated: list[tuple[int, int]] = field(default_factory=list)
-    # dofs of the limited joints whose limit torque is predicted
-    predicted: list[int] = field(default_factory=list)
-    # stiffness, damping of each
-    springs: list[tuple[float, float]] = field(default_factory=list)
-
-    @classmethod
-    def from_scene(cls, scene: Scene, features: FeatureConfig) -> "_JointFeatures":
-        found = cls(scene.control_step)
+    def __init__(self, scene: Scene, features: FeatureConfig) -> None:
+        self.step_size = scene.control_step  # s
+        self.angles: list[int] = []  # qpos of unlimited hinges
+        self.positions: list[int] = []  # qpos that enter as they are
+        self.balls: list[int] = []  # qpos of ball joints' quaternions
+        self.velocities: list[int] = []  # dofs that enter as they are
+        self.limited: list[int] = []  # qpos of limited joints
+        self.limits: list[tuple[float, float, float]] = []  # low, high, margin of each
+        self.gated: list[tuple[int, int]] = []  # index into limited, dof: near a limit
+        self.predicted: list[int] = []  # dofs whose limit torque is predicted
+        self.springs: list[tuple[float, float]] = []  # stiffness, damping of each
         model, ignored = scene.model, scene.symmetries
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
@@ -152,28 +142,27 @@ class _JointFeatures:
             if kind == FREE:
                 continue
             if kind == BALL:
-                found.balls.append(q)
-                found.velocities.extend((v, v + 1, v + 2))
+                self.balls.append(q)
+                self.velocities.extend((v, v + 1, v + 2))
                 continue
             if q not in ignored.positions:
                 is_angle = kind == HINGE and not is_limited
-                (found.angles if is_angle else found.positions).append(q)
+                (self.angles if is_angle else self.positions).append(q)
             if v not in ignored.velocities:
-                found.velocities.append(v)
+                self.velocities.append(v)
             if is_limited:
                 if v in ignored.velocities:
-                    found.gated.append((len(found.limited), v))
-                low, high = (float(x) for x in model.jnt_range[joint])
+                    self.gated.append((len(self.limited), v))
+                low, high = model.jnt_range[joint].tolist()
                 # from the end: the ranges may leave out a floating base, which is first
                 fastest = float(speed[v - model.nv])
                 margin = LIMIT_STEPS * scene.control_step * fastest
                 if features.predicted_force:
                     stiffness, damping = limit_stiffness(model, [joint])
-                    found.predicted.append(v)
-                    found.springs.append((stiffness.item(), damping.item()))
-                found.limited.append(q)
-                found.limits.append((low, high, margin))
-        return found
+                    self.predicted.append(v)
+                    self.springs.append((stiffness.item(), damping.item()))
+                self.limited.append(q)
+                self.limits.append((low, high, margin))
 
     @property
     def size(self) -> int:

@@ -60,9 +60,7 @@ class SelfContactFeatures(FeatureTransform):
     def self_contact_features(self, qpos: Tensor, qvel: Tensor) -> list[Tensor]:
         """The output, if there is one, ``(*batch, D)`` in the dtype of the inputs.
 
-        Args:
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
+        Of ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
         """
         if not self.sizes:
             return []

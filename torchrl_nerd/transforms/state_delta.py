@@ -69,11 +69,8 @@ class StateDelta(Transform):
             after = _replace(after, v, rotate(turn, after[..., v : v + 3]))
         residual = moved - 0.5 * self.step_size * (qvel + after)
         change = after - qvel
-        if self.layout.translations:
-            change, residual = (
-                self._turn(qpos, x, rotate_inverse) for x in (change, residual)
-            )
-        return torch.cat((change, residual), -1)
+        parts = (self._turn(qpos, x, rotate_inverse) for x in (change, residual))
+        return torch.cat(tuple(parts), -1)
 
     def integrate(
         self,
@@ -87,9 +84,8 @@ class StateDelta(Transform):
         ``limit`` keeps a motion ``(*batch, nv)`` over so many seconds within bounds: the
         next velocities, over one, and how far positions move of what begins within them.
         """
-        change, residual = delta.split(self.layout.nv, -1)
-        if self.layout.translations:
-            change, residual = (self._turn(qpos, x, rotate) for x in (change, residual))
+        parts = delta.split(self.layout.nv, -1)
+        change, residual = (self._turn(qpos, x, rotate) for x in parts)
         after = qvel + change if limit is None else limit(qvel + change, 1.0)
         moved = 0.5 * self.step_size * (qvel + after) + residual
         if limit is not None:
@@ -105,15 +101,16 @@ class StateDelta(Transform):
         self, qpos: Tensor, x: Tensor, turn: Callable[[Tensor, Tensor], Tensor]
     ) -> Tensor:
         """Linear parts of free joints in a tangent vector, in axes of the base."""
-        q = self.base.qpos_address + 3
-        quat = qpos[..., q : q + 4] if self.base.is_floating else self._mount(qpos)
         for v in self.layout.translations:
-            x = _replace(x, v, turn(quat, x[..., v : v + 3]))
+            x = _replace(x, v, turn(self._orientation(qpos), x[..., v : v + 3]))
         return x
 
-    def _mount(self, qpos: Tensor) -> Tensor:
-        """Orientation of a fixed base, ``(*batch, 4)``."""
-        return constant(qpos, self.mount).expand(*qpos.shape[:-1], 4)
+    def _orientation(self, qpos: Tensor) -> Tensor:
+        """Of the base, ``(*batch, 4)``."""
+        if not self.base.is_floating:
+            return constant(qpos, self.mount).expand(*qpos.shape[:-1], 4)
+        q = self.base.qpos_address + 3
+        return qpos[..., q : q + 4]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
         """Write the change between the state and the one under ``next``.

@@ -60,16 +60,9 @@ def cube_slope() -> Scene:
     """Build the scene. ``qpos`` = centre (m), quaternion."""
     spec = mujoco.MjSpec.from_file(str(cube_path("cube")))
     level = spec.geom("ground")
+    kept = ("type", "size", "contype", "conaffinity", "material", "rgba")
     slope = spec.worldbody.add_body(name="slope", mocap=True)
-    slope.add_geom(
-        name="slope",
-        type=level.type,
-        size=level.size,
-        contype=level.contype,
-        conaffinity=level.conaffinity,
-        material=level.material,
-        rgba=level.rgba,
-    )
+    slope.add_geom(name="slope", **{name: getattr(level, name) for name in kept})
     spec.delete(level)
     return _scene("cube_slope", spec, ground=sample_slope)
 
@@ -101,9 +94,8 @@ def sample_slope(qpos: Tensor, generator: Generator) -> Tensor:
 def slope_beneath(qpos: Tensor, u: Tensor) -> Tensor:
     """Planes ``(*batch, 4)``, as far below cubes as level ground at height 0 would be.
 
-    Args:
-        qpos: ``(*batch, 7)``.
-        u: ``(*batch, 2)`` in [0, 1]: how steep, up to `STEEPEST`, and which way.
+    For ``qpos (*batch, 7)`` and ``u (*batch, 2)`` in [0, 1]: how steep, up to `STEEPEST`,
+    and which way.
     """
     angle, heading = STEEPEST * u[..., 0], 2.0 * torch.pi * u[..., 1]
     across, up = angle.sin(), angle.cos()
@@ -117,9 +109,7 @@ def slope_beneath(qpos: Tensor, u: Tensor) -> Tensor:
 def cube_reach(quat: Tensor, direction: Tensor) -> Tensor:
     """How far a cube's corners are from its centre along a direction, m, ``(*batch,)``.
 
-    Args:
-        quat: ``(*batch, 4)``.
-        direction: of unit length, world, ``(*batch, 3)``.
+    ``quat (*batch, 4)``; ``direction (*batch, 3)`` is of unit length, in the world.
     """
     along = (direction[..., None, :] @ matrix_from_quat(quat))[..., 0, :]  # (*batch, 3)
     return HALF * along.abs().sum(-1)

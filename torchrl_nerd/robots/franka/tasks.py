@@ -9,12 +9,7 @@ from torchrl_nerd.geometry.constants import constant, placed
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.rotations import wrap_angle
 from torchrl_nerd.keys import GOAL, QPOS, QVEL
-from torchrl_nerd.robots.franka.scene import (
-    GAIN,
-    HOME,
-    franka,
-    franka_gravity,
-)
+from torchrl_nerd.robots.franka.scene import GAIN, HOME, franka, franka_gravity
 from torchrl_nerd.scenes.controllers import PDController
 from torchrl_nerd.scenes.operational_space import OperationalSpaceController
 from torchrl_nerd.tasks.floating import between, symmetric
@@ -121,17 +116,12 @@ class FrankaReachOSC(FrankaReachTorque):
         angles, point, goal = super().observation(state).split((7, 3, 3), -1)
         return torch.cat((angles, point, goal - point), -1)
 
-    @property
-    def controller(self) -> OperationalSpaceController:
-        """From displacements of the hand to torques within the effort limits."""
-        return self._controller
-
     @cached_property
-    def _controller(self) -> OperationalSpaceController:
+    def controller(self) -> OperationalSpaceController:  # pyright: ignore
+        """From displacements of the hand to torques within the effort limits."""
         kp, kd, scale = (HAND_KP,) * 3, (HAND_KD,) * 3, (HAND_SCALE,) * 3
-        return OperationalSpaceController(
-            self.scene.model, HAND, kp, kd, scale, HOME, limit=GAIN
-        )
+        numbers = kp, kd, scale, HOME, GAIN
+        return OperationalSpaceController(self.scene.model, HAND, *numbers)
 
 
 class FrankaGravityReachTorque(FrankaReachTorque):
