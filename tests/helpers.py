@@ -23,6 +23,7 @@ from torchrl_nerd.scenes.commands import drive, held
 from torchrl_nerd.scenes.contact_points import ContactPoints
 from torchrl_nerd.scenes.controllers import TorqueController
 from torchrl_nerd.scenes.sampling import Sampling, sample_commands
+from torchrl_nerd.scenes.variation import Variation
 
 EXCERPT = Path(__file__).parent / "data" / "tosses_excerpt.npz"
 """A dozen tosses of a real cube; source and licence are in the file beside it."""
@@ -306,3 +307,13 @@ def simulated(
     offsets = states * torch.arange(trajectories + 1)
     frame = scene.control_step
     return Recording(qpos, qvel, torque, offsets, frame, terrain=ground, ctrl=ctrl)
+
+
+def varied_model(variation: Variation, parameters: Tensor) -> mujoco.MjModel:
+    """A model of its own for one row's parameters ``(size,)``."""
+    model = copy.copy(variation.model)
+    for name, value in variation.fields(parameters.numpy()[None]).items():
+        owner = model.opt if name.startswith("opt.") else model
+        getattr(owner, name.removeprefix("opt."))[...] = value[0]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model

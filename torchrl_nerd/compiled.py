@@ -5,7 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache, wraps
 from threading import Barrier, Timer
 from typing import Any, Generic, ParamSpec, TypeVar, cast
@@ -68,12 +68,8 @@ class Compiled(Generic[Given, Result]):
     """Compiled after a first call; eager for good, with one warning, where that fails.
 
     Code does not travel: a copy, or one in another process, compiles its own. Inside what
-    is being compiled it is a part of that.
-
-    Args:
-        function: what to compile.
-        warmup: eager calls at first, in which it works out what it keeps.
-        options: of `torch.compile`.
+    is being compiled it is a part of that. In the first ``warmup`` calls, which are eager,
+    the function works out what it keeps. ``options`` are those of `torch.compile`.
     """
 
     def __init__(
@@ -91,20 +87,16 @@ class Compiled(Generic[Given, Result]):
         if self._calls_to_go > 0:
             self._calls_to_go -= 1
             return self.function(*args, **kwargs)
-        if self._run is not None:
-            return self._attempt(self._run, *args, **kwargs)
-        self._run = torch.compile(self.function, **compile_options(self.options))
-        with announced():
-            return self._attempt(self._run, *args, **kwargs)
-
-    def _attempt(
-        self, run: Callable[Given, Result], *args: Given.args, **kwargs: Given.kwargs
-    ) -> Result:
+        run, waiting = self._run, nullcontext()
+        if run is None:
+            run = torch.compile(self.function, **compile_options(self.options))
+            self._run, waiting = run, announced()
         try:
-            return run(*args, **kwargs)
+            with waiting:
+                return run(*args, **kwargs)
         except COMPILER_ERRORS as error:
             reason = " ".join(str(error).strip().splitlines()[:2])
-            warnings.warn(f"cannot compile, running eagerly: {reason}", stacklevel=3)
+            warnings.warn(f"cannot compile, running eagerly: {reason}", stacklevel=2)
             self.is_eager, self._run = True, None
             return self.function(*args, **kwargs)
 
@@ -123,11 +115,9 @@ class RowThreads(Generic[Result]):
     """A function of tensors of rows, computed in parts on threads; records no gradients.
 
     For functions in which rows are independent, and which release Python's lock for most
-    of the time, as compiled code does that is wrapped in C++.
-
-    Args:
-        function: of positional arguments. Tensors among them, and what it returns, have
-            the rows as their first dimension; all else goes to every part.
+    of the time, as compiled code does that is wrapped in C++. Tensors among its positional
+    arguments, and what it returns, have the rows as their first dimension; all else goes to
+    every part.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:

@@ -16,23 +16,18 @@ Precision = Literal["float32", "float64"]
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """What is among a model's features beside state, torque and contacts.
+    """What is among a model's features beside state, torque and contacts."""
 
-    | field | meaning |
-    |---|---|
-    | ``predicted_force`` | the penalty law's forces at contacts and joint limits over the
-      coming step, see `PredictedForce`; for scenes that follow it |
-    | ``unconstrained_motion`` | contacts predicted along the motion that the robot has if
-      nothing touches it, not at constant velocity; see `PredictedPenetration` |
-    | ``parameters`` | the row's parameters, for a model of a varied scene that is told what
-      others find in their history; see `Variation` |
-    | ``self_contact`` | contacts of the robot with itself, see `SelfContactFeatures` |
-    """
-
+    # the penalty law's forces at contacts and joint limits over the coming step, for
+    # scenes that follow it; see `PredictedForce`
     predicted_force: bool = False
+    # contacts predicted along the motion that the robot has if nothing touches it, not at
+    # constant velocity; see `PredictedPenetration`
     unconstrained_motion: bool = False
+    # the row's parameters, for a model of a varied scene that is told what others find in
+    # their history; see `Variation`
     parameters: bool = False
-    self_contact: bool = False
+    self_contact: bool = False  # of the robot with itself, see `SelfContactFeatures`
 
 
 NO_PREDICTIONS = FeatureConfig()

@@ -69,7 +69,7 @@ class PaperInput(nn.Module):
                 self.joint_qpos += range(q, q + (4 if kind == BALL else 1))
                 self.joint_dofs += range(v, v + (3 if kind == BALL else 1))
         self.driven = [self.joint_dofs.index(v) for v in scene.actuated]
-        bodies, positions, radii = shape_points(model)
+        bodies, positions, radii, *_ = shape_points(model)
         margins = torch.as_tensor(MARGIN_PER_RADIUS * radii).clamp_min(MIN_MARGIN)
         self.register_buffer("margins", margins, persistent=False)
         self.count = len(bodies) if scene.terrain is not None else 0

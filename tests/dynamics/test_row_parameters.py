@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from dynamics_helpers import random_drive
+from helpers import varied_model
 from servo_helpers import ARM
 from tensordict import TensorDict
 
@@ -42,7 +43,7 @@ IDS = [f"{name}: {', '.join(ranges)}" for name, ranges in CASES]
 def alone(scene: Scene, start, torques, parameters) -> np.ndarray:
     """States ``(steps, nq + nv)`` of one row, with a model of its own."""
     variation = scene.variation
-    model = variation.model_of(parameters)
+    model = varied_model(variation, parameters)
     model.opt.disableflags = engine_model(scene, False).opt.disableflags
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = start[QPOS], start[QVEL]
@@ -100,7 +101,7 @@ def test_servos_of_a_row_are_as_strong_and_late_as_it_says(tmp_path, generator):
     for ctrl in commands:
         state = dynamics.step(state, idle, None, ctrl)
     for row in range(ROWS):
-        model = scene.variation.model_of(own[row])
+        model = varied_model(scene.variation, own[row])
         assert model.actuator_gainprm[0, 0] == pytest.approx(4500 * float(own[row, 0]))
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = start[row][QPOS], start[row][QVEL]

@@ -97,12 +97,6 @@ def test_gradients_of_the_position_are_the_jacobian(model, site, rng):
     torch.testing.assert_close(got, found.jacobian[:, :3].detach())
 
 
-def test_limits_are_the_models():
-    kinematics = SiteKinematics(*MODELS["handmade"])
-    want = [[-np.inf, np.inf]] * 2 + [[-1.0, 2.0]]
-    np.testing.assert_array_equal(kinematics.limits, want)
-
-
 def test_other_sites_and_joints_are_refused_in_a_sentence():
     model = MODELS["handmade"][0]
     with pytest.raises(ValueError, match=r"name of a site \(tip\), got 'hand'"):

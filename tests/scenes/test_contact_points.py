@@ -66,7 +66,7 @@ def test_the_nearest_point_gives_a_shapes_clearance(shape, rng):
     attributes, count, radius = SHAPES[shape]
     scene = one_shape(attributes)
     model, points = scene.model, scene.contacts
-    assert len(points) == points.count_found == count
+    assert len(points) == len(points.stands_for) == count
     assert (points.radii == radius).all()
     data, poses = mujoco.MjData(model), random_states(model, 30, rng)[0].numpy()
     places = world_points(model, poses, points.bodies, points.positions)
@@ -83,7 +83,7 @@ def test_margins_are_the_papers(scene):
     want = np.maximum(MARGIN_PER_RADIUS * points.radii, MIN_MARGIN)
     np.testing.assert_array_equal(points.margins, want)
     assert (MARGIN_PER_RADIUS, MIN_MARGIN) == (4.0, 0.1)
-    assert len(points) <= points.count_found
+    assert len(points) <= len(points.stands_for)
 
 
 def test_pendulum_keeps_elbow_and_tip():
@@ -93,7 +93,7 @@ def test_pendulum_keeps_elbow_and_tip():
     order = np.argsort(places[:, 0])
     np.testing.assert_allclose(places[order], [[1.5, -1, 2], [3.0, -1, 2]], atol=1e-12)
     np.testing.assert_allclose(points.radii, 0.1)
-    assert points.count_found == 4
+    assert len(points.stands_for) == 4
 
 
 def test_merged_points_never_part(rng):
@@ -244,7 +244,7 @@ def test_third_party_robots_are_where_mujoco_has_them(path, rng):
     points = contact_points(model, Base.from_model(model))
     assert len(points) <= MAX_POINTS and points.error < 0.1
     if (model.geom_type[terrain_geoms(model)] == PLANE_TYPE).all():
-        check_distances(model, shape_points(model), points.error, rng, rows=30)
+        check_distances(model, shape_points(model)[:3], points.error, rng, rows=30)
 
 
 def test_only_what_can_touch_has_points():

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from helpers import varied_model
 
 from torchrl_nerd.robots import PRESETS, load_scene
 from torchrl_nerd.scenes.variation import Variation
@@ -52,7 +53,7 @@ def test_a_payload_is_a_small_heavy_body(generator):
     load = spec.body("torso").add_body(name="load", pos=given[1:].tolist())
     load.mass, load.inertia = float(given[0]), [1e-9] * 3
     load.ipos, load.explicitinertial = [0.0] * 3, True
-    other, own = spec.compile(), scene.variation.model_of(given)
+    other, own = spec.compile(), varied_model(scene.variation, given)
     matrices = []
     for model in (own, other):
         data = mujoco.MjData(model)
@@ -74,7 +75,7 @@ def test_a_slope_is_steep_where_friction_does_not_hold(friction):
     speeds = []
     for angle in (0.8 * np.arctan(friction), 1.3 * np.arctan(friction)):
         own = [angle, friction / 0.15]
-        model = found.model_of(torch.tensor(own, dtype=torch.float64))
+        model = varied_model(found, torch.tensor(own, dtype=torch.float64))
         data = mujoco.MjData(model)
         data.qpos[2] = 0.0524
         mujoco.mj_step(model, data, nstep=3000)
@@ -91,7 +92,7 @@ def test_stiffness_keeps_the_damping_ratio():
     for solref in ("0.02 0.7", "-2000 -80"):
         model = mujoco.MjModel.from_xml_string(xml.format(solref))
         stiffer = Variation(model, [], {"stiffness": (4.0, 4.0)})
-        own = stiffer.model_of(torch.full((1,), 4.0, dtype=torch.float64))
+        own = varied_model(stiffer, torch.full((1,), 4.0, dtype=torch.float64))
         depths = []
         for each in (model, own):
             data = mujoco.MjData(each)
@@ -104,7 +105,7 @@ def test_nothing_varied_leaves_hash_and_model_alone():
     scene = load_scene("ant")
     before = copy.copy(scene.model)
     varied = scene.vary({"mass": (0.5, 2.0), "friction": (0.1, 1.0)})
-    varied.variation.model_of(torch.tensor([2.0, 0.5], dtype=torch.float64))
+    varied_model(varied.variation, torch.tensor([2.0, 0.5], dtype=torch.float64))
     assert varied.hash == scene.hash and varied.vary({}).variation is None
     np.testing.assert_array_equal(scene.model.body_mass, before.body_mass)
     np.testing.assert_array_equal(scene.model.geom_friction, before.geom_friction)

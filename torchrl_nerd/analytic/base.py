@@ -24,11 +24,8 @@ class StepResult(NamedTuple):
 class AnalyticStep(nn.Module, ABC):
     """A control step from the equation of motion: no weights, no history.
 
-    | attribute | meaning |
-    |---|---|
-    | ``scene`` | the robot and its ground |
-    | ``config`` | which step it is, as a checkpoint's card stores it |
-    | ``num_defects`` | K, width of ``velocity_defect``; dof after dof, repeated |
+    ``config`` says which step it is, as a checkpoint's card stores it; ``num_defects`` is
+    K, width of ``velocity_defect``: dof after dof, repeated.
     """
 
     kind: ClassVar[str] = "analytic"
@@ -59,20 +56,16 @@ class AnalyticStep(nn.Module, ABC):
     ) -> StepResult:
         """The state after one control step.
 
-        Args:
-            qpos: ``(*batch, nq)``, float64.
-            qvel: ``(*batch, nv)``.
-            joint_torque: ``(*batch, num_actuated)``, N m and N, held over the step; None
-                for none.
-            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+        From ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``. The ``joint_torque (*batch,
+        num_actuated)``, N m and N, is held over the step; None for none. Of the ``terrain
+        (*batch, terrain.size)`` None is the scene's own.
         """
         batch = qpos.shape[:-1]
-        qpos, qvel = (x.reshape(batch.numel(), x.shape[-1]) for x in (qpos, qvel))
-        drive = (
-            None if x is None else x.reshape(len(qpos), x.shape[-1])
-            for x in (joint_torque, terrain)
+        given = (
+            None if x is None else x.reshape(batch.numel(), x.shape[-1])
+            for x in (qpos, qvel, joint_torque, terrain)
         )
-        found = self._step(qpos, qvel, *drive)
+        found = self._step(*given)  # pyright: ignore
         return StepResult(*(x.reshape(*batch, x.shape[-1]) for x in found))
 
     @abstractmethod

@@ -57,9 +57,8 @@ class FreeBodyPenaltyStep(AnalyticStep):
     in units of `SCALED`, then those that scenes lack, in units of `SHIFTED`. All zero for
     the scene as it is.
 
-    Args:
-        scene: a single free body with point contacts that follow the penalty law.
-        num_substeps: semi-implicit Euler steps per control step.
+    The scene is a single free body with point contacts that follow the penalty law;
+    ``num_substeps`` are semi-implicit Euler steps per control step.
 
     Raises:
         ValueError: another kind of robot or contact.

@@ -103,13 +103,9 @@ class SubstepIntegrator(nn.Module):
     ) -> list[SubstepState]:
         """The state at the start and after each substep, in the base frame of ``last``.
 
-        Args:
-            first: dynamics from which Jacobian and smooth acceleration change linearly
-            last: to these.
-            between: time between both, in substeps; 0: they are one, nothing changes.
-            qpos: at the start, ``(N, nq)``.
-            qvel: at the start, ``(N, nv)``.
-            num_substeps: time to reach, in substeps; rounded up.
+        Jacobian and smooth acceleration change linearly from the ``first`` dynamics to the
+        ``last``, ``between`` substeps later; 0: they are one, nothing changes. The start is
+        ``qpos (N, nq)`` and ``qvel (N, nv)``; ``num_substeps`` are rounded up.
         """
         step, jacobian, normal, depth, qacc_smooth, inverse, _ = self.step_size, *last
         joints = qpos.mT[self.limited_qpos].to(qacc_smooth)

@@ -46,9 +46,6 @@ class DMControlDynamics:
     servos, which dm_control itself takes as zero in that substep. For many envs
     `MujocoDynamics` is faster: here every env costs a Python call.
 
-    Args:
-        scene: robot, ground and substeps.
-
     Raises:
         ValueError: a scene whose parameters differ from row to row.
     """

@@ -7,12 +7,7 @@ from torchrl_nerd.scenes.variation import Variation
 
 
 class RowParameters:
-    """Parameters of a `Variation` in a batch of MuJoCo's simulations.
-
-    Args:
-        variation: what differs.
-        batch: the simulations; they begin with the scene's own model.
-    """
+    """Parameters of a `Variation` in a batch that begins with the scene's own model."""
 
     def __init__(self, variation: Variation, batch: Batch) -> None:
         self.variation, self.batch = variation, batch
@@ -36,10 +31,8 @@ class RowParameters:
     ) -> np.ndarray:
         """What the engine gets where ``command (rows, m)`` is asked of the motors.
 
-        Args:
-            command: joint torques, or ``ctrl``, whose actuators the model itself weakens.
-            late: ``(rows, 1 + max_delay, at least m)``, the last ones; takes it in.
-            is_ctrl: whether it is ``ctrl``.
+        Of a ``ctrl`` the model itself weakens the actuators. ``late (rows, 1 + max_delay,
+        at least m)`` holds the last commands, and takes this one in.
         """
         late[:, 1:] = late[:, :-1].copy()
         late[:, 0, : command.shape[1]] = command

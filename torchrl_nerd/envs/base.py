@@ -127,11 +127,8 @@ class SceneEnv(RenderedEnv):
         """Make one compiled piece of a step, and one of a reset; returns the env itself.
 
         TorchRL calls it for ``compile=``. Without a compiler, eager with one warning.
-
-        Args:
-            warmup: eager steps before the first compiled one; 1 where not given.
-            kwargs: of `torch.compile`; without mode, backend or options, those that suit
-                the model.
+        ``warmup`` eager steps come first, 1 where not given. ``kwargs`` are those of
+        `torch.compile`; without mode, backend or options, those that suit the model.
         """
         suits: Mapping[str, Any] = {}
         if (inner := self._torch_dynamics) is not None:

@@ -28,16 +28,10 @@ def image_size(given: int | tuple[int, int]) -> tuple[int, int]:
 
 
 class RenderedEnv(EnvBase):
-    """An env whose state can be seen; `SceneEnv` is one.
+    """An env whose state can be seen; `SceneEnv` is one."""
 
-    | attribute | meaning |
-    |---|---|
-    | ``render_size`` | height and width of an image, pixels |
-    | ``camera_id`` | of an image, see `Renderer` |
-    """
-
-    render_size: tuple[int, int] = (240, 320)
-    camera_id: int | str | None = None
+    render_size: tuple[int, int] = (240, 320)  # height and width of an image, pixels
+    camera_id: int | str | None = None  # of an image, see `Renderer`
     from_pixels = pixels_only = False
     _renderer: Renderer
 

@@ -88,10 +88,8 @@ class Renderer:
     The camera is the model's first one that stands in the world or tracks the robot.
     Without such a camera it is MuJoCo's default free camera, whose direction and distance
     ``<visual><global azimuth= elevation=>`` and ``<statistic center= extent=>`` of the MJCF
-    file set; it follows the center of mass of a floating base.
-
-    Args:
-        task: what is drawn; `Task.show` puts its own things into the image.
+    file set; it follows the center of mass of a floating base. `Task.show` puts the task's
+    own things into the image.
     """
 
     def __init__(self, task: Task) -> None:

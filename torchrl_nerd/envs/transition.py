@@ -5,6 +5,7 @@ of a control step can be compiled into one piece.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -43,32 +44,24 @@ def drive_sizes(task: Task) -> dict[str, int]:
 
 
 class Transition:
-    """A task in a dynamics, from one state to the next.
+    """A task in a dynamics, from one state to the next."""
 
-    Args:
-        task: controller, observation, reward, end, starts.
-        dynamics: what steps the state; guarded by ``"truncate"`` it also ends episodes.
-
-    | attribute | meaning |
-    |---|---|
-    | ``is_round`` | the dynamics has compiled code of its own, and `step` compiles to what
-      is round it |
-    | ``is_whole`` | all control steps of an action are one compiled piece, not one each |
-    """
+    # the dynamics has compiled code of its own, and `step` compiles to what is round it
+    is_round = False
+    is_whole = (
+        True  # all control steps of an action are one compiled piece, not one each
+    )
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         self.task, self.dynamics = task, dynamics
-        self.is_round, self.is_whole = False, True
         is_guarded = isinstance(dynamics, GuardedDynamics)
         self.is_truncating = is_guarded and dynamics.guard == "truncate"
 
     def step(self, state: Tensors, action: Tensor, age: Tensor) -> Tensors:
         """All that one action leads to; an env at fault keeps its state and ends.
 
-        Args:
-            state: ``qpos``, ``qvel`` and the task's parameters, ``(num_envs, size)``.
-            action: ``(num_envs, num_actions)``.
-            age: ``(num_envs,)`` actions before this one.
+        The ``state`` holds ``qpos``, ``qvel`` and the task's parameters, ``(num_envs,
+        size)`` each; ``age (num_envs,)`` counts the actions before this one.
 
         Returns:
             The next state and what an env hands out beside it: ``joint_torque``, of servos
@@ -124,45 +117,31 @@ class Transition:
         self, moving: Tensors, action: Tensor, terrain: Tensor | None
     ) -> tuple[Tensors, Tensors]:
         """The state one control step later, and what drove it: torque and ``ctrl``."""
-        qpos, qvel = moving[QPOS], moving[QVEL]
-        torque, ctrl = actuate(self.task.controller, action, qpos, qvel)
+        state = {key: moving[key] for key in (QPOS, QVEL, PARAMETERS) if key in moving}
+        torque, ctrl = actuate(self.task.controller, action, state[QPOS], state[QVEL])
         move = self._move_apart if self.is_round else self._move
-        moved = move(qpos, qvel, torque, terrain, ctrl, moving.get(PARAMETERS))
-        drive = {"joint_torque": torque}
+        moved, drive = move(state, torque, terrain, ctrl), {"joint_torque": torque}
         return moved, drive if ctrl is None else {**drive, "ctrl": ctrl}
 
-    def _move(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        torque: Tensor,
-        terrain: Tensor | None,
-        ctrl: Tensor | None,
-        parameters: Tensor | None,
-    ) -> Tensors:
-        values = {QPOS: qpos, QVEL: qvel}
-        if parameters is not None:
-            values[PARAMETERS] = parameters
-        state = TensorDict(values, qpos.shape[:1], device=qpos.device)
-        moved = dict(self.dynamics.step(state, torque, terrain, ctrl).items())
+    def _move(self, state: Tensors, *given: Any) -> Tensors:
+        """A step of the dynamics, in the state's precision."""
+        qpos = state[QPOS]
+        before = TensorDict(state, qpos.shape[:1], device=qpos.device)
+        moved = dict(self.dynamics.step(before, *given).items())
         return moved | {key: moved[key].to(qpos.dtype) for key in (QPOS, QVEL)}
 
     @uncompiled
-    def _move_apart(self, *given: Tensor | None) -> Tensors:
-        return self._move(*given)  # pyright: ignore
+    def _move_apart(self, state: Tensors, *given: Any) -> Tensors:
+        return self._move(state, *given)
 
     def restart(
         self, state: Tensors, rows: Tensor, drawn: Tensor, given: Tensors
     ) -> Tensors:
-        """New episodes for some envs; the others stay bitwise as they are.
+        """New episodes for ``rows (num_envs,)``; the others stay bitwise as they are.
 
-        Args:
-            state: as in `step`.
-            rows: ``(num_envs,)`` bool: which.
-            drawn: ``(num_envs, numbers)``, uniform in [0, 1), for all envs, so that shapes
-                stay the same. An argument, since the compiler would write the hash that
-                they come from into each of their uses.
-            given: what of a start is not left to chance.
+        What of a start is not ``given`` is left to chance: ``drawn (num_envs, numbers)``,
+        uniform in [0, 1), for all envs, so that shapes stay the same. They are an argument,
+        since the compiler would write the hash that they come from into each of their uses.
 
         Returns:
             As `step`, without reward: zero torque and control, no fault, full trust, not

@@ -1,6 +1,7 @@
 """The frame B_t that a robot's coordinates refer to, and its joint axes as points."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,19 +14,16 @@ from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
 
 # a scene keeps them: they must not be inference tensors, whoever asks first
 @torch.inference_mode(False)
-def keep_constants(module: nn.Module, **values: object) -> None:
-    """Keep copies as float64 buffers: they move with the module, checkpoints omit them."""
+def keep_constants(module: nn.Module, dtype: type = np.float64, **values: Any) -> None:
+    """Keep copies as buffers: they move with the module, checkpoints omit them."""
     for name, value in values.items():
-        tensor = torch.from_numpy(np.asarray(value, np.float64).copy())
+        tensor = torch.from_numpy(np.array(value, dtype, order="C"))
         module.register_buffer(name, tensor, persistent=False)
 
 
-@torch.inference_mode(False)
-def keep_indices(module: nn.Module, **values: object) -> None:
+def keep_indices(module: nn.Module, **values: Any) -> None:
     """Keep integers as buffers: `torch.compile` would guard every entry of a list."""
-    for name, value in values.items():
-        tensor = torch.from_numpy(np.asarray(value, np.int64).copy())
-        module.register_buffer(name, tensor, persistent=False)
+    keep_constants(module, np.int64, **values)
 
 
 @dataclass(frozen=True)

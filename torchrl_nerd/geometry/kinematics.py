@@ -83,14 +83,9 @@ class PointKinematics(nn.Module):
     def forward(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """Positions and velocities of the points, as seen from the base; both in B_t.
 
-        Where there are fewer velocities than positions, the first positions have one.
-
-        Args:
-            qpos: ``(*batch, nq)``, float64.
-            qvel: ``(*moving, nv)``, float64; of no rows where only positions are wanted.
-
-        Returns:
-            positions ``(*batch, P, 3)``, m, and velocities ``(*moving, P, 3)``, m/s.
+        From ``qpos (*batch, nq)`` and ``qvel (*moving, nv)``: positions ``(*batch, P, 3)``,
+        m, and velocities ``(*moving, P, 3)``, m/s. Where there are fewer velocities than
+        positions, the first positions have one; none has of a ``qvel`` without rows.
         """
         q, v = (x.reshape(-1, x.shape[-1]).T.contiguous() for x in (qpos, qvel))
         position, rotation, omega, velocity = self.body_motion(q, v)

@@ -1,9 +1,12 @@
 """Motion of many bodies in many robots, the batch last, and the algebra of it."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.constants import take
 
 Motion = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -52,10 +55,7 @@ def _side_by_side(parts: tuple[Tensor, ...]) -> Tensor:
     return torch.cat([part.expand(*part.shape[:-1], rows) for part in parts], -2)
 
 
-@torch.inference_mode(False)
-def keep(module: nn.Module, **per_body: object) -> None:
+def keep(module: nn.Module, **per_body: Any) -> None:
     """Keep numbers of n bodies ``(n, *size)`` as buffers ``(*size, n, 1)``."""
     for name, value in per_body.items():
-        tensor = torch.as_tensor(np.array(value), dtype=torch.float64)
-        tensor = tensor.movedim(0, -1)[..., None].contiguous()
-        module.register_buffer(name, tensor, persistent=False)
+        keep_constants(module, **{name: np.moveaxis(np.array(value), 0, -1)[..., None]})

@@ -98,13 +98,10 @@ class RigidBodyDynamics(nn.Module):
     ) -> Tensor:
         """Acceleration ``(*batch, nv)``, in the axes of ``qvel``.
 
-        Args:
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
-            joint_torque: ``(*batch, num_actuated)``; None for none.
-            rotation: of the base, ``(*batch, 3, 3)``.
-            places: of the points at ``positions``, ``(*batch, 2 J + 4 B, 3)``, m, in B_t.
-            period: s, over which damping is implicit (taken at its middle).
+        ``joint_torque (*batch, num_actuated)`` may be None for none. Given are, too, the
+        base's ``rotation (*batch, 3, 3)`` and the ``places (*batch, 2 J + 4 B, 3)``, m, of
+        the points at ``positions``, in B_t. Damping is implicit over ``period`` s (taken at
+        its middle).
         """
         given = qpos, qvel, joint_torque, rotation, places, period
         parts = self.mass_matrix_and_force(*given)
@@ -127,7 +124,7 @@ class RigidBodyDynamics(nn.Module):
 
         Arguments as of `forward`. A floating base's linear velocity is in B_t here, in a
         frame that moves with the base.
-        """  # noqa: D417
+        """
         rate, position = rows_last(qvel, 1), rows_last(qpos, 1)
         count = 2 * len(self.is_slide)
         axes, corners = places.split((count, places.shape[-2] - count), -2)

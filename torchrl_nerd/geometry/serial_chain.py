@@ -35,7 +35,7 @@ class SiteKinematics:
     """Forward kinematics and Jacobian of a named site on a robot whose base is fixed.
 
     ``qpos_addresses`` and ``dof_addresses`` are those of the chain's n joints, from the
-    base on; ``limits (n, 2)`` their lowest and highest positions, infinite where unlimited.
+    base on.
 
     Raises:
         ValueError: no such site, or a joint on the way to it that is no hinge or slide.
@@ -45,9 +45,6 @@ class SiteKinematics:
         self.joints = _joints_to(model, site)
         self.qpos_addresses = model.jnt_qposadr[self.joints].tolist()
         self.dof_addresses = model.jnt_dofadr[self.joints].tolist()
-        is_limited = model.jnt_limited[self.joints, None] != 0
-        unlimited = np.array((-np.inf, np.inf))
-        self.limits = np.where(is_limited, model.jnt_range[self.joints], unlimited)
         self._chains = {torch.device("cpu"): serial_chain(model, site)}
 
     def __call__(self, qpos: Tensor) -> EndEffector:

@@ -72,14 +72,9 @@ class Encoded(NamedTuple):
 class NeRD(nn.Module):
     """The learned solver of one robot: state, torque and ground in, next state out.
 
-    Args:
-        scene: the robot and its ground.
-        features: which predictions of the contact law are among its features.
-        network: size and kind of the network.
-        stats: of raw features and targets; zero mean and unit variance where not given
-            (weights that are yet to be loaded).
-        scene_features: what it sees of a state; `SceneFeatures` where not given.
-        state_delta: what it predicts; see `StateDelta`.
+    ``stats`` are those of raw features and targets: zero mean and unit variance where none
+    are given and weights are yet to be loaded. What it sees of a state and what it predicts
+    are `SceneFeatures` and `StateDelta`, unless others are given.
     """
 
     kind: ClassVar[str] = "learned"
@@ -156,11 +151,9 @@ class NeRD(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The next ``qpos`` and ``qvel``, and the features, for `ood_score`.
 
-        Args:
-            state: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
-            drive: ``(*batch, num_actuated + num_ctrl)``, see `drive_of`.
-            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
-            network_step: ``(*batch, token_size) -> (*batch, D)``: keeps the history.
+        ``drive (*batch, num_actuated + num_ctrl)``: see `drive_of`. Of the ``terrain
+        (*batch, terrain.size)`` None is the scene's own. ``network_step``, which keeps the
+        history, is ``(*batch, token_size) -> (*batch, D)``.
         """
         encoded = self.encode(*state, drive, terrain)
         after = self.decode(state, encoded, network_step(encoded.token))
@@ -201,16 +194,13 @@ class NeRD(nn.Module):
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
         """Move everything, but cast only the network: constants stay float64."""
-        for part in (part for part in self.children() if part is not self.network):
-            for module in part.modules():
-                for name, buffer in module._buffers.items():
-                    if buffer is not None:
-                        module._buffers[name] = buffer.to(fn(buffer).device)
-                for weight in module._parameters.values():  # of an analytic step
-                    if weight is not None:
-                        weight.data = weight.data.to(fn(weight.data).device)
-        self.zero, self.one = (x.to(fn(x).device) for x in (self.zero, self.one))
-        self.network._apply(fn, recurse)
+
+        def move(x: Tensor) -> Tensor:
+            return x.to(fn(x).device)
+
+        for part in self.children():
+            part._apply(fn if part is self.network else move, recurse)
+        self.zero, self.one = move(self.zero), move(self.one)
         return self
 
     @property

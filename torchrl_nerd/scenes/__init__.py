@@ -15,8 +15,7 @@ def is_import(name: str) -> bool:
 def import_scene(name: str) -> Scene:
     """The third-party robot of that name; the same object at every call.
 
-    Args:
-        name: ``dm_control/DOMAIN-TASK``, ``gymnasium/ID`` or the path of an MJCF file.
+    Such as ``dm_control/DOMAIN-TASK``, ``gymnasium/ID`` or the path of an MJCF file.
 
     Raises:
         ValueError: no such robot, or one with something not supported (named).

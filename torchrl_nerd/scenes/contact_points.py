@@ -49,13 +49,8 @@ class ContactPoints:
 
     @property
     def merged(self) -> np.ndarray:
-        """Which of the shapes' points each stands for, ``(P, count_found)``, bool."""
+        """Which of the shapes' points each stands for, ``(P, len(stands_for))``, bool."""
         return np.arange(len(self))[:, None] == self.stands_for
-
-    @property
-    def count_found(self) -> int:
-        """How many the shapes have before merging and dropping."""
-        return len(self.stands_for)
 
 
 def contact_points(
@@ -66,7 +61,7 @@ def contact_points(
     Raises:
         ValueError: a shape that can touch the ground is none of `shape_balls`'.
     """
-    bodies, positions, radii, error, thinned = _shape_points(model, most)
+    bodies, positions, radii, error, thinned = shape_points(model, most)
     leaders = _leaders(model, base, bodies, positions, radii)
     kept = sorted(set(leaders) - {-1})
     return ContactPoints(
@@ -82,20 +77,13 @@ def contact_points(
 
 def shape_points(
     model: mujoco.MjModel, most: int = MAX_POINTS
-) -> tuple[list[int], np.ndarray, np.ndarray]:
+) -> tuple[list[int], np.ndarray, np.ndarray, float, int]:
     """The points of every shape that can touch the ground, none merged.
 
-    Body ids, positions ``(N, 3)`` (m, body frame) and radii ``(N,)`` (m). A robot of
-    ``most`` points of spheres, capsules and boxes keeps them all; of another one the
-    spheres' remain and those that `thin` keeps.
+    Body ids, positions ``(N, 3)`` (m, body frame), radii ``(N,)`` (m), and ``error`` and
+    ``thinned`` of `ContactPoints`. A robot of ``most`` points of spheres, capsules and
+    boxes keeps them all; of another one the spheres' remain and those that `thin` keeps.
     """
-    return _shape_points(model, most)[:3]
-
-
-def _shape_points(
-    model: mujoco.MjModel, most: int
-) -> tuple[list[int], np.ndarray, np.ndarray, float, int]:
-    """See `shape_points`; `ContactPoints.error` and ``thinned`` too."""
     bodies, exact, single, error = [], [], [], 0.0
     parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 3)), np.zeros(0))]
     for geom in touching_geoms(model):
@@ -183,12 +171,6 @@ def collision_filter(model: mujoco.MjModel) -> Callable[[int, int], bool]:
 def body_label(model: mujoco.MjModel, body: int) -> str:
     """A body's name; ``body 3`` where it has none."""
     return model.body(body).name or f"body {body}"
-
-
-def geom_label(model: mujoco.MjModel, geom: int) -> str:
-    """A geom's name, or its number, and its body, for messages."""
-    body = body_label(model, int(model.geom_bodyid[geom]))
-    return f"geom '{model.geom(geom).name or geom}' of '{body}'"
 
 
 def _moving_geoms(model: mujoco.MjModel) -> list[int]:

@@ -42,13 +42,9 @@ class Controller(Protocol):
 
 @dataclass(frozen=True)
 class TorqueController:
-    """Torque proportional to the action: ``gain * clip(action, -1, 1)``.
+    """Torque proportional to the action: ``gain * clip(action, -1, 1)``."""
 
-    Args:
-        gain: N or N m per unit of action, one per actuated dof.
-    """
-
-    gain: Row
+    gain: Row  # N or N m per unit of action, one per actuated dof
 
     @property
     def num_actions(self) -> int:
@@ -67,26 +63,17 @@ class PDController:
     The target is ``scale * clip(action, -1, 1)`` from the pose ``default``, or from the
     present position where there is none.
 
-    Args:
-        qpos_addresses: of the actuated joints.
-        dof_addresses: of the same joints.
-        kp: stiffness, N m/rad or N/m, one per joint.
-        kd: damping, N m s/rad or N s/m.
-        scale: rad or m per unit of action.
-        default: pose of the actuated joints, rad or m.
-        limit: largest torque; None for none.
-
     Raises:
         ValueError: lengths that differ.
     """
 
-    qpos_addresses: tuple[int, ...]
-    dof_addresses: tuple[int, ...]
-    kp: Row
-    kd: Row
-    scale: Row
-    default: Row | None = None
-    limit: Row | None = None
+    qpos_addresses: tuple[int, ...]  # of the actuated joints
+    dof_addresses: tuple[int, ...]  # of the same joints
+    kp: Row  # stiffness, N m/rad or N/m, one per joint
+    kd: Row  # damping, N m s/rad or N s/m
+    scale: Row  # rad or m per unit of action
+    default: Row | None = None  # pose of the actuated joints, rad or m
+    limit: Row | None = None  # largest torque; None for none
 
     def __post_init__(self) -> None:
         for name in ("dof_addresses", "kp", "kd", "scale", "default", "limit"):

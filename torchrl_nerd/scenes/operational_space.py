@@ -144,18 +144,13 @@ class OperationalSpaceController:
         return self.torque(constant(qpos, self.kp) * offset, qpos, qvel)
 
     def torque(self, acceleration: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """Torques that accelerate the site, less its damping kd x'.
+        """Torques that accelerate the site, less its damping kd x', within the limits.
 
-        Args:
-            acceleration: ``(*batch, num_actions)``, m/s^2 and rad/s^2, world.
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
-
-        Returns:
-            ``(*batch, num_actuated)``, N m and N, within the limits.
+        From an ``acceleration (*batch, num_actions)``, m/s^2 and rad/s^2, in the world:
+        ``(*batch, num_actuated)``, N m and N.
         """
-        given, count = (acceleration, qpos, qvel), self.num_actions
-        a, q, v = (x.double() for x in given)
+        count = self.num_actions
+        a, q, v = acceleration.double(), qpos.double(), qvel.double()
         mass_matrix, bias = self._equation_of_motion(q, v)
         found, dofs = self.site(q).jacobian, self.site.dof_addresses
         drift = bias_acceleration(found, take(v, dofs))[..., :count]  # J' q'

@@ -62,14 +62,10 @@ def limit_forces(
 def set_penalty_contact(
     model: mujoco.MjModel, *, ke: float, kd: float, kf: float, mu: float
 ) -> None:
-    """Give every shape of a moving body the penalty law against the ground.
+    """Give every shape of a moving body the penalty law against the ground, in place.
 
-    Args:
-        model: compiled; changed in place.
-        ke: stiffness, N/m.
-        kd: normal damping, N s/m.
-        kf: tangential damping below the friction limit, N s/m.
-        mu: Coulomb friction coefficient.
+    Stiffness ``ke``, N/m; normal damping ``kd`` and tangential damping below the friction
+    limit ``kf``, N s/m; Coulomb friction coefficient ``mu``.
     """
     model.opt.impratio = kf / kd
     for geom in range(model.ngeom):

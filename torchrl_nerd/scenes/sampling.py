@@ -10,7 +10,6 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.geometry.rotations import (
-    quat_multiply,
     quat_normalize,
     random_tilt,
     rotate,
@@ -40,16 +39,13 @@ class BaseSampling:
     linear_high: Row
     angular_low: Row  # rad/s, base frame
     angular_high: Row
-    quat: Row = (1.0, 0.0, 0.0, 0.0)  # the orientation that is turned, wxyz
 
     def draw(self, rows: int, generator: Generator) -> tuple[Tensor, Tensor]:
         """``qpos (rows, 7)`` and ``qvel (rows, 6)`` of the free joint, float64."""
         position = uniform(self.low, self.high, rows, generator)
         axis = torch.rand(rows, 3, dtype=torch.float64, generator=generator)
         angle = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
-        upright = torch.tensor(self.quat, dtype=torch.float64).expand(rows, 4)
-        tilt = random_tilt(torch.cat((axis, angle), -1), self.tilt)
-        quat = quat_multiply(upright, tilt)
+        quat = random_tilt(torch.cat((axis, angle), -1), self.tilt)
         linear = uniform(self.linear_low, self.linear_high, rows, generator)
         angular = uniform(self.angular_low, self.angular_high, rows, generator)
         qvel = torch.cat((rotate(quat, linear), angular), -1)
@@ -60,49 +56,35 @@ class BaseSampling:
 class Sampling:
     """Uniform ranges of initial states and torques.
 
-    | field | meaning |
-    |---|---|
-    | ``qpos_low``, ``qpos_high`` | initial positions of the joints, m and rad |
-    | ``qvel_low``, ``qvel_high`` | initial velocities of the joints, m/s and rad/s |
-    | ``torque`` | largest torque of each actuated dof, N and N m |
-    | ``base`` | start of a floating base, whose joint comes before the others |
-    | ``ground`` | draws each row's ground, where it varies |
-    | ``level_ground`` | draws grounds that the robot hits head-on, see `strategies` |
-    | ``drive`` | torques that depend on the state, in place of uniform ones |
-    | ``ctrl`` | lowest and highest control of each servo, drawn in place of torques |
-    | ``clearance`` | starts nearer to the ground than this (m) are drawn again |
-    | ``penetration`` | starts with a contact deeper than this (m), of the robot with the
-      ground or with itself, are drawn again; the least deep draw of a row stays if all of
-      its draws are deeper |
-    | ``zero_torque_fraction`` | share of trajectories with no torque at all |
-    | ``low_torque_fraction`` | share whose torque and velocity are scaled down by U(0, 1) |
-    | ``starts`` | draws the initial states, in place of the ranges |
-    | ``min_torque_scale`` | torque scales of the other rows: log-uniform from this to 1 |
-    | ``correlation_time`` | lowest and highest time, s, that a row's torques keep |
-
-    Without a ``correlation_time`` torques are drawn anew at every step.
-
     Raises:
         ValueError: a fraction outside [0, 1], a scale or times that are not positive and
             in order, or a correlation beside a ``drive``, whose torques follow the state.
     """
 
-    qpos_low: Row
+    qpos_low: Row  # initial positions of the joints, m and rad
     qpos_high: Row
-    qvel_low: Row
+    qvel_low: Row  # initial velocities of the joints, m/s and rad/s
     qvel_high: Row
-    torque: Row
+    torque: Row  # largest torque of each actuated dof, N and N m
+    # start of a floating base, whose joint comes before the others
     base: BaseSampling | None = None
-    ground: GroundSampler | None = None
+    ground: GroundSampler | None = None  # draws each row's, where it varies
+    # draws grounds that the robot hits head-on, see `data.strategies`
     level_ground: GroundSampler | None = None
-    drive: Drive | None = None
-    clearance: float | None = None
+    drive: Drive | None = None  # torques that depend on the state, not uniform ones
+    clearance: float | None = None  # m: starts nearer to the ground are drawn again
+    # m: starts with a deeper contact, of the robot with the ground or with itself, are
+    # drawn again; the least deep draw of a row stays if all of its draws are deeper
     penetration: float | None = None
-    zero_torque_fraction: float = 0.25
+    zero_torque_fraction: float = 0.25  # share of trajectories with no torque at all
+    # share whose torque and velocity are scaled down by U(0, 1)
     low_torque_fraction: float = 0.25
-    starts: Starts | None = None
+    starts: Starts | None = None  # draws the initial states, in place of the ranges
+    # torque scales of the other rows are log-uniform from this to 1
     min_torque_scale: float | None = None
+    # lowest and highest time, s, that a row's torques keep; None: drawn at every step
     correlation_time: tuple[float, float] | None = None
+    # lowest and highest control of each servo, drawn in place of torques
     ctrl: tuple[Row, Row] | None = None
 
     def __post_init__(self) -> None:

@@ -40,29 +40,18 @@ REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's ow
 class Scene:
     """Everything that all dynamics share about a robot and its surroundings.
 
-    | field | meaning |
-    |---|---|
-    | ``name`` | its name in the registry |
-    | ``model`` | compiled MuJoCo model; ``opt.timestep`` is one substep |
-    | ``substeps`` | MuJoCo steps per control step |
-    | ``controller`` | turns actions into joint torques |
-    | ``sampling`` | ranges of training states and torques |
-    | ``reference_ratio`` | substeps in one of the scene's own, see `reference`; else 1 |
-    | ``max_contact_points`` | about how many contact points the robot may have |
-    | ``variation`` | parameters that differ from row to row, see `vary`; None for none |
-
     Raises:
         ValueError: the model has something no NeRD can be built for (named).
     """
 
-    name: str
-    model: mujoco.MjModel
-    substeps: int
-    controller: Controller
-    sampling: Sampling
-    reference_ratio: int = 1
-    max_contact_points: int = MAX_POINTS
-    variation: Variation | None = None
+    name: str  # in the registry
+    model: mujoco.MjModel  # compiled; ``opt.timestep`` is one substep
+    substeps: int  # MuJoCo steps per control step
+    controller: Controller  # turns actions into joint torques
+    sampling: Sampling  # ranges of training states and torques
+    reference_ratio: int = 1  # substeps in one of the scene's own, see `reference`
+    max_contact_points: int = MAX_POINTS  # about how many the robot may have
+    variation: Variation | None = None  # what differs from row to row, see `vary`
 
     def __post_init__(self) -> None:
         if self.substeps < 1:

@@ -171,11 +171,9 @@ class TerrainDistance(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Distance and normal of the nearest surface, at points given in a frame.
 
-        Args:
-            points: ``(*batch, P, 3)``, m, in the frame.
-            terrain: ``(*batch, terrain.size)``, world; None for the file's own ground.
-            position: ``(*batch, 3)``, m, the frame's origin in the world.
-            rotation: ``(*batch, 3, 3)``, the frame's axes in the world.
+        The frame's origin and axes are ``position (*batch, 3)``, m, and ``rotation
+        (*batch, 3, 3)`` in the world; ``points (*batch, P, 3)``, m, are in the frame. Of
+        the ``terrain (*batch, terrain.size)`` None is the file's own.
 
         Returns:
             ``(*batch, P)``, m, negative inside; ``(*batch, P, 3)``, unit, in the frame.

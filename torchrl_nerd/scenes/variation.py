@@ -22,7 +22,6 @@ MuJoCo takes the greater friction, unless one has a higher priority, as the geom
 package's robots have. Factors are drawn log-uniform, all other values uniform.
 """
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -69,10 +68,7 @@ class Parameter:
 class Variation:
     """Named parameters of a robot and their ranges; see the table of this file.
 
-    Args:
-        model: of the robot.
-        actuated: its actuated dofs, in the order of the joint torques.
-        ranges: of each parameter.
+    ``actuated`` are the robot's actuated dofs, in the order of the joint torques.
 
     Raises:
         ValueError: in one sentence, a kind or target that is not there, a range that
@@ -191,15 +187,6 @@ class Variation:
         """Control steps by which every torque is late, whole numbers ``(rows,)``."""
         columns = [i for i, _ in self._of_kind("delay")]
         return parameters[:, columns].sum(1).astype(int)
-
-    def model_of(self, parameters: Tensor) -> mujoco.MjModel:
-        """A model of its own for one row's parameters ``(size,)``."""
-        model = copy.copy(self.model)
-        for name, value in self.fields(parameters.numpy()[None]).items():
-            owner = model.opt if name.startswith("opt.") else model
-            getattr(owner, name.removeprefix("opt."))[...] = value[0]
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-        return model
 
     def _of_kind(self, kind: str) -> Iterator[tuple[int, Parameter]]:
         return ((i, p) for i, p in enumerate(self.parameters) if p.kind == kind)

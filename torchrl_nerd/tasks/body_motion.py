@@ -22,12 +22,7 @@ class Motion(NamedTuple):
 
 
 class BodyMotion(nn.Module):
-    """`Motion` of the named bodies of a scene's robot, one pass of kinematics.
-
-    Args:
-        scene: the robot.
-        names: of bodies that move.
-    """
+    """`Motion` of the named moving bodies of a scene's robot, one pass of kinematics."""
 
     centre: Tensor  # (3, bodies, 1), m, of mass, in the body
     share: Tensor  # (bodies, 1), of the robot's mass

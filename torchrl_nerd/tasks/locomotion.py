@@ -27,34 +27,21 @@ RARE = 1e-12  # a uniform number nearer to 0 or 1 would be an infinite normal on
 
 @dataclass(frozen=True)
 class Locomotion:
-    """Numbers of one task.
+    """Numbers of one task."""
 
-    | field | meaning |
-    |---|---|
-    | ``noise`` | half width of uniform starts about the file's pose |
-    | ``ctrl_cost`` | per squared control, summed over controls |
-    | ``forward`` | reward per m/s along x |
-    | ``healthy`` | reward of a step that does not end the episode |
-    | ``height`` | open range of the base's height, m |
-    | ``angle`` | open range of a planar torso's pitch, rad |
-    | ``largest`` | open bound of all states but the place along the track |
-    | ``fastest`` | bound of the velocities that are shown |
-    | ``hidden`` | leading positions that are not shown |
-    | ``is_normal`` | velocities start as normal numbers times ``noise``, not uniform |
-    | ``by_centre`` | speed is that of the centre of mass, not of the base |
-    """
-
-    noise: float
-    ctrl_cost: float
-    forward: float = 1.0
-    healthy: float = 0.0
-    height: tuple[float, float] | None = None
-    angle: tuple[float, float] | None = None
-    largest: float = inf
-    fastest: float = inf
-    hidden: int = 1
-    is_normal: bool = False
-    by_centre: bool = False
+    noise: float  # half width of uniform starts about the file's pose
+    ctrl_cost: float  # per squared control, summed over controls
+    forward: float = 1.0  # reward per m/s along x
+    healthy: float = 0.0  # reward of a step that does not end the episode
+    height: tuple[float, float] | None = None  # open range of the base's, m
+    angle: tuple[float, float] | None = (
+        None  # open range of a planar torso's pitch, rad
+    )
+    largest: float = inf  # open bound of all states but the place along the track
+    fastest: float = inf  # bound of the velocities that are shown
+    hidden: int = 1  # leading positions that are not shown
+    is_normal: bool = False  # velocities start as normal numbers times ``noise``
+    by_centre: bool = False  # speed is that of the centre of mass, not of the base
 
 
 TASKS = {
@@ -79,9 +66,6 @@ class LocomotionTask(Task):
     Reward = forward * speed + healthy - ctrl_cost * sum(ctrl^2), where the speed is the
     mean over the step. A robot that falls ends its episode and earns no ``healthy``. An
     action of -1 to 1 spans the control range.
-
-    Args:
-        name: such as ``"gymnasium/Hopper-v5"``.
 
     Raises:
         ValueError: no such task.

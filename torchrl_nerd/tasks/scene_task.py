@@ -18,9 +18,6 @@ class SceneTask(Task):
     `Scene.sample_initial`, and has 1000 control steps. Subclass it to give a robot of your
     own a reward.
 
-    Args:
-        scene: the robot and its ground.
-
     Raises:
         ValueError: no state within the scene's ranges is clear of the ground.
 

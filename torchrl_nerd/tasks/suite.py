@@ -38,12 +38,8 @@ class SuiteTask(Task):
     in its order; an action of -1 to 1 spans the control range. A task that reads contact
     forces (hopper's feet) is shown those of the ground truth's last substep, as in the
     suite. Learned dynamics know none: there MuJoCo computes them at the state and the
-    action that led to it.
-
-    Args:
-        name: such as ``"dm_control/cheetah-run"``.
-        frame_skip: control steps over which an action is held; only the last of
-            them is judged.
+    action that led to it. Of the ``frame_skip`` control steps over which an action is held
+    only the last is judged.
 
     Raises:
         ValueError: in one sentence, no such task or something not supported.
@@ -144,13 +140,6 @@ class SuiteReward:
     written in and only what the suite reads is brought up to date. A task may be shared by
     threads: they take turns.
 
-    | attribute | meaning |
-    |---|---|
-    | ``horizon`` | control steps until the suite's time limit |
-    | ``observation_size`` | width of the suite's observation, flattened in its order |
-    | ``targets`` | geoms that it places at each reset and that touch nothing |
-    | ``forces`` | entries of ``sensordata`` that need contact forces |
-
     Raises:
         ValueError: no such task, one without a time limit, or one that changes more at
             a reset than where its targets are.
@@ -163,9 +152,11 @@ class SuiteReward:
         if not np.isfinite(env._step_limit):
             raise ValueError(f"task '{name}' has no time limit: not supported")
         self.horizon = ceil(env._step_limit)
+        # geoms that it places at each reset and that touch nothing
         self.targets = np.zeros(0, int)
         self.targets = self._moved_geoms(name)
         self.observation_size = len(self._observe())
+        # entries of sensordata that need contact forces
         needs_forces = self._model.sensor_needstage == FORCES
         self.forces = np.flatnonzero(np.repeat(needs_forces, self._model.sensor_dim))
 
@@ -253,18 +244,15 @@ class _RowMemo:
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Answers to ``rows (n, k)``; of the same n and k as last time, or all anew."""
         with _ONE_AT_A_TIME:  # one `Physics`, written in and read
-            return self._answer(rows)
-
-    def _answer(self, rows: np.ndarray) -> np.ndarray:
-        is_known = np.zeros(len(rows), bool)
-        if rows.shape == self._given.shape:  # bit for bit: NaN equals NaN
-            is_known = (rows.view(np.int64) == self._given.view(np.int64)).all(-1)
-        answers = [
-            self._answers[i] if is_known[i] else self.function(row)
-            for i, row in enumerate(rows)
-        ]
-        self._given, self._answers = rows, np.array(answers)
-        return self._answers
+            is_known = np.zeros(len(rows), bool)
+            if rows.shape == self._given.shape:  # bit for bit: NaN equals NaN
+                is_known = (rows.view(np.int64) == self._given.view(np.int64)).all(-1)
+            answers = [
+                self._answers[i] if is_known[i] else self.function(row)
+                for i, row in enumerate(rows)
+            ]
+            self._given, self._answers = rows, np.array(answers)
+            return self._answers
 
 
 @uncompiled

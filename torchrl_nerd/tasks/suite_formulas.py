@@ -19,12 +19,7 @@ X, Z = 0, 2
 
 
 class Formula(ABC):
-    """Observation and reward of one task.
-
-    Args:
-        scene: the task's robot.
-        task: its name in the domain, such as ``"walk"``.
-    """
+    """Observation and reward of one task, named as in its domain, such as ``"walk"``."""
 
     bodies: tuple[str, ...] = ()  # whose places and axes it reads
 

@@ -67,10 +67,6 @@ class Normalize(StateTransform):
     acts on ``in_keys_inv`` alone, none by default: a replay buffer calls it on whatever is
     stored. `denormalize` is the inverse of one quantity.
 
-    Args:
-        stats: key -> `Stats`.
-        in_keys_inv: keys that ``inv`` takes back, outside an env.
-
     Examples:
         >>> x = torch.randn(100, 3).double() * 5.0 + 1000.0
         >>> transform = Normalize({"x": Stats.of(x)})

@@ -66,14 +66,9 @@ class PredictedPenetration(nn.Module):
         after the step. Along unconstrained motion the cubic through depths and rates at
         both ends, accurate to 0.02 mm in the double pendulum's impacts.
 
-        Args:
-            qpos: ``(*batch, nq)``.
-            qvel: ``(*batch, nv)``.
-            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
-            gain: velocity change of unconstrained motion over the step, ``(*batch, nv)``;
-                None: at constant velocity.
-            depth: of every point now, ``(*batch, P)``, m.
-            speed: of every point along its normal now, ``(*batch, P)``, m/s.
+        ``gain (*batch, nv)`` is the velocity change of unconstrained motion over the step,
+        None: at constant velocity. Of every point now, ``depth (*batch, P)`` is in m and
+        ``speed (*batch, P)`` that along its normal, m/s.
         """
         if gain is None:
             later = integrate_pos(self.layout, qpos, self.period * qvel)
@@ -157,13 +152,10 @@ class PredictedForce(nn.Module):
     ) -> Tensor:
         """``(*batch, nv)``, N and N m; the base's six first, force before moment.
 
-        Args:
-            points: ``(*batch, P, 3)``, m, as all that follows in and relative to B_t.
-            normal: of the ground at each, ``(*batch, P, 3)``.
-            depth: at K times of the step, ``(*batch, P, K)``, m, zero beside the ground.
-            speed: along the normal, ``(*batch, P, 1)``, m/s.
-            sliding: across it, ``(*batch, P, 3)``, m/s.
-            places: of the axes' anchors and tips, ``(*batch, 2 J, 3)``, m.
+        All is given in and relative to B_t: ``points (*batch, P, 3)``, m; the ground's
+        ``normal`` at each; ``depth (*batch, P, K)`` at K times of the step, m, zero beside
+        the ground; ``speed (*batch, P, 1)`` along the normal and ``sliding (*batch, P, 3)``
+        across it, m/s; ``places (*batch, 2 J, 3)`` of the axes' anchors and tips, m.
         """
         stiffness, damping, slip, friction, merged = self.law
         # mean over the K times: (*batch, P)
