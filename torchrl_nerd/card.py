@@ -8,13 +8,7 @@ from typing import Any
 import mujoco
 import torch
 
-from torchrl_nerd import __version__
-from torchrl_nerd.configs import (
-    FeatureConfig,
-    FreeBodyConfig,
-    PenaltyContactConfig,
-    UnconstrainedConfig,
-)
+from torchrl_nerd import __version__, configs
 from torchrl_nerd.dynamics import Model
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
@@ -28,11 +22,13 @@ MAX_SIZE = 2**14  # of any number in a configuration
 KINDS: dict[str, dict[str, type]] = {
     "network": {"transformer": TransformerConfig, "mlp": MLPConfig, "gru": GRUConfig},
     "step": {
-        "unconstrained": UnconstrainedConfig,
-        "penalty-contact": PenaltyContactConfig,
-        "free-body": FreeBodyConfig,
+        "unconstrained": configs.UnconstrainedConfig,
+        "penalty-contact": configs.PenaltyContactConfig,
+        "free-body": configs.FreeBodyConfig,
     },
-    "features": {"features": FeatureConfig},  # one kind, which cards do not name
+    "features": {
+        "features": configs.FeatureConfig
+    },  # one kind, which cards do not name
 }
 """Configurations by the part of the model and the name of their kind in a card."""
 
@@ -80,11 +76,7 @@ def _described(what: str, config: Any) -> dict[str, Any]:
 
 
 def config_of(card: dict[str, Any], what: str, folder: Path) -> Any:
-    """The configuration that a card has of its ``network``, ``step`` or ``features``.
-
-    Raises:
-        ValueError: it describes none that this version can build.
-    """
+    """A card's ``network``, ``step`` or ``features``; a ValueError if none can be built."""
     found = card.get(what)
     try:
         if not isinstance(found, dict):

@@ -67,11 +67,7 @@ StepConfig = UnconstrainedConfig | PenaltyContactConfig | FreeBodyConfig
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Size and seed of a data set.
-
-    Raises:
-        SettingError: fewer than one trajectory or step.
-    """
+    """Size and seed of a data set; a SettingError for sizes below one."""
 
     trajectories: int = 10_000  # to draw; those that diverge are dropped and counted
     steps: int = 100  # control steps of each trajectory
@@ -155,11 +151,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """Settings of fine-tuning on recorded trajectories.
-
-    Raises:
-        SettingError: a value that cannot be.
-    """
+    """Settings of fine-tuning on recordings; a SettingError for a value that cannot be."""
 
     # what changes: physical parameters (physics), all weights, or the last layer (head);
     # default: physics for an analytic step, all for a network
@@ -183,10 +175,10 @@ class FinetuneConfig:
             raise SettingError(f"expected update of {known}, got '{self.update}'")
         expect_at_least(2, states=self.states)
         counts = ("evaluations", "batch_size", "sequence_length")
-        for name in (*counts, "validate_every", "patience"):
-            expect_at_least(1, **{name: getattr(self, name)})
-        for name in ("epochs", "lr", "clip", "short_history_fraction"):
-            expect_at_least(0, **{name: getattr(self, name)})
+        counts = (*counts, "validate_every", "patience")
+        numbers = ("epochs", "lr", "clip", "short_history_fraction")
+        for least, names in ((1, counts), (0, numbers)):
+            expect_at_least(least, **{name: getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,7 @@ def _plain(content: Any) -> Any:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        ValueError: the file holds something else, said in one sentence.
-    """
+    """Read a JSON object; a ValueError where the file holds something else."""
     if not path.is_file():  # a device would be read without end
         raise ValueError(f"expected JSON in {path}, found no file")
     try:
@@ -96,11 +92,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a file that cannot be written; nothing is made or changed.
-
-    Raises:
-        ValueError: in one sentence, why it cannot be written.
-    """
+    """Raise a ValueError where a file cannot be written; nothing is made or changed."""
     try:
         if path.is_dir():
             raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
@@ -111,11 +103,7 @@ def check_writable(path: Path) -> None:
 
 
 def writable_folder(path: Path) -> Path:
-    """Create a folder, or say in one sentence why it cannot be written.
-
-    Raises:
-        ValueError: a file stands there, or permission is missing.
-    """
+    """Create a folder, or raise a ValueError that says why it cannot be written."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=path).close()

@@ -192,11 +192,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Begin the next episode, or with a seed the first of its stream.
-
-        Raises:
-            ValueError: options, of which there are none.
-        """
+        """Begin the next episode, or with a seed the first; ValueError for any options."""
         super().reset(seed=seed)
         if options:
             raise ValueError(f"expected no options, got {sorted(options)}")

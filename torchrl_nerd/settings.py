@@ -15,22 +15,14 @@ class SettingError(ValueError):
 
 
 def expect_at_least(least: float, **settings: float) -> None:
-    """Refuse settings below ``least``.
-
-    Raises:
-        SettingError: naming the first such setting.
-    """
+    """Raise a SettingError that names the first setting below ``least``."""
     for name, value in settings.items():
         if not value >= least:  # NaN is not either
             raise SettingError(f"expected {name} of at least {least}, got {value}")
 
 
 def expect_count(least: int, **settings: object) -> None:
-    """Refuse settings that are no whole numbers of at least ``least``.
-
-    Raises:
-        SettingError: naming the first such setting.
-    """
+    """Raise a SettingError for what is no whole number of at least ``least``."""
     for name, value in settings.items():
         is_number = isinstance(value, Integral) and not isinstance(value, bool)
         if not is_number or int(value) < least:  # pyright: ignore
@@ -46,11 +38,7 @@ def did_you_mean(name: str, known: Iterable[str], first: Sequence[str] = ()) -> 
 
 
 def look_up(what: str, name: str, known: Mapping[str, Value]) -> Value:
-    """The entry of that name.
-
-    Raises:
-        SettingError: there is none; it lists those that there are.
-    """
+    """The entry of that name, or a SettingError that lists those that there are."""
     if name not in known:
         names = ", ".join(known)
         raise SettingError(f"unknown {what} '{name}', expected one of {names}")

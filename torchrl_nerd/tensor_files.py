@@ -15,11 +15,7 @@ LFS_POINTER = b"version https://git-lfs"
 def write_tensors(
     path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None
 ) -> None:
-    """Replace the file by these tensors of any device; ``about``: words kept with them.
-
-    Raises:
-        ValueError: it cannot be written, said in one sentence.
-    """
+    """Replace the file by these tensors, with words ``about`` them, or raise ValueError."""
     copies = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
     # save_file would leave a file of its own if it is killed
     content = save(copies, dict(about or {}))
@@ -27,11 +23,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file by name, on the processor.
-
-    Raises:
-        ValueError: in one sentence, no file there, or something else in it.
-    """
+    """The tensors of a file by name, on the processor; a ValueError if it has none."""
     if not path.is_file():
         raise ValueError(f"expected tensors in {path}, found no file")
     with open(path, "rb") as file:

@@ -39,11 +39,7 @@ STEPS: dict[str, StepConfig] = {
 
 
 def step_config(name: str) -> StepConfig:
-    """The configuration of that name in `STEPS`.
-
-    Raises:
-        SettingError: no such step.
-    """
+    """The configuration of that name in `STEPS`; a SettingError where there is none."""
     return look_up("analytic step", name, STEPS)
 
 

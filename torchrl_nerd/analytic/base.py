@@ -76,11 +76,7 @@ class AnalyticStep(nn.Module, ABC):
 
 
 def check_supported(scene: Scene) -> None:
-    """Refuse a scene with forces that no analytic step models.
-
-    Raises:
-        ValueError: in one sentence, naming all of them.
-    """
+    """Raise a ValueError that names all forces which no analytic step models."""
     model = scene.model
     kinds = {geom_kind(model, geom) for geom in touching_geoms(model)}
     names = ("armature", "damping", "dampingpoly")

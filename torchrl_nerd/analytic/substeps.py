@@ -21,14 +21,7 @@ from torchrl_nerd.analytic.frozen_dynamics import DynamicsEvaluation, FrozenDyna
 from torchrl_nerd.geometry.base import JointAxes, keep_constants, keep_indices
 from torchrl_nerd.geometry.motion import cross
 from torchrl_nerd.geometry.spd import matvec
-from torchrl_nerd.scenes.penalty_law import (
-    PenaltyLaw,
-    friction_force,
-    limit_forces,
-    limit_stiffness,
-    normal_force,
-)
-from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes import Scene, penalty_law
 
 MIN_SLIP = 1e-6  # m/s: keeps the direction of slip defined at rest
 
@@ -69,7 +62,7 @@ class SubstepIntegrator(nn.Module):
                 "expected elliptic friction cones, got pyramidal ones in scene "
                 f"'{scene.name}'"
             )
-        law = PenaltyLaw.of_bodies(model, points.bodies)
+        law = penalty_law.PenaltyLaw.of_bodies(model, points.bodies)
         # share of the tangential force beyond the cone that becomes normal force
         share = law.friction / model.opt.impratio
         scale = 1.0 / (1.0 + law.friction * share)
@@ -77,7 +70,7 @@ class SubstepIntegrator(nn.Module):
         joints = np.flatnonzero(model.jnt_limited[axes.joints])
         ids = [axes.joints[joint] for joint in joints]
         low, high = model.jnt_range[ids].T
-        springs = limit_stiffness(model, ids) if ids else (low, low)
+        springs = penalty_law.limit_stiffness(model, ids) if ids else (low, low)
         limited = (2 * self.num_base_dofs + joints).tolist()
         dofs = [*evaluation.jacobian_dofs.tolist(), *limited]
         scatter = np.zeros((model.nv, len(dofs)))  # adds columns to their dofs
@@ -165,17 +158,18 @@ class SubstepIntegrator(nn.Module):
         stick_force = slip_damping * slip_speed
         on_cone = (scale * (spring + share * stick_force)).clamp_min(0.0)
         on_cone = torch.where(depth > 0.0, on_cone, 0.0)
-        pressed = normal_force(stiffness, damping, depth, rising)
+        pressed = penalty_law.normal_force(stiffness, damping, depth, rising)
         is_sliding = stick_force > friction * spring
         pressed = merged * torch.where(is_sliding, on_cone, pressed)
-        drag = friction_force(merged * slip_damping, friction, pressed, slip_speed)
+        sticking = merged * slip_damping
+        drag = penalty_law.friction_force(sticking, friction, pressed, slip_speed)
         return pressed * normal - (drag / slip_speed) * slip
 
     def _limit_force(self, position: Tensor, velocity: Tensor) -> Tensor:
         """Torques ``(L, N)``, N m or N, of the joints that have limits."""
         stiffness, damping, low, high = self.limit_law.to(position)
         law = stiffness, damping, low, high
-        below, above = limit_forces(*law, position, velocity)
+        below, above = penalty_law.limit_forces(*law, position, velocity)
         return below.clamp_min(0.0) + above.clamp_max(0.0)
 
     def _composed(self, moved: Tensor, further: Tensor) -> Tensor:

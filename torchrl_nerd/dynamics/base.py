@@ -1,12 +1,17 @@
 """The interface of all dynamics: state, torque and controls in, next state out."""
 
+from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
+import mujoco
 import numpy as np
-from tensordict import TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
+from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 
 
@@ -98,6 +103,59 @@ class Memoryless:
 
     def restore(self, history: object, rows: Tensor) -> None:
         """See `Dynamics.restore`; there is no past."""
+
+
+class Engine(ABC):
+    """`Dynamics` of the ground truth.
+
+    With ``ctrl`` the robot's own actuators act in every substep. Without it they are off,
+    and the joint torque is held.
+    """
+
+    kind = "ground truth"
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.has_actuators = isinstance(scene.controller, ActuatorController)
+        # sensors that need forces, such as touch
+        self.feels_forces = mujoco.mjtStage.mjSTAGE_ACC in scene.model.sensor_needstage
+
+    @torch.no_grad()
+    @uncompiled
+    def step(
+        self,
+        state: TensorDictBase,
+        joint_torque: Tensor,
+        terrain: Tensor | None = None,
+        ctrl: Tensor | None = None,
+    ) -> TensorDictBase:
+        """See `Dynamics.step`. Envs that cannot be stepped come back as NaN."""
+        check_step(self.scene, state, joint_torque, terrain, ctrl)
+        command = self._command(joint_torque, ctrl)
+        values = self._step(state, command, terrain)
+        if PARAMETERS in state.keys():
+            values[PARAMETERS] = state[PARAMETERS]
+        return TensorDict(values, [len(command)]).to(state[QPOS].device)
+
+    def _command(self, joint_torque: Tensor | None, ctrl: Tensor | None) -> Tensor:
+        """What is held; begins anew where actuators have to be switched on or off."""
+        command = joint_torque if ctrl is None else ctrl
+        if command is None:
+            raise ValueError("expected a joint torque or ctrl, got neither")
+        if self.has_actuators != (ctrl is not None):
+            self.has_actuators = ctrl is not None
+            self._restart()
+        return command
+
+    @abstractmethod
+    def _restart(self) -> None:
+        """Begin anew with or without actuators."""
+
+    @abstractmethod
+    def _step(
+        self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
+    ) -> dict[str, Tensor]:
+        """Next ``qpos`` and ``qvel``, and ``sensordata`` where the model feels forces."""
 
 
 def as_numpy(x: Tensor) -> np.ndarray:

@@ -6,19 +6,17 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.dynamics.base import (
+    Engine,
     as_numpy,
-    check_step,
     ground_pose,
     refuse_variation,
 )
-from torchrl_nerd.dynamics.mujoco import engine_model, feels_forces
+from torchrl_nerd.dynamics.mujoco import engine_model
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
-from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -38,7 +36,7 @@ def make_physics(scene: Scene, has_actuators: bool) -> "Physics":
     return Physics.from_model(wrapper.MjModel(engine_model(scene, has_actuators)))
 
 
-class DMControlDynamics:
+class DMControlDynamics(Engine):
     """The same envs on dm_control `Physics` objects, bit for bit what it would give.
 
     An env whose state is the one its `Physics` was left in goes on from there, as an
@@ -50,12 +48,9 @@ class DMControlDynamics:
         ValueError: a scene whose parameters differ from row to row.
     """
 
-    kind = "ground truth"
-
     def __init__(self, scene: Scene) -> None:
         refuse_variation(scene, "dm_control")
-        self.scene = scene
-        self._has_actuators = isinstance(scene.controller, ActuatorController)
+        super().__init__(scene)
         self._rows: list[Physics] = []
 
     def __getstate__(self) -> dict:
@@ -64,12 +59,15 @@ class DMControlDynamics:
 
     def __setstate__(self, state: dict) -> None:
         past = state.pop("_rows")
-        self.__dict__.update(state)
+        vars(self).update(state)
         self._rows = [self._new() for _ in past]
         self.restore(past, torch.ones(len(past), dtype=torch.bool))
 
     def _new(self) -> "Physics":
-        return make_physics(self.scene, self._has_actuators)
+        return make_physics(self.scene, self.has_actuators)
+
+    def _restart(self) -> None:
+        self._rows = []
 
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Return the `Physics` of ``rows (num_envs,)`` to the state a new one has."""
@@ -101,21 +99,11 @@ class DMControlDynamics:
             mujoco.mj_setState(*where, history[row], INTEGRATED)
             mujoco.mj_step1(*where)  # with which `Physics` ends a step
 
-    @uncompiled
-    def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
-        ctrl: Tensor | None = None,
-    ) -> TensorDictBase:
-        """See `Dynamics.step`. Envs on which MuJoCo gave up come back as NaN."""
-        check_step(self.scene, state, joint_torque, terrain, ctrl)
-        if self._has_actuators != (ctrl is not None):
-            self._has_actuators, self._rows = ctrl is not None, []
-        if len(self._rows) != len(joint_torque):
+    def _step(
+        self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
+    ) -> dict[str, Tensor]:
+        if len(self._rows) != len(command):
             self.reset(state)
-        command = joint_torque if ctrl is None else ctrl
         qpos, qvel, told = (as_numpy(x) for x in (state[QPOS], state[QVEL], command))
         pose = ground_pose(self.scene, terrain)
         poses = [None] * len(qpos) if pose is None else as_numpy(pose)
@@ -123,7 +111,7 @@ class DMControlDynamics:
         felt = np.empty((len(qpos), self.scene.model.nsensordata))
         for row, physics in enumerate(self._rows):
             _place(physics, qpos[row], qvel[row], poses[row])
-            if self._has_actuators:
+            if self.has_actuators:
                 physics.set_control(told[row])
             else:
                 physics.data.qfrc_applied[self.scene.actuated] = told[row]
@@ -134,10 +122,9 @@ class DMControlDynamics:
             next_qvel[row] = np.nan if is_broken else physics.data.qvel
             felt[row] = physics.data.sensordata
         values = {QPOS: next_qpos, QVEL: next_qvel}
-        if feels_forces(self.scene):
+        if self.feels_forces:
             values[SENSORDATA] = felt
-        after = {key: torch.from_numpy(value) for key, value in values.items()}
-        return TensorDict(after, [len(qpos)]).to(state[QPOS].device)
+        return {key: torch.from_numpy(value) for key, value in values.items()}
 
 
 def _place(

@@ -12,11 +12,9 @@ from mujoco.batch import Batch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import as_numpy, check_step, ground_pose
+from torchrl_nerd.dynamics.base import Engine, as_numpy, check_step, ground_pose
 from torchrl_nerd.dynamics.row_parameters import RowParameters
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, SENSORDATA
-from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import silence_mujoco
 from torchrl_nerd.settings import expect_count
@@ -34,18 +32,8 @@ def engine_model(scene: Scene, has_actuators: bool) -> mujoco.MjModel:
     return model
 
 
-def feels_forces(scene: Scene) -> bool:
-    """Whether the model has sensors that need forces, such as touch."""
-    stages = scene.model.sensor_needstage
-    return bool((stages == mujoco.mjtStage.mjSTAGE_ACC).any())
-
-
 def default_threads() -> int:
-    """``NERD_THREADS`` for workers that share a machine, or all processors allowed.
-
-    Raises:
-        ValueError: the variable holds no number of threads.
-    """
+    """``NERD_THREADS`` or all processors allowed; a ValueError if it is no number."""
     try:
         allowed = len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
@@ -56,11 +44,10 @@ def default_threads() -> int:
     return int(said)
 
 
-class MujocoDynamics:
+class MujocoDynamics(Engine):
     """MuJoCo itself, substeps and threads in C, no Python loop over envs.
 
-    With ``ctrl`` a step is ``mj_step`` itself, substep by substep, to the last bit: the
-    robot's own actuators act. Without it they are off, and the joint torque is held. The
+    With ``ctrl`` a step is ``mj_step`` itself, substep by substep, to the last bit. The
     solver's warm start is carried from step to step, as ``mj_step`` does (it changes
     results by less than the solver's tolerance), and cleared for envs that are reset.
     Where the scene varies, each env has the ``parameters`` of its state; without any all
@@ -71,13 +58,10 @@ class MujocoDynamics:
         ValueError: a number of threads below 1.
     """
 
-    kind = "ground truth"
-
     def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
-        self.scene = scene
+        super().__init__(scene)
         self.num_threads = default_threads() if num_threads is None else num_threads
         expect_count(1, num_threads=self.num_threads)
-        self._has_actuators = isinstance(scene.controller, ActuatorController)
         self._start(np.zeros((0, scene.model.nv)))
 
     def _start(self, warmstart: np.ndarray, late: np.ndarray | None = None) -> None:
@@ -90,7 +74,7 @@ class MujocoDynamics:
         size = 1 + longest, max(len(scene.actuated), scene.model.nu)
         self._late = np.zeros((rows, *size)) if late is None else late
         self._own: RowParameters | None = None
-        self._model = engine_model(self.scene, self._has_actuators)
+        self._model = engine_model(self.scene, self.has_actuators)
         self._batch: Batch | None = None
         self._warmstart = warmstart
         if len(warmstart):
@@ -126,26 +110,17 @@ class MujocoDynamics:
         for past, then in zip(pasts, history, strict=True):
             past[mask] = then[mask] if len(then) == len(mask) else 0.0
 
-    @uncompiled
-    def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
-        ctrl: Tensor | None = None,
-    ) -> TensorDictBase:
-        """See `Dynamics.step`. Envs that MuJoCo gave up on come back as NaN."""
-        controls = None if ctrl is None else ctrl[:, None]
-        states = self.rollout(state, joint_torque[:, None], terrain, controls)
-        last = TensorDict({k: x[:, 0] for k, x in states.items()}, len(joint_torque))
-        if feels_forces(self.scene):
+    def _step(
+        self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
+    ) -> dict[str, Tensor]:
+        moved = self._roll(state, command[:, None], terrain)
+        values = {key: x[:, 0] for key, x in moved.items()}
+        if self.feels_forces:
             felt = np.zeros((0, self._model.nsensordata))
             if self._batch is not None:
                 felt = self._batch.bind("sensordata").copy()
-            last[SENSORDATA] = torch.from_numpy(felt)
-        if PARAMETERS in state.keys():
-            last[PARAMETERS] = state[PARAMETERS]
-        return last.to(state[QPOS].device)
+            values[SENSORDATA] = torch.from_numpy(felt)
+        return values
 
     def rollout(
         self,
@@ -167,16 +142,19 @@ class MujocoDynamics:
         Raises:
             ValueError: a shape that is not the scene's, or a ground that is not finite.
         """
-        command = joint_torque if ctrl is None else ctrl
-        if command is None:
-            raise ValueError("expected a joint torque or ctrl, got neither")
-        rows, length = command.shape[:2]
-        if length:
-            torque, now = (None if x is None else x[:, 0] for x in (joint_torque, ctrl))
+        given = joint_torque, ctrl
+        if all(x is None or x.shape[1] for x in given):
+            torque, now = (None if x is None else x[:, 0] for x in given)
             check_step(self.scene, state, torque, terrain, now)
-        if self._has_actuators != (ctrl is not None):
-            self._has_actuators = ctrl is not None
-            self._start(*self.history())
+        commands = self._command(*given)
+        moved = self._roll(state, commands, terrain)
+        return TensorDict(moved, commands.shape[:2]).to(state[QPOS].device)
+
+    def _roll(
+        self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
+    ) -> dict[str, Tensor]:
+        """``qpos`` and ``qvel`` after each of the commands ``(rows, T, m)``."""
+        rows, length = command.shape[:2]
         if len(self._warmstart) != rows:
             self.reset(state)
         qpos = np.empty((rows, length, self._model.nq))
@@ -190,8 +168,10 @@ class MujocoDynamics:
             for t in range(length):
                 self._advance(batch, commands[:, t], is_whole)
                 qpos[:, t], qvel[:, t] = batch.bind(QPOS), batch.bind(QVEL)
-        values = {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
-        return TensorDict(values, [rows, length]).to(state[QPOS].device)
+        return {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
+
+    def _restart(self) -> None:
+        self._start(*self.history())
 
     def _vary(self, batch: Batch, state: TensorDictBase) -> Batch:
         """The batch, every simulation with the parameters of its state if there are any."""
@@ -199,7 +179,7 @@ class MujocoDynamics:
         if variation is None or (given is None and self._own is None):
             return batch
         if given is None:  # the scene's own robot again
-            self._start(*self.history())
+            self._restart()
             assert self._batch is not None  # for the type checker: it has rows
             return self._batch
         if self._own is None:
@@ -222,8 +202,8 @@ class MujocoDynamics:
     def _advance(self, batch: Batch, command: np.ndarray, is_whole: np.ndarray) -> None:
         """One control step; a simulation with a warning is NaN, and whole no longer."""
         if self._own is not None:
-            command = self._own.applied(command, self._late, self._has_actuators)
-        if self._has_actuators:
+            command = self._own.applied(command, self._late, self.has_actuators)
+        if self.has_actuators:
             batch.bind("ctrl")[:] = command
         else:
             batch.bind("qfrc_applied")[:, self.scene.actuated] = command
@@ -249,7 +229,7 @@ def _restart_all() -> None:
     for dynamics in list(_STARTED):
         if dynamics._batch is not None:
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(dynamics._batch))
-            dynamics._start(*dynamics.history())
+            dynamics._restart()
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows

@@ -7,14 +7,12 @@ from typing import Any, cast
 
 import mujoco
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.dynamics.base import check_step, ground_pose, refuse_variation
-from torchrl_nerd.dynamics.mujoco import engine_model, feels_forces
+from torchrl_nerd.dynamics.base import Engine, ground_pose, refuse_variation
+from torchrl_nerd.dynamics.mujoco import engine_model
 from torchrl_nerd.keys import QPOS, QVEL, SENSORDATA
-from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 
 LARGEST = 1e10  # m, rad, m/s, rad/s: MuJoCo's mjMAXVAL, beyond which it gives up
@@ -22,7 +20,7 @@ CONTACTS_PER_PAIR = 8  # of two geoms, two boxes at most; MuJoCo Warp has no mor
 CONTACTS_PER_HEIGHT_FIELD = 50  # of it and another geom, MuJoCo's mjMAXCONPAIR
 
 
-class MujocoWarpDynamics:
+class MujocoWarpDynamics(Engine):
     """MuJoCo Warp: states stay on the device, one launch of kernels for all envs.
 
     States are float64 like everywhere, but Warp computes in float32: a step agrees with
@@ -44,8 +42,6 @@ class MujocoWarpDynamics:
         ValueError: a model or a device that Warp cannot step on (named).
     """
 
-    kind = "ground truth"
-
     def __init__(
         self,
         scene: Scene,
@@ -54,12 +50,12 @@ class MujocoWarpDynamics:
         is_capturing: bool = True,
     ) -> None:
         refuse_variation(scene, "MuJoCo Warp")
-        self.scene, self.device = scene, torch.device(device)
+        super().__init__(scene)
+        self.device = torch.device(device)
         self.max_contacts, self.is_capturing = max_contacts, is_capturing
-        self.has_actuators = isinstance(scene.controller, ActuatorController)
-        self._start()
+        self._restart()
 
-    def _start(self) -> None:
+    def _restart(self) -> None:
         self._warp, self._engine = _import_warp()
         try:
             self._place = self._warp.device_from_torch(self.device)
@@ -90,14 +86,15 @@ class MujocoWarpDynamics:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is on the device does not travel, but for the warm start."""
-        kept = ("scene", "device", "max_contacts", "is_capturing", "has_actuators")
+        kept = ("scene", "device", "max_contacts", "is_capturing")
+        kept = (*kept, "has_actuators", "feels_forces")
         warmstart = self._view("qacc_warmstart").cpu() if self._rows else None
         return {name: self.__dict__[name] for name in kept} | {"warmstart": warmstart}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         warmstart = state.pop("warmstart")
-        self.__dict__.update(state)
-        self._start()
+        vars(self).update(state)
+        self._restart()
         if warmstart is not None:
             self._allocate(len(warmstart))
             self._view("qacc_warmstart").copy_(warmstart)
@@ -119,25 +116,13 @@ class MujocoWarpDynamics:
         mask, now = rows.to(self.device), self._view("qacc_warmstart")
         now[mask] = 0.0 if history is None else history[mask]
 
-    @torch.no_grad()
-    @uncompiled
-    def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
-        ctrl: Tensor | None = None,
-    ) -> TensorDictBase:
-        """See `Dynamics.step`. Envs that cannot be stepped come back as NaN."""
-        check_step(self.scene, state, joint_torque, terrain, ctrl)
-        if self.has_actuators != (ctrl is not None):
-            self.has_actuators = ctrl is not None
-            self._start()
-        if len(joint_torque) != self._rows:
-            self._allocate(len(joint_torque))
+    def _step(
+        self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
+    ) -> dict[str, Tensor]:
+        if len(command) != self._rows:
+            self._allocate(len(command))
         if not self._rows:
-            return TensorDict({key: state[key].double() for key in (QPOS, QVEL)}, [0])
-        command = joint_torque if ctrl is None else ctrl
+            return {key: state[key].double() for key in (QPOS, QVEL)}
         is_broken = ~self._write(state, command, terrain)
         self._advance()
         moved = torch.cat((self._view(QPOS), self._view(QVEL)), -1)
@@ -147,9 +132,9 @@ class MujocoWarpDynamics:
             key: self._view(key).double().masked_fill(is_broken[:, None], torch.nan)
             for key in (QPOS, QVEL)
         }
-        if feels_forces(self.scene):
+        if self.feels_forces:
             values[SENSORDATA] = self._view("sensordata").double()
-        return TensorDict(values, [self._rows]).to(state[QPOS].device)
+        return values
 
     def _write(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None

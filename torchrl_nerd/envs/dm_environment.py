@@ -47,11 +47,7 @@ class DmEnvironment(dm_env.Environment):
         return dm_env.restart(self.env.reset()[OBSERVATION][0].cpu().numpy())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Act, or begin an episode where none is under way.
-
-        Raises:
-            ValueError: an action of another shape.
-        """
+        """Act, or begin an episode where none is; ValueError for another shape."""
         if self._is_over:
             return self.reset()
         given = torch.as_tensor(np.asarray(action), dtype=torch.float32)

@@ -65,11 +65,7 @@ def _renders(name: str) -> bool:
 
 
 def require_gl() -> str:
-    """The library of `find_gl`.
-
-    Raises:
-        ValueError: none works; what to install.
-    """
+    """The library of `find_gl`, or a ValueError that says what to install."""
     name = find_gl()
     if name is None:
         raise ValueError(
@@ -161,20 +157,20 @@ class Renderer:
             self._gl[height, width] = self._make_gl(height, width)
         renderer = self._gl[height, width]
         images = np.empty((len(state[QPOS]), height, width, 3), np.uint8)
-        for i in range(len(images)):
-            row = {key: value[i : i + 1] for key, value in state.items()}
+        for i, image in enumerate(images):
+            row = {key: value[i] for key, value in state.items()}
             self._draw(row, renderer, camera)
-            renderer.render(out=images[i])
+            renderer.render(out=image)
         return images
 
     def _draw(self, row: State, renderer: "mujoco.Renderer", camera: Camera) -> None:
         model, data, scene = self._model, self._data, self.task.scene
-        data.qpos[:] = as_numpy(row[QPOS][0])
+        data.qpos[:] = as_numpy(row[QPOS])
         pose = ground_pose(scene, row.get(TERRAIN))
         if pose is not None:
-            position, turn = np.split(as_numpy(pose[0]), [3 * scene.model.nmocap])
+            position, turn = np.split(as_numpy(pose), [3 * scene.model.nmocap])
             data.mocap_pos.flat, data.mocap_quat.flat = position, turn
-        self.task.show(model, data, {key: value[0] for key, value in row.items()})
+        self.task.show(model, data, row)
         mujoco.mj_fwdPosition(model, data)
         if scene.base.is_floating and not isinstance(camera, int | str):
             camera.lookat[:] = data.subtree_com[scene.base.body]
@@ -185,7 +181,7 @@ class Renderer:
                 seen.geoms[seen.ngeom],
                 mujoco.mjtGeom.mjGEOM_SPHERE,
                 np.full(3, GOAL_RADIUS),
-                as_numpy(row[GOAL][0]),
+                as_numpy(row[GOAL]),
                 np.eye(3).ravel(),
                 np.array(GOAL_COLOR, np.float32),
             )

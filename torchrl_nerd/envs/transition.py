@@ -48,9 +48,8 @@ class Transition:
 
     # the dynamics has compiled code of its own, and `step` compiles to what is round it
     is_round = False
-    is_whole = (
-        True  # all control steps of an action are one compiled piece, not one each
-    )
+    # all control steps of an action are one compiled piece, not one each
+    is_whole = True
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         self.task, self.dynamics = task, dynamics

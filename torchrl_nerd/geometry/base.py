@@ -14,7 +14,7 @@ from torchrl_nerd.geometry.rotations import matrix_from_quat, quat_matrix
 
 # a scene keeps them: they must not be inference tensors, whoever asks first
 @torch.inference_mode(False)
-def keep_constants(module: nn.Module, dtype: type = np.float64, **values: Any) -> None:
+def keep_constants(module: nn.Module, dtype: Any = np.float64, **values: Any) -> None:
     """Keep copies as buffers: they move with the module, checkpoints omit them."""
     for name, value in values.items():
         tensor = torch.from_numpy(np.array(value, dtype, order="C"))
@@ -44,11 +44,7 @@ class Base:
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel) -> "Base":
-        """Find the base.
-
-        Raises:
-            ValueError: nothing in the model can move.
-        """
+        """Find the base; a ValueError where nothing in the model can move."""
         if not model.njnt:
             raise ValueError("no joint")
         roots = [model.body_treeid.tolist().index(tree) for tree in range(model.ntree)]

@@ -97,7 +97,8 @@ class NeRD(nn.Module):
         self.scene_features = scene_features or SceneFeatures(scene, features)
         self.state_delta = state_delta or StateDelta(scene)
         num_features, num_outputs = self.scene_features.size, self.state_delta.size
-        unit = {TOKEN: Stats.unit(num_features), TARGET: Stats.unit(num_outputs)}
+        sizes: dict[NestedKey, int] = {TOKEN: num_features, TARGET: num_outputs}
+        unit = {key: Stats.unit(size) for key, size in sizes.items()}
         self.normalize = Normalize(stats or unit)
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)

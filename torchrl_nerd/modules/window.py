@@ -1,17 +1,19 @@
 """A network that recomputes its last tokens at every step, as NeRD section 3.4 does."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.modules.transformer import stored
 
 
+@dataclass
 class TokenWindow:
-    """The last ``size`` tokens of every row, left-aligned: a row's first is at index 0."""
+    """The last tokens of every row, left-aligned: a row's first is at index 0."""
 
-    def __init__(self, rows: int, size: int, width: int, like: Tensor) -> None:
-        self.tokens = like.new_zeros(rows, size, width)
-        self.age = torch.zeros(rows, dtype=torch.long, device=like.device)
+    tokens: Tensor  # (rows, size, width)
+    age: Tensor  # (rows,): tokens seen since the row's reset, at most size
 
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
@@ -21,9 +23,7 @@ class TokenWindow:
 
     def __copy__(self) -> "TokenWindow":
         """Apart from the original, which is written to in place."""
-        twin = object.__new__(TokenWindow)
-        twin.tokens, twin.age = self.tokens.clone(), self.age.clone()
-        return twin
+        return TokenWindow(self.tokens.clone(), self.age.clone())
 
     def restore(self, past: "TokenWindow", rows: Tensor) -> None:
         """See `History.restore`."""
@@ -54,7 +54,8 @@ class WindowNetwork(nn.Module):
     def empty_memory(self, rows: int) -> TokenWindow:
         """A window without tokens."""
         weight = next(self.network.parameters())
-        return TokenWindow(rows, self.size, self.width, weight)
+        age = torch.zeros(rows, dtype=torch.long, device=weight.device)
+        return TokenWindow(weight.new_zeros(rows, self.size, self.width), age)
 
     def step(self, token: Tensor, memory: TokenWindow) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""

@@ -45,9 +45,6 @@ def register(robot: Robot) -> None:
     Nothing is built yet: a scene or task is, when its name is first asked for. Commands
     and worker processes find a robot whose module ``NERD_ROBOTS`` names.
 
-    Args:
-        robot: its scenes, and tasks, presets, models and policies of these.
-
     Raises:
         TypeError: no robot, or a field that holds something else than it should.
         ValueError: a name that is taken, or does not go with the scenes.

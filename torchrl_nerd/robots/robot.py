@@ -14,6 +14,11 @@ Source = Task | Scene
 """Whose starts and controller a rollout has: a task's, or a scene's sampling ranges."""
 
 
+# As in the paper's reference code (rl_games), except that its step size follows the
+# policy's KL divergence; here it falls linearly.
+WALKING_PPO = PPOConfig(num_envs=2048, minibatch=16_384, lr=3e-4, widths=(128, 64, 32))
+
+
 @dataclass(frozen=True)
 class EvaluationProtocol:
     """Open-loop rollouts that measure a scene.

@@ -121,10 +121,8 @@ def _constructor_defaults(entry_point: str) -> tuple[dict[str, Any], Path]:
     folders = found.submodule_search_locations if found else None
     source = Path(folders[0], *rest).with_suffix(".py") if folders else Path()
     tree = ast.parse(source.read_text(encoding="utf-8") if source.is_file() else "")
-    kinds = (
-        x for x in ast.walk(tree) if isinstance(x, ast.ClassDef) and x.name == name
-    )
-    for part in (part for kind in kinds for part in kind.body):
+    classes = (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    for part in (part for node in classes if node.name == name for part in node.body):
         if isinstance(part, ast.FunctionDef) and part.name == "__init__":
             names, values = part.args.args, part.args.defaults
             pairs = zip(names[len(names) - len(values) :], values, strict=True)

@@ -78,9 +78,8 @@ class OperationalSpaceController:
         self.kp, self.kd, self.scale, self.home = kp, kd, scale, home
         self.limit, self.center, self.relative_to = limit, center, relative_to
         self.home_kp, self.home_kd, self.max_mass = home_kp, home_kd, max_mass
-        self.actuated = driven_dofs(model)
+        self.actuated, base = driven_dofs(model), Base.from_model(model)
         self._check(model)
-        base = Base.from_model(model)
         if base.is_floating:
             raise ValueError("expected an arm on a fixed base, got a floating one")
         axes = JointAxes.of(model, base)

@@ -35,13 +35,8 @@ class Kind:
     target: str  # a kind of MuJoCo's objects; "axis", or "" where there is none
     unit: str  # "factor" for a factor
     write: Write | None = None  # None: not by itself
-    least: float = -np.inf  # of its values; of a factor, above zero
+    least: float = -np.inf  # of the values that a robot can have
     most: float = np.inf
-
-    @property
-    def lowest(self) -> float:
-        """The lowest value that a robot can have."""
-        return float(np.nextafter(0.0, 1.0)) if self.unit == "factor" else self.least
 
 
 def _times(*names: str) -> Write:
@@ -110,8 +105,9 @@ MOTOR = _times("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 """What makes the strength of actuators times the value."""
 
 STEEPEST = 1.5  # rad: gravity turns by less than a right angle
+TINIEST = 5e-324  # a factor is above zero
 KINDS = {
-    "mass": Kind("body", "factor", _times("body_mass", "body_inertia")),
+    "mass": Kind("body", "factor", _times("body_mass", "body_inertia"), TINIEST),
     "com_x": Kind("body", "m", _plus("body_ipos", 0)),
     "com_y": Kind("body", "m", _plus("body_ipos", 1)),
     "com_z": Kind("body", "m", _plus("body_ipos", 2)),
@@ -120,10 +116,10 @@ KINDS = {
     "damping": Kind("joint", "N s/m or N m s/rad", _to("dof_damping"), 0.0),
     "frictionloss": Kind("joint", "N or N m", _to("dof_frictionloss"), 0.0),
     "armature": Kind("joint", "kg or kg m^2", _to("dof_armature"), 0.0),
-    "motor": Kind("joint", "factor"),
+    "motor": Kind("joint", "factor", least=TINIEST),
     "delay": Kind("", "control steps", least=0.0),
-    "friction": Kind("geom", "factor", _times("geom_friction")),
-    "stiffness": Kind("geom", "factor", _stiffness),
+    "friction": Kind("geom", "factor", _times("geom_friction"), TINIEST),
+    "stiffness": Kind("geom", "factor", _stiffness, TINIEST),
     "slope": Kind("axis", "rad", _slope, -STEEPEST, STEEPEST),
 }
 """By name, in the order in which they change a model."""

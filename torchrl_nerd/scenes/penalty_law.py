@@ -78,16 +78,16 @@ def set_penalty_contact(
 
 
 def set_penalty_limit(
-    model: mujoco.MjModel, joint: str, *, ke: float, kd: float
+    model: mujoco.MjModel, *joints: str, ke: float, kd: float
 ) -> None:
-    """Give a limited joint a spring and damper that act beyond its range.
+    """Give limited joints a spring and damper that act beyond their ranges.
 
     As `set_penalty_contact`; ``ke`` in N/m or N m/rad, ``kd`` in N s/m or N m s/rad.
     """
-    index = model.joint(joint).id
-    inverse_mass = model.dof_invweight0[model.jnt_dofadr[index]]
-    model.jnt_solref[index] = (-ke * inverse_mass, -kd * inverse_mass)
-    model.jnt_solimp[index] = SOLIMP
+    for index in (model.joint(joint).id for joint in joints):
+        inverse_mass = model.dof_invweight0[model.jnt_dofadr[index]]
+        model.jnt_solref[index] = (-ke * inverse_mass, -kd * inverse_mass)
+        model.jnt_solimp[index] = SOLIMP
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,7 @@ class PenaltyLaw:
 
     @classmethod
     def of_bodies(cls, model: mujoco.MjModel, bodies: list[int]) -> "PenaltyLaw":
-        """The law of the contacts of each body, the inverse of `set_penalty_contact`.
-
-        Raises:
-            ValueError: a body whose shapes follow another law.
-        """
+        """The law of each body's contacts; a ValueError where it is another one."""
         geoms = [int(np.flatnonzero(model.geom_bodyid == body)[0]) for body in bodies]
         weight = model.body_invweight0[bodies, 0]
         stiffness, damping = _stiffness(model.geom_solref[geoms], weight, "contacts")
@@ -116,11 +112,7 @@ class PenaltyLaw:
 def limit_stiffness(
     model: mujoco.MjModel, joints: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness and damping of the joints' limits, the inverse of `set_penalty_limit`.
-
-    Raises:
-        ValueError: a joint whose limit follows another law.
-    """
+    """Stiffness and damping of limits that follow the law; others are a ValueError."""
     weight = model.dof_invweight0[model.jnt_dofadr[joints]]
     return _stiffness(model.jnt_solref[joints], weight, "limits")
 

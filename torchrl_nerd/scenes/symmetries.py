@@ -76,11 +76,10 @@ def find_symmetries(
     free, rng = _without(model, LIMIT, has_servos), np.random.default_rng(0)
     effects: list[Effect] = []
     for joint in np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE))).tolist():
-        name = joint_label(model, joint)
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         for key, address in ((QPOS, q), (QVEL, v)):
             change = _largest_change(free, substeps, rng, _shift(key, address))
-            effects.append(Effect(name, key, address, change))
+            effects.append(Effect(joint_label(model, joint), key, address, change))
     return Symmetries(tuple(effects))
 
 

@@ -13,20 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.geometry import surfaces
 from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.rotations import (
     quat_conjugate,
     quat_matrix,
     quat_multiply,
     rotate,
-)
-from torchrl_nerd.geometry.surfaces import (
-    PLANE_PARAMETERS,
-    box_distance,
-    height_field_distance,
-    into_frame,
-    plane_distance,
-    plane_in_frame,
 )
 from torchrl_nerd.scenes.contact_points import HEIGHT_FIELD, PLANE
 
@@ -63,20 +56,16 @@ class Terrain:
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel, geoms: list[int]) -> "Terrain":
-        """The ground that these geoms make, of `terrain_geoms`.
-
-        Raises:
-            ValueError: a mocap body carries more than one plane.
-        """
+        """The ground of `terrain_geoms`; ValueError for two planes on one mocap body."""
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        surfaces = tuple(_read_surface(model, data, geom) for geom in geoms)
-        mocaps = [surface.mocap for surface in surfaces if surface.mocap >= 0]
+        found = tuple(_read_surface(model, data, geom) for geom in geoms)
+        mocaps = [surface.mocap for surface in found if surface.mocap >= 0]
         if len({*mocaps}) < len(mocaps):
             raise ValueError(
                 "expected one plane on a mocap body of the ground, got more"
             )
-        return cls(surfaces, np.hstack((data.mocap_pos, data.mocap_quat)))
+        return cls(found, np.hstack((data.mocap_pos, data.mocap_quat)))
 
     @cached_property
     def planes(self) -> list[Surface]:
@@ -86,7 +75,7 @@ class Terrain:
     @property
     def size(self) -> int:
         """How many numbers a row has."""
-        return PLANE_PARAMETERS * len(self.planes)
+        return surfaces.PLANE_PARAMETERS * len(self.planes)
 
     @property
     def is_per_row(self) -> bool:
@@ -128,7 +117,7 @@ class Terrain:
 
     def split(self, terrain: Tensor) -> tuple[Tensor, ...]:
         """The planes ``(*batch, 4)`` of ``terrain (*batch, size)``."""
-        return terrain.split(PLANE_PARAMETERS, -1) if self.planes else ()
+        return terrain.split(surfaces.PLANE_PARAMETERS, -1) if self.planes else ()
 
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
         """Raise ValueError where a row's parameters are of another shape or not finite.
@@ -208,15 +197,16 @@ class TerrainDistance(nn.Module):
         if surface.kind == PLANE:
             plane = planes.pop(0) if surface.mocap >= 0 else own("plane")
             plane = plane.expand(*points.shape[:-2], -1)
-            return plane_distance(points, plane_in_frame(plane, position, rotation))
+            seen = surfaces.plane_in_frame(plane, position, rotation)
+            return surfaces.plane_distance(points, seen)
         frame = position, rotation, own("position"), own("rotation")
-        local, turn = into_frame(points, *frame)
+        local, turn = surfaces.into_frame(points, *frame)
         if surface.kind == HEIGHT_FIELD:
             half_x, half_y = (float(half) for half in surface.size[:2])
             field = own("heights"), half_x, half_y, self.reach
-            distance, normal = height_field_distance(local, *field)
+            distance, normal = surfaces.height_field_distance(local, *field)
         else:
-            distance, normal = box_distance(local, own("size"))
+            distance, normal = surfaces.box_distance(local, own("size"))
         return distance, normal @ turn
 
 

@@ -42,27 +42,18 @@ Ranges = Mapping[str, Sequence[float]]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a `Variation`; ``indices`` of its target's bodies, dofs, geoms."""
+    """One parameter of a `Variation`."""
 
     name: str
+    kind: str  # the part of its name before the colon
     low: float
     high: float
-    indices: list[int]
-
-    @property
-    def kind(self) -> str:
-        """The part of its name before the colon."""
-        return self.name.partition(":")[0]
-
-    @property
-    def unit(self) -> str:
-        """Such as ``"kg"``, or ``"factor"``."""
-        return KINDS[self.kind].unit
+    indices: list[int]  # of its target's bodies, dofs or geoms
 
     @property
     def is_factor(self) -> bool:
         """Whether it multiplies what the robot has."""
-        return self.unit == "factor"
+        return KINDS[self.kind].unit == "factor"
 
 
 class Variation:
@@ -136,8 +127,8 @@ class Variation:
             ValueError: naming the first such parameter.
         """
         for p, value in zip(self.parameters, parameters.unbind(-1), strict=True):
-            about, most = KINDS[p.kind], KINDS[p.kind].most
-            wrong = ~((value >= about.lowest) & (value <= most))
+            about = KINDS[p.kind]
+            wrong = ~((value >= about.least) & (value <= about.most))
             if p.kind == "delay":
                 wrong |= (value != value.floor()) | (value > p.high)
             if wrong.any():
@@ -218,11 +209,11 @@ def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Para
         ) from None
     is_whole = kind != "delay" or (low.is_integer() and high.is_integer())
     is_finite = isfinite(high - low) and (low <= 0.0 or isfinite(high / low))
-    if not (about.lowest <= low <= high <= about.most and is_finite and is_whole):
+    if not (about.least <= low <= high <= about.most and is_finite and is_whole):
         raise ValueError(
             f"expected a possible range for '{name}', got {low:g}:{high:g}"
         )
-    return Parameter(name, low, high, _indices(model, about, target, name))
+    return Parameter(name, kind, low, high, _indices(model, about, target, name))
 
 
 def _indices(model: mujoco.MjModel, kind: Kind, target: str, name: str) -> list[int]:

@@ -34,9 +34,7 @@ class Locomotion:
     forward: float = 1.0  # reward per m/s along x
     healthy: float = 0.0  # reward of a step that does not end the episode
     height: tuple[float, float] | None = None  # open range of the base's, m
-    angle: tuple[float, float] | None = (
-        None  # open range of a planar torso's pitch, rad
-    )
+    angle: tuple[float, float] | None = None  # of a planar torso's pitch, rad
     largest: float = inf  # open bound of all states but the place along the track
     fastest: float = inf  # bound of the velocities that are shown
     hidden: int = 1  # leading positions that are not shown

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.robots.ant.scene import ant
 from torchrl_nerd.robots.ant.tasks import AntRun, AntSpin, AntSpinTrack
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
+from torchrl_nerd.robots.robot import WALKING_PPO, EvaluationProtocol, Preset, Robot
 
 PUBLISHED = {  # paper, Fig. 3
     ("passive", 500, "base_position"): 0.057,
@@ -34,15 +34,7 @@ PRESET = Preset(
         "friction": (0.3, 1.5),
     },
 )
-# As in the paper's reference code (rl_games), except that its step size follows the
-# policy's KL divergence; here it falls linearly.
-PPO = PPOConfig(
-    total_frames=32_800_000,
-    num_envs=2048,
-    minibatch=16_384,
-    lr=3e-4,
-    widths=(128, 64, 32),
-)
+PPO = replace(WALKING_PPO, total_frames=32_800_000)
 ROBOT = Robot(
     scenes={"ant": ant},
     tasks={"ant/run": AntRun, "ant/spin": AntSpin, "ant/spin_track": AntSpinTrack},

@@ -29,8 +29,7 @@ def ant() -> Scene:
     """Build the scene. ``qpos`` = torso position (m), quaternion, joints (rad)."""
     model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("ant.xml")))
     set_penalty_contact(model, **CONTACT)
-    for joint in JOINTS:
-        set_penalty_limit(model, joint, **LIMIT)
+    set_penalty_limit(model, *JOINTS, **LIMIT)
     near, far = ANKLE
     sampling = Sampling(  # reference code, utils/commons.py
         qpos_low=(-HIP, near, -HIP, -far, -HIP, -far, -HIP, near),

@@ -1,9 +1,11 @@
 """Presets of ANYmal: data, training, test rollouts, PPO."""
 
-from torchrl_nerd.configs import DataConfig, PPOConfig, TrainConfig
+from dataclasses import replace
+
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.robots.anymal.scene import anymal
 from torchrl_nerd.robots.anymal.tasks import AnymalForward, AnymalSideways
-from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
+from torchrl_nerd.robots.robot import WALKING_PPO, EvaluationProtocol, Preset, Robot
 
 PRESET = Preset(
     # a PD controller holds the nominal pose for an episode; nothing is published
@@ -27,15 +29,7 @@ PRESET = Preset(
         "friction": (0.3, 1.5),
     },
 )
-# As in the paper's reference code (rl_games), except that its step size follows the
-# policy's KL divergence; here it falls linearly.
-PPO = PPOConfig(
-    total_frames=65_500_000,
-    num_envs=2048,
-    minibatch=16_384,
-    lr=3e-4,
-    widths=(128, 64, 32),
-)
+PPO = replace(WALKING_PPO, total_frames=65_500_000)
 ROBOT = Robot(
     scenes={"anymal": anymal},
     tasks={"anymal/forward": AnymalForward, "anymal/sideways": AnymalSideways},

@@ -50,8 +50,7 @@ def anymal() -> Scene:
     """
     model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("anymal.xml")))
     set_penalty_contact(model, **CONTACT)
-    for leg in LEGS:
-        set_penalty_limit(model, f"{leg}_HAA", **LIMIT)
+    set_penalty_limit(model, *(f"{leg}_HAA" for leg in LEGS), **LIMIT)
     sampling = Sampling(
         qpos_low=tuple(q - 0.2 for q in STANDING_POSE),
         qpos_high=tuple(q + 0.2 for q in STANDING_POSE),

@@ -93,11 +93,7 @@ def _plane(normal: Tensor, qpos: Tensor, draw: Tensor) -> Tensor:
 
 
 def evaluation_ground(number: int) -> Tensor:
-    """Plane ``(4,)`` of one of the seven evaluation grounds, 0 (out of reach) to 6.
-
-    Raises:
-        ValueError: no such number.
-    """
+    """Plane ``(4,)`` of an evaluation ground, 0 (out of reach) to 6; else ValueError."""
     if not 0 <= number < len(GROUNDS):
         raise ValueError(
             f"expected a ground from 0 to {len(GROUNDS) - 1}, got {number}"
