@@ -25,10 +25,10 @@ from torchrl_nerd.evaluation.bench.errors import (
     ErrorRow,
     cases_of,
     error_rows,
-    error_table,
     evaluation_set,
     measure,
 )
+from torchrl_nerd.evaluation.bench.summary import summary_table, warnings
 from torchrl_nerd.evaluation.recorded_error import (
     STATES,
     compare,
@@ -106,7 +106,9 @@ class Eval(MeasuringCommand):
         rows = []
         for part in self.measure(protocol_of(scene), [*simulators(scene), *learned]):
             rows += part
-            print(f"\n{part[0].case}, {part[0].steps} steps\n{error_table(part)}")
+        print(f"\n{summary_table(scene, rows)}\n")
+        for sentence in warnings(scene, rows):
+            print(sentence)
         return {
             "scene": self.scene,
             "num_trajectories": self.num_trajectories,

@@ -216,7 +216,9 @@ def error_table(
     quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
     candidates = list(dict.fromkeys((row.name, row.kind) for row in rows))
     found = {
-        (row.name, row.quantity): [_shown(x) for x in (row.mean, row.final, row.p95)]
+        (row.name, row.quantity): [
+            error_text(x) for x in (row.mean, row.final, row.p95)
+        ]
         for row in rows
     }
     tables = []
@@ -240,7 +242,7 @@ def error_table(
     return "\n\n".join(tables)
 
 
-def _shown(value: float | None) -> str:
+def error_text(value: float | None) -> str:
     """Three digits; an error that is not finite is of a rollout that diverges."""
     if value is None:
         return "-"
