@@ -15,6 +15,13 @@ has_gl = pytest.mark.skipif(
 )
 
 
+def test_the_help_says_that_a_file_is_a_task(capsys):
+    with pytest.raises(SystemExit):
+        main(["play", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "or an MJCF file" in said and "nerd play robot.xml" in said
+
+
 @has_gl
 @pytest.mark.parametrize("task", ["cartpole/swingup", "cube_slope/toss"])
 def test_a_video_and_its_results(task, tmp_path, seed, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import torch
 
-from torchrl_nerd.analytic import STEPS, make_step
+from torchrl_nerd.analytic import STEPS, fitting_steps, make_step
 from torchrl_nerd.card import FORMAT, config_of
 from torchrl_nerd.card import make_card as make_card
 from torchrl_nerd.dynamics import ENGINES, Model
@@ -119,15 +119,29 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
         raise ValueError(f"expected a model, got the engine '{found}'")
     asked = scene.name if scene is not None and found in KINDS else found
     if asked != found or is_import(found):
-        kind = "hybrid" if found == "hybrid" else "learned"
-        step = " --step STEP" if found == "hybrid" else ""
-        raise ValueError(
-            f"no {kind} model of '{asked}' is shipped: make one with `nerd data {asked}` "
-            f"and `nerd train {asked} --kind {kind}{step}`, and give its folder, such as "
-            f"runs/{folder_name(asked)}/best; `nerd explain {asked}` names the analytic "
-            "steps that suit it"
-        )
+        raise ValueError(_not_shipped(asked, scene if found == "hybrid" else None))
     raise ValueError(f"unknown dynamics {str(found)!r}, expected {_known()}")
+
+
+def _not_shipped(name: str, hybrid_of: Scene | None) -> str:
+    """That no model has this name, and how to make one; a hybrid where a scene is given."""
+    how, folder = f"nerd train {name}", f"runs/{folder_name(name)}"
+    what = f"no learned model of '{name}' is shipped: make one"
+    if hybrid_of is not None:
+        steps, reason = fitting_steps(hybrid_of)
+        if steps:
+            what = f"no hybrid model of '{name}' is shipped: make one, STEP being "
+            what += " or ".join(steps) + ","
+            how, folder = f"{how} --kind hybrid --step STEP", f"{folder}-hybrid"
+        else:
+            what = (
+                f"no hybrid model of '{name}' is possible, since no analytic step fits "
+            )
+            what += f"({reason}): make a learned one"
+    return (
+        f"{what} with `nerd data {name}` and `{how}`, and give its folder, such as "
+        f"{folder}/best"
+    )
 
 
 def model_name(name: str | Path, scene: Scene | None = None) -> str:

@@ -131,3 +131,34 @@ def test_without_parameters_all_rows_are_the_scenes_own_again(generator):
     used.reset(plain)
     again = used.step(plain, torques[0])
     assert torch.equal(again[QVEL], expected[QVEL])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ([1.0, 2.0], "expected a possible 'delay', got 2"),  # beyond the range's end
+        ([1.0, 0.5], "expected a possible 'delay', got 0.5"),
+        ([0.0, 1.0], "expected a possible 'mass:pole', got 0"),
+        ([np.nan, 1.0], "expected a possible 'mass:pole', got nan"),
+        ([np.inf, 1.0], "expected a possible 'mass:pole', got inf"),
+        ([1.0], "expected parameters of shape .*2.*, got .*1"),
+    ],
+)
+def test_parameters_of_no_robot_are_refused_and_change_nothing(
+    parameters, words, generator
+):
+    """By a step, as by ``reset(set_state=True)``."""
+    scene = load_scene("cartpole").vary({"mass:pole": (0.3, 3.0), "delay": (0, 1)})
+    start, torques, _ = random_drive(scene, ROWS, STEPS, generator)
+    good = start.clone().set(PARAMETERS, scene.variation.draw(ROWS, generator))
+    wrong = good.clone()
+    wrong[PARAMETERS] = torch.tensor(parameters).double().expand(ROWS, len(parameters))
+    used, fresh = MujocoDynamics(scene), MujocoDynamics(scene)
+    for dynamics in (used, fresh):
+        dynamics.reset(good)
+        dynamics.step(good, torques[0])
+    with pytest.raises(ValueError, match=words) as refused:
+        used.step(wrong, torques[1])
+    assert "\n" not in str(refused.value)
+    expected = fresh.step(good, torques[1])
+    assert torch.equal(used.step(good, torques[1])[QVEL], expected[QVEL])

@@ -51,6 +51,33 @@ def test_a_scene_stands_for_its_learned_model_as_it_does_in_from_pretrained():
     assert all(weights[key].equal(value) for key, value in expected.items())
 
 
+FILE = """<mujoco><worldbody><body><joint axis="0 1 0" {}/><geom size="0.1"/></body>
+  </worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("dynamics", ["nerd", "hybrid"])
+@pytest.mark.parametrize("friction", ["", 'frictionloss="1"'])
+def test_a_file_without_a_model_is_told_what_is_possible(friction, dynamics, tmp_path):
+    """A hybrid needs an analytic step, and no analytic step knows dry friction."""
+    path = tmp_path / "robot.xml"
+    path.write_text(FILE.format(friction))
+    said = refusal(lambda: make_env(path, dynamics))
+    is_possible = dynamics == "hybrid" and not friction
+    assert (
+        f"no {'learned' if dynamics == 'nerd' else 'hybrid'} model of '{path}'" in said
+    )
+    assert f"`nerd data {path}`" in said and f"`nerd train {path}" in said
+    assert ("--kind hybrid --step STEP" in said) == is_possible
+    assert ("STEP being unconstrained" in said) == is_possible
+    assert ("-hybrid/best" in said) == is_possible
+    is_impossible = dynamics == "hybrid" and bool(friction)
+    assert ("with dry friction): make a learned one" in said) == is_impossible
+    if is_possible:
+        words = said.partition("STEP being ")[2].partition(", with")[0].split(" or ")
+        for step in words:
+            assert make_env(path, step).dynamics.kind == "analytic"
+
+
 @pytest.mark.parametrize("dynamics", ["mujoco", "dm_control", "analytic"])
 @pytest.mark.parametrize("guard", ["flag", "nonsense"])
 def test_a_guard_of_dynamics_without_a_network_is_refused(dynamics, guard):

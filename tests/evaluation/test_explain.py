@@ -3,12 +3,14 @@
 from collections import Counter
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 from helpers import every_scene, make_scene
 
 from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.evaluation.explain import TRAJECTORIES, explain
+from torchrl_nerd.geometry.manifold import HINGE, SLIDE, joint_label
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.robots import load_scene
@@ -23,7 +25,8 @@ CROSSED = """
 
 @every_scene
 def test_the_report_adds_up_and_its_text_names_all(scene):
-    report, text = explain(scene), str(explain(scene))
+    report = explain(scene)
+    text = str(report)
     assert report.token_width == SceneFeatures(scene).size
     assert text.startswith(f"{scene.name}: {report.token_width} features a step")
     assert all(feature.key in text for feature in report.features)
@@ -34,6 +37,14 @@ def test_the_report_adds_up_and_its_text_names_all(scene):
     assert kept == len(scene.contacts) and f", {kept} kept" in text
     assert type(scene.controller).__name__ in text
     assert ("none that the robot can touch" in text) == (scene.terrain is None)
+    assert f"control step: {scene.control_step:.6g} s, MuJoCo Euler, " in text
+    assert f" {scene.substeps} substep" in text
+    reason, moved = solver.why_all_kept, {effect.name for effect in solver.effects}
+    for joint in np.flatnonzero(np.isin(scene.model.jnt_type, (HINGE, SLIDE))):
+        assert (joint_label(scene.model, joint) in moved) == (reason is None)
+    assert (reason is None) == ("every hinge and slide is kept: " not in text)
+    has_props = scene.model.ntree > 1
+    assert ("several moving trees" in (reason or "")) == has_props
 
 
 @pytest.mark.parametrize(

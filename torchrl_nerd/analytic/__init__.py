@@ -25,6 +25,7 @@ __all__ = [
     "StepResult",
     "UnconstrainedStep",
     "default_step",
+    "fitting_steps",
     "make_step",
     "step_config",
 ]
@@ -67,3 +68,15 @@ def make_step(scene: Scene, config: StepConfig | None = None) -> AnalyticStep:
     if isinstance(config, FreeBodyConfig):
         return FreeBodyPenaltyStep(scene, **asdict(config))
     return PenaltyContactStep(scene, **asdict(config))
+
+
+def fitting_steps(scene: Scene) -> tuple[list[str], str]:
+    """Names in `STEPS` that can step a scene, and why another one cannot."""
+    names, reason = [], ""
+    for name, config in STEPS.items():
+        try:
+            make_step(scene, config)
+            names.append(name)
+        except ValueError as error:
+            reason = str(error)
+    return names, reason

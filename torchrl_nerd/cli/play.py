@@ -28,10 +28,13 @@ class Play(DeviceCommand):
     Example: nerd play ant/run --dynamics ant-mlp --out ant.gif
 
     Example: nerd play cartpole/swingup --policy runs/ppo --out swing_up.mp4
+
+    Example: nerd play robot.xml --dynamics runs/robot/best
     """
 
     task: Positional[str]
-    """Id of the task, such as cartpole/swingup."""
+    """Id of the task, such as cartpole/swingup, dm_control/DOMAIN-TASK or gymnasium/ID; or
+    an MJCF file, which has no reward and acts at random."""
     dynamics: str = "nerd"
     """Of the left robot: nerd, hybrid, analytic, a shipped model or a checkpoint folder."""
     policy: Path | None = None

@@ -21,7 +21,7 @@ class Transfer(MeasuringCommand):
     """
 
     task: Positional[str]
-    """Id of the task, such as cartpole/swingup."""
+    """Id of the task, such as cartpole/swingup, dm_control/DOMAIN-TASK or gymnasium/ID."""
     policy: Path | None = None
     """Folder of a policy, as examples/ppo.py writes it; by default the shipped one."""
     dynamics: tuple[str, ...] = ("nerd", "mujoco")

@@ -1,6 +1,7 @@
 """What each simulation of a batch has of its own: model fields, motor strength, delay."""
 
 import numpy as np
+import torch
 from mujoco.batch import Batch
 
 from torchrl_nerd.scenes.variation import Variation
@@ -16,9 +17,19 @@ class RowParameters:
         self._strength, self._delay = np.ones((rows, dofs)), np.zeros(rows, int)
 
     def write(self, parameters: np.ndarray) -> None:
-        """Give every simulation its parameters ``(rows, size)``."""
+        """Give every simulation its parameters ``(rows, size)``.
+
+        Raises:
+            ValueError: another shape, or parameters of no robot; nothing has changed then.
+        """
+        if parameters.shape != self._values.shape:
+            raise ValueError(
+                f"expected parameters of shape {self._values.shape}, got "
+                f"{parameters.shape}"
+            )
         rows = np.flatnonzero((parameters != self._values).any(1))
         if len(rows):
+            self.variation.check(torch.from_numpy(parameters[rows]))
             values = self._values[rows] = parameters[rows]
             for name, value in self.variation.fields(values).items():
                 self.batch.expand(name)[rows] = value

@@ -9,6 +9,7 @@ from torch import Generator
 
 from torchrl_nerd.analytic import STEPS, default_step, make_step
 from torchrl_nerd.data.simulate import is_sound, simulate
+from torchrl_nerd.evaluation.bench.candidates import mujoco_name
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -24,7 +25,7 @@ from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, own_contacts
 from torchrl_nerd.scenes.penetration import touching_bodies
-from torchrl_nerd.scenes.symmetries import Effect, base_effects
+from torchrl_nerd.scenes.symmetries import Effect, base_effects, why_all_kept
 from torchrl_nerd.scenes.terrain import PLANE
 
 SERVOS = "; servos: the control is held, MuJoCo evaluates their law in every substep"
@@ -55,7 +56,12 @@ class SolverReport:
     """What stepping MuJoCo says about a scene."""
 
     scene: str
+    control_step: float  # s
+    solver: str  # integrator and substeps, see `mujoco_name`
     effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
+    why_all_kept: (
+        str | None
+    )  # the reason in words where hinges and slides are not moved
     points_found: int  # contact points of the robot's shapes
     points_merged: int  # of these, how many always coincide with another one
     points_fixed: int  # of these, how many no joint can move
@@ -103,6 +109,8 @@ class SceneReport:
             what = f"{effect.name} {effect.key}[{effect.address}]"
             verdict = ignored if effect.is_ignored else "kept"
             lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
+        if solver.why_all_kept is not None:
+            lines.append(f"every hinge and slide is kept: {solver.why_all_kept}")
         lines.append(
             f"contact points: {solver.points_found} found, {solver.points_merged} merged "
             f"with one at the same place, {solver.points_fixed} dropped since no joint "
@@ -122,6 +130,7 @@ class SceneReport:
                 *lines,
                 f"self-contacts: {self._touching()}",
                 f"terrain: {self.terrain}",
+                f"control step: {solver.control_step:.6g} s, {solver.solver}",
                 f"controller: {self.controller}",
                 f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
             ]
@@ -164,6 +173,9 @@ def explain(scene: Scene) -> SceneReport:
         features=tuple(Feature(str(k), n, meanings[str(k)]) for k, n in sizes.items()),
         solver=SolverReport(
             scene=scene.name,
+            control_step=scene.control_step,
+            solver=mujoco_name(scene),
+            why_all_kept=why_all_kept(model),
             effects=effects + scene.symmetries.effects,
             points_found=len(found),
             points_merged=len(found) - fixed - kept,

@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+import numpy as np
 
 from torchrl_nerd.scenes.contact_points import terrain_geoms
+from torchrl_nerd.scenes.support import silence_mujoco
 
 if TYPE_CHECKING:
     from dm_control.rl.control import Environment
@@ -31,18 +33,27 @@ def read_mjcf(
     With terrain ``"plane"`` level ground is added to it.
 
     Raises:
-        ValueError: in one sentence, no file, MuJoCo's complaint, a control step of no
-            whole number of timesteps, or ground that cannot be added.
+        ValueError: in one sentence, no file, MuJoCo's complaint, numbers that are not
+            finite, a control step of no whole number of timesteps, or ground that cannot
+            be added.
     """
     if not path.is_file():
         raise ValueError(f"expected an MJCF file, found none at {path}")
     if terrain not in (None, "plane"):
         raise ValueError(f"expected terrain 'plane' or None, got {terrain!r}")
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        with silence_mujoco() as warned:
+            model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         complaint = " ".join(str(error).split())
         raise ValueError(f"MuJoCo cannot compile {path}: {complaint}") from None
+    if any("NaN" in warning for warning in warned):
+        raise ValueError(f"expected finite numbers in {path}, got NaN")
+    if odd := _not_finite(model):
+        raise ValueError(
+            f"expected finite numbers of a possible size in {path}, whose compiled "
+            f"{', '.join(odd)} are not finite"
+        )
     if terrain is not None:
         if terrain_geoms(model):
             raise ValueError(f"expected no ground beside a plane in {path}, got some")
@@ -61,6 +72,18 @@ def read_mjcf(
             f"got {control_step!r} s"
         )
     return model, substeps
+
+
+def _not_finite(model: mujoco.MjModel) -> list[str]:
+    """Names of the numbers of a compiled model that are not finite."""
+    return [
+        name
+        for owner in (model, model.opt)
+        for name in dir(owner)
+        if not name.startswith("_")
+        and (value := np.asarray(getattr(owner, name))).dtype.kind == "f"
+        and not np.isfinite(value).all()
+    ]
 
 
 def load_suite(domain: str, task: str) -> "Environment":

@@ -84,7 +84,7 @@ class Scene:
                 something not supported (named), or a plane beside another ground.
         """
         parts = importer.read_mjcf(Path(path), control_step, terrain)
-        scene = cls._from(name or str(path), *parts, ranges)
+        scene = cls._from(name or str(Path(path)), *parts, ranges)
         return replace(scene, max_contact_points=max_contact_points)
 
     @classmethod

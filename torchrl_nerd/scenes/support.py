@@ -23,6 +23,7 @@ from torchrl_nerd.scenes.shapes import geom_kind
 DISABLE = mujoco.mjtDisableBit
 ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 MOST_NAMED = 3  # elements of one kind in a message
+MAX_CTRL = 1e10  # mjMAXVAL: MuJoCo gives up on a larger ctrl
 
 Refusal = tuple[str, Any, Callable[[int], Any] | None]
 """What, a flag of the model or one per object, and how to get an object by its index."""
@@ -33,17 +34,20 @@ _LOCK = fork_safe_lock()
 
 
 @contextmanager
-def silence_mujoco() -> Iterator[None]:
+def silence_mujoco() -> Iterator[list[str]]:
     """Neither warnings on the terminal nor a MUJOCO_LOG.TXT in the working folder.
+
+    Gives the list of what MuJoCo warns of.
 
     What MuJoCo calls is one for all threads: the last that leaves such a block puts back
     what the first found.
     """
+    warnings: list[str] = []
     with _LOCK:
         _silent.append(_silent[0] if _silent else mujoco.get_mju_user_warning())
-        mujoco.set_mju_user_warning(lambda message: None)
+        mujoco.set_mju_user_warning(warnings.append)
     try:
-        yield
+        yield warnings
     finally:
         with _LOCK:
             before = _silent.pop()
@@ -120,6 +124,8 @@ def _actuators(model: mujoco.MjModel) -> Iterator[Refusal]:
     yield "an actuator whose force a callback computes", is_called, get
     is_single = (model.actuator_ctrlnum == 1) & (model.actuator_outnum == 1)
     yield "an actuator of several controls", ~is_single, get
+    is_wild = ~(abs(model.actuator_ctrlrange) <= MAX_CTRL).all(1)  # NaN is
+    yield f"an actuator with a control range beyond {MAX_CTRL:g}", is_wild, get
     is_off = [bool(model.opt.disableactuator & 1 << g) for g in model.actuator_group]
     yield "a disabled actuator", is_off, get
     all_off = model.nu and model.opt.disableflags & DISABLE.mjDSBL_ACTUATION

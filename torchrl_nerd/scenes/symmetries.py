@@ -70,8 +70,7 @@ def find_symmetries(
     not show what matters: limited tendons, static shapes without features, props. Servos
     act in every substep; without them a torque is a torque.
     """
-    unseen = set(ground_geoms(model)) - set(terrain_geoms(model))
-    if model.tendon_limited.any() or unseen or model.ntree > 1:
+    if why_all_kept(model):
         return Symmetries(())
     free, rng = _without(model, LIMIT, has_servos), np.random.default_rng(0)
     effects: list[Effect] = []
@@ -81,6 +80,17 @@ def find_symmetries(
             change = _largest_change(free, substeps, rng, _shift(key, address))
             effects.append(Effect(joint_label(model, joint), key, address, change))
     return Symmetries(tuple(effects))
+
+
+def why_all_kept(model: mujoco.MjModel) -> str | None:
+    """The reason, in words, where `find_symmetries` moves no coordinate; else None."""
+    if model.ntree > 1:
+        return "the file has several moving trees, which may push each other"
+    if model.tendon_limited.any():
+        return "a tendon has limits, which random states may not reach"
+    if set(ground_geoms(model)) - set(terrain_geoms(model)):
+        return "the robot can touch shapes that no feature shows"
+    return None
 
 
 def base_effects(

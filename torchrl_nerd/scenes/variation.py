@@ -127,8 +127,8 @@ class Variation:
             ValueError: naming the first such parameter.
         """
         for p, value in zip(self.parameters, parameters.unbind(-1), strict=True):
-            about = KINDS[p.kind]
-            wrong = ~((value >= about.least) & (value <= about.most))
+            about, is_finite = KINDS[p.kind], value.isfinite()
+            wrong = ~(is_finite & (value >= about.least) & (value <= about.most))
             if p.kind == "delay":
                 wrong |= (value != value.floor()) | (value > p.high)
             if wrong.any():
