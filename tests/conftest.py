@@ -12,6 +12,7 @@ Random inputs of a test are the same at every run. ``pytest --seed N`` draws oth
 import logging
 import secrets
 from collections import Counter
+from dataclasses import replace
 from itertools import groupby
 from zlib import crc32
 
@@ -22,7 +23,14 @@ from helpers import EXCERPT
 
 from torchrl_nerd.data.log_files import read_log
 from torchrl_nerd.data.recorded import Recording, complete
-from torchrl_nerd.robots import ROBOTS, SCENES, TASKS, load_scene
+from torchrl_nerd.robots import (
+    ROBOTS,
+    SCENES,
+    TASKS,
+    EvaluationProtocol,
+    load_scene,
+    protocol_of,
+)
 from torchrl_nerd.scenes import Scene
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -101,6 +109,17 @@ def generator(seed: int) -> torch.Generator:
 def rng(seed: int) -> np.random.Generator:
     """NumPy's random numbers of this test."""
     return np.random.default_rng(seed)
+
+
+@pytest.fixture
+def short_rollouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands roll out for 5 control steps where no test asks for the errors' size."""
+
+    def short(scene: Scene) -> EvaluationProtocol:
+        return replace(protocol_of(scene), horizons=(5,))
+
+    for command in ("train", "eval"):
+        monkeypatch.setattr(f"torchrl_nerd.cli.{command}.protocol_of", short)
 
 
 @pytest.fixture(params=list(SCENES))

@@ -78,7 +78,11 @@ def test_it_comes_to_rest_on_the_ground_at_any_stiffness(real_cube, generator, h
     step.set_values({**values, "stiffness": stiffness, "damping": damping})
     qpos, qvel = falling(real_cube, generator, height=0.02)
     with torch.no_grad():
-        for _ in range(700):
+        for number in range(700):
+            qpos, qvel, _ = step(qpos, qvel)
+            if number % 50 == 0 and qvel.abs().max() < 0.05:
+                break
+        for _ in range(20):  # and stays there
             qpos, qvel, _ = step(qpos, qvel)
     assert qvel.abs().max() < 0.05
     lowest = real_cube.clearances(qpos).amin(-1)

@@ -120,7 +120,7 @@ def test_it_converges_however_joints_are_coupled(generator):
     rows = random_rows(scene, generator)
     qpos, qvel = rows[QPOS], rows[QVEL]
     unconstrained = UnconstrainedStep(scene)
-    for _ in range(300):
+    for _ in range(100):
         qpos, qvel, *_ = unconstrained(qpos, qvel, 0.0 * qvel)
         assert qvel.abs().max() < 1e3
     assert (qpos.abs() < 1.0).all() and qvel.norm(dim=-1).median() < 20.0

@@ -4,6 +4,7 @@ from typing import cast
 
 import pytest
 import torch
+from helpers import slow_but
 from network_off import without_network
 from tensordict import TensorDict
 
@@ -22,14 +23,15 @@ from torchrl_nerd.robots import protocol_of
 HYBRIDS = [n for n in shipped_models() if shipped_card(n)["kind"] == "hybrid"]
 TRAJECTORIES, SEED = 128, 4242  # per case; a test seed: nothing was chosen on it
 LEAST_GAIN = 1.2  # a fifth
+CASES = [(name, drive) for name in HYBRIDS for drive in ("passive", "driven")]
+QUICK = CASES[:1] + CASES[-1:]  # of the first hybrid passive, of the last driven
 
 
 def test_there_are_some():
     assert HYBRIDS
 
 
-@pytest.mark.parametrize("drive", ["passive", "driven"])
-@pytest.mark.parametrize("name", HYBRIDS)
+@pytest.mark.parametrize(("name", "drive"), slow_but(QUICK, CASES))
 def test_without_its_network_the_error_rises_by_a_fifth(name, drive):
     """Over all cases of the protocol, and outside the interval of the difference."""
     model = cast(HybridNeRD, from_pretrained(name))

@@ -1,6 +1,7 @@
 """Policies that come with the package earn in MuJoCo what the paper's policies do."""
 
 import pytest
+from helpers import slow_but
 
 from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.policy import (
@@ -40,7 +41,7 @@ LOST = {
 """Largest part of MuJoCo's return that the network's own error may cost or add."""
 
 
-@pytest.mark.parametrize("task", shipped_policies())
+@pytest.mark.parametrize("task", slow_but(["franka/reach"], shipped_policies()))
 def test_it_earns_in_mujoco_what_is_told(task, seed) -> None:
     """To within what 32 starts leave open: a few arms and poles begin far from a goal."""
     actor = make_actor(load_policy(shipped_policy(task), make_task(task)))

@@ -21,10 +21,15 @@ from torchrl_nerd.evaluation.stability.states import (
 from torchrl_nerd.robots import SCENES, load_scene
 
 SCALE = 0.001
-QUICK = ("cartpole", "double_pendulum", "franka", "cube")  # others take up to a minute
+COVER = ("cube", "cartpole", "double_pendulum", "franka")
 SLOW = ("drop", "sliding", "resting", "horizon")
 SHORT = [name for name in CASES if name not in SLOW]
 INDEPENDENT = ("invalid_inputs", "quaternion_sign", "altitude")
+ONCE: dict[str, list[str]] = {}
+"""Every short case, by the first robot of `COVER` that it applies to."""
+for _case in SHORT:
+    _fitting = (name for name in COVER if CASES[_case].applies(load_scene(name)))
+    ONCE.setdefault(next(_fitting), []).append(_case)
 
 
 def results_of(scene, names, generator):
@@ -38,12 +43,20 @@ def failures(results):
     return {r.case: r.ground_truth for r in results if not r.ground_truth_passes}
 
 
-@pytest.mark.parametrize("name", slow_but(QUICK, SCENES))
-def test_mujoco_passes(name, generator):
+@pytest.mark.parametrize(
+    ("name", "cases"),
+    [
+        *((name, tuple(cases)) for name, cases in ONCE.items()),
+        *(pytest.param(name, SHORT, marks=pytest.mark.slow) for name in SCENES),
+    ],
+)
+def test_mujoco_passes(name, cases, generator):
     scene = load_scene(name)
-    results = results_of(scene, SHORT, generator)
+    results = results_of(scene, cases, generator)
     assert failures(results) == {}
     table = as_table(results)
+    if name in ONCE:
+        assert {result.case for result in results} >= set(ONCE[name])
     for result in results:
         assert result.case in table
         assert set(result.tolerances) <= set(result.tested)
@@ -55,7 +68,9 @@ def test_mujoco_passes_long_cases(scene, generator):
     assert failures(results) == {}
 
 
-def test_what_does_not_depend_on_weights_holds_for_any(scene, generator):
+@pytest.mark.parametrize("name", slow_but(COVER[:2], SCENES))
+def test_what_does_not_depend_on_weights_holds_for_any(name, generator):
+    scene = load_scene(name)
     for result in results_of(scene, list(INDEPENDENT), generator):
         assert result.passes, (result.case, result.tested)
 

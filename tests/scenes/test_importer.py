@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from helpers import slow_but
 from servo_helpers import servo_scene
 from tensordict import TensorDict
 
@@ -49,6 +50,8 @@ STEPS = {  # control step (s), substeps: of the tasks and environments
     "gymnasium/Swimmer-v5": (0.04, 4),
     "gymnasium/Walker2d-v5": (0.008, 4),
 }
+FEW = ("dm_control/reacher-easy", "gymnasium/HalfCheetah-v5", "gymnasium/Ant-v5")
+"""On a fixed base, in a plane, on a floating base."""
 PLANAR = [f"dm_control/{x}" for x in ("cheetah-run", "hopper-hop", "walker-walk")]
 PLANAR += [f"gymnasium/{x}-v5" for x in ("HalfCheetah", "Hopper", "Walker2d")]
 
@@ -188,6 +191,7 @@ def test_control_steps_are_the_tasks(robot):
     assert robot.substeps == substeps
 
 
+@pytest.mark.parametrize("robot", slow_but(FEW, STEPS), indirect=True)
 def test_a_network_can_step_it(robot, generator):
     state, action = states_and_actions(robot, generator, robot.sampling.clearance)
     torque = robot.controller(action, state[QPOS], state[QVEL])

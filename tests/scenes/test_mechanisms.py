@@ -12,7 +12,7 @@ from torchrl_nerd.cli import main
 from torchrl_nerd.evaluation.explain import explain
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import SceneFeatures
-from torchrl_nerd.scenes import Scene
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.tasks import SceneTask
 from torchrl_nerd.transforms import StateDelta
 
@@ -67,17 +67,23 @@ MECHANISMS = {
 }  # fmt: skip
 
 
-@pytest.fixture(params=MECHANISMS)
-def path(request, tmp_path):
+@pytest.fixture(scope="module", params=MECHANISMS)
+def path(request, tmp_path_factory):
     """A file with the mechanism."""
     world, rest = MECHANISMS[request.param]
     if "joint=" in rest or '"a"' in world:
         rest += MOTOR
     world = world.replace("</body>", '<site name="s"/></body>', 1) if "string" == (
         request.param) else world  # fmt: skip
-    file = tmp_path / "robot.xml"
+    file = tmp_path_factory.mktemp("mechanism") / "robot.xml"
     file.write_text(f"<mujoco><worldbody>{world}</worldbody>{rest}</mujoco>")
     return file
+
+
+@pytest.fixture
+def scene(path):
+    """The mechanism, read once."""
+    return load_scene(path)
 
 
 def some_states(scene, generator):
@@ -102,8 +108,7 @@ def test_the_env_is_mujoco(path, generator):
                 np.testing.assert_allclose(td[key][row], want, 1e-9, 1e-9)
 
 
-def test_the_change_of_state_is_lossless(path, generator):
-    scene = Scene.from_mjcf(path)
+def test_the_change_of_state_is_lossless(scene, generator):
     start, end = (some_states(scene, generator) for _ in range(2))
     change, states = (
         StateDelta(scene),
@@ -115,9 +120,8 @@ def test_the_change_of_state_is_lossless(path, generator):
     torch.testing.assert_close(back, delta, rtol=1e-12, atol=1e-12)
 
 
-def test_every_joint_and_prop_is_seen(path, generator):
+def test_every_joint_and_prop_is_seen(scene, generator):
     """Features tell any two states apart, up to where a floating robot stands."""
-    scene = Scene.from_mjcf(path)
     state = some_states(scene, generator)
     tokens, torque = (
         SceneFeatures(scene),
@@ -138,8 +142,8 @@ def test_every_joint_and_prop_is_seen(path, generator):
         assert ((here - faster).abs().amax(-1) > 1e-6).all()
 
 
-def test_explain_needs_no_names(path):
-    text = str(explain(Scene.from_mjcf(path)))
+def test_explain_needs_no_names(scene):
+    text = str(explain(scene))
     assert "''" not in text and "joint None" not in text
 
 
@@ -147,7 +151,7 @@ TRAINED = ("ball before the robot", "closed chain", "tendon limit", "unnamed")
 
 
 @pytest.mark.parametrize("path", slow_but(TRAINED[:1], TRAINED), indirect=True)
-def test_a_model_of_seconds_steps_and_streams(path, tmp_path, capsys):
+def test_a_model_of_seconds_steps_and_streams(path, tmp_path, short_rollouts, capsys):
     data, out = tmp_path / "data", tmp_path / "run"
     sizes = "--trajectories 40 --steps 12 --quiet".split()
     assert main(["data", str(path), "--out", str(data), *sizes]) == 0
@@ -160,7 +164,7 @@ def test_a_model_of_seconds_steps_and_streams(path, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "ball position" in said or "ball" not in path.read_text()
     paths, start = [], None
-    task = SceneTask(Scene.from_mjcf(path))
+    task = SceneTask(load_scene(path))
     for inference in ("streaming", "window"):
         env = NeRDEnv(task, out / "last", 3, seed=0, inference=inference)
         start = env.reset() if start is None else start

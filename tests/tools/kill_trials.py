@@ -230,11 +230,13 @@ def main(options: Options) -> dict[str, dict[str, int]]:
     bar = tqdm(total=options.kills)
     with tempfile.TemporaryDirectory() as temporary:
         for index, (name, work) in enumerate(KINDS.items()):
+            share = (options.kills + len(KINDS) - 1 - index) // len(KINDS)
+            if not share:
+                continue
             whole, count = Path(temporary) / f"{name}-whole", Counter[str]()
             began = time.monotonic()
             in_child(partial(work.run, whole))
             longest = time.monotonic() - began
-            share = (options.kills + len(KINDS) - 1 - index) // len(KINDS)
             while count["kills"] < share:
                 folder = Path(temporary) / name
                 found = trial(work, folder, whole, longest * rng.random())
