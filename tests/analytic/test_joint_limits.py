@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 from helpers import make_scene, mujoco_step, random_transitions
@@ -107,16 +108,22 @@ def test_no_end_pulls():
 
 
 def test_it_converges_however_joints_are_coupled(generator):
-    """Jacobi's plain iteration throws this chain: one axis for three heavy links."""
+    """Jacobi's plain iteration throws this chain of four heavy links."""
     links, ends = "", ""
-    for name in "abc":
-        links += f"""<body><joint name="{name}" axis="0 0 1" range="-10 10"/>
+    for name in "abcd":
+        links += f"""<body pos="2 0 0"><joint name="{name}" axis="0 0 1" range="-10 10"/>
           <geom size="0.5" pos="1 0 0"/>"""
         ends += "</body>"
-    motors = "".join(f'<motor joint="{name}"/>' for name in "abc")
+    motors = "".join(f'<motor joint="{name}"/>' for name in "abcd")
     scene = make_scene(f"""<mujoco><compiler autolimits="true"/>
       <default><geom contype="0"/></default><worldbody>{links}{ends}</worldbody>
       <actuator>{motors}</actuator></mujoco>""")
+    data, mass = mujoco.MjData(scene.model), np.zeros((4, 4))
+    mujoco.mj_forward(scene.model, data)
+    mujoco.mj_fullM(scene.model, data, mass)
+    coupling = np.linalg.inv(mass)
+    growth = np.linalg.eigvals(coupling / coupling.diagonal()[:, None]) - 1.0
+    assert abs(growth).max() > 2.0  # of an error, in each of Jacobi's sweeps
     rows = random_rows(scene, generator)
     qpos, qvel = rows[QPOS], rows[QVEL]
     unconstrained = UnconstrainedStep(scene)
