@@ -60,7 +60,7 @@ def test_a_log_of_any_robot_comes_back(kind, generator, tmp_path):
     assert same(replace(found, frame=log.frame, time=None), log)
     assert sum(len(members) for members in split.values()) == len(log)
     window = found.windows(found.starts(5)[:1], 5)
-    assert torch.equal(window["joint_torque"][0], log.joint_torque[:5])
+    assert torch.equal(window["next", "joint_torque"][0], log.joint_torque[:5])
 
 
 def test_positions_alone_are_enough_for_any_robot(generator):

@@ -22,7 +22,7 @@ from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.envs import NeRDEnv
 from torchrl_nerd.evaluation.bench.candidates import NoMotion
 from torchrl_nerd.evaluation.rollout_error import passive_errors
-from torchrl_nerd.keys import CTRL, QPOS, QVEL
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes.commands import actuate, drive, drive_of
@@ -151,7 +151,7 @@ def test_streams_are_the_full_sequence(network, arm, generator):
     model.network.double()
     data = simulated(arm, generator, 3, 8)
     windows = data.windows(torch.arange(3) * 8, 7)
-    driven = drive_of(windows["joint_torque"], windows["ctrl"])
+    driven = drive_of(windows[JOINT_TORQUE], windows[CTRL])
     encoded = model.encode(windows[QPOS], windows[QVEL], driven, None)
     whole = model.decode(
         (windows[QPOS], windows[QVEL]), encoded, model.network(encoded.token)
@@ -160,7 +160,7 @@ def test_streams_are_the_full_sequence(network, arm, generator):
     dynamics.reset(windows[:, 0])
     for step in range(7):
         now = windows[:, step]
-        after = dynamics.step(now, now["joint_torque"], None, now["ctrl"])
+        after = dynamics.step(now, now[JOINT_TORQUE], None, now[CTRL])
         for key, want in zip((QPOS, QVEL), whole, strict=True):
             torch.testing.assert_close(after[key], want[:, step], rtol=1e-9, atol=1e-9)
 

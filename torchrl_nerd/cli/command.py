@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_nerd import __version__
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.files import check_writable, write_json
+from torchrl_nerd.files import write_json
 from torchrl_nerd.settings import expect_device
 
 SHOWN = ("json", "quiet", "dry_run")
@@ -33,11 +33,6 @@ class Command(ABC):
     def record(self) -> Path | None:
         """Where results and settings go."""
         return self.json
-
-    def check_record(self) -> None:
-        """Refuse, before any work, a `record` that cannot be written: ValueError."""
-        if self.record is not None:
-            check_writable(self.record)
 
     def configuration(self) -> dict[str, Any]:
         """Every option and its value, which repeat the command."""

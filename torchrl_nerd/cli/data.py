@@ -8,16 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_nerd.cli.command import Command
-from torchrl_nerd.cli.options import (
-    Flat,
-    Positional,
-    Reference,
-    SceneName,
-    Vary,
-    recorded_scene,
-    run_name,
-    scene_of,
-)
+from torchrl_nerd.cli.options import Flat, SceneOptions, recorded_scene
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.cluster import ray_map
 from torchrl_nerd.data.generate import (
@@ -36,7 +27,7 @@ from torchrl_nerd.training.policy_data import along_policy
 
 
 @dataclass(frozen=True)
-class Data(Command):
+class Data(SceneOptions, Command):
     """Generate random trajectories in MuJoCo, or convert recorded ones.
 
     An interrupted command resumes when it is run again.
@@ -52,11 +43,8 @@ class Data(Command):
     Example: nerd data ant --policy runs/ppo_ant --out datasets/ant_policy
     """
 
-    scene: Positional[SceneName]
     out: Path | None = None
     """Folder of the data set; default datasets/SCENE."""
-    reference: Reference = None
-    vary: Vary = ()
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """File of recorded trajectories (npz or CSV); units and frames are checked."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
@@ -72,9 +60,7 @@ class Data(Command):
     @property
     def folder(self) -> Path:
         """Of the data set that is generated."""
-        return self.out or Path("datasets") / run_name(
-            self.scene, self.reference, self.vary
-        )
+        return self.out or Path("datasets") / self.run_name
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
         """Name and function that draw: the policy's, or the preset's."""
@@ -87,7 +73,7 @@ class Data(Command):
         if self.recorded is not None:
             recording, _ = load_recording(self.recorded, recorded_scene(self.scene))
             return [f"convert {len(recording)} recorded trajectories"]
-        scene, out = scene_of(self.scene, self.reference, self.vary), self.folder
+        scene, out = self.load(), self.folder
         _, draw = self.strategy(scene) or (None, partial(simulate, scene))
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
         wanted, existing = self.config.trajectories, 0
@@ -115,14 +101,11 @@ class Data(Command):
             count = card["trajectories"]
             print(f"{count} recorded trajectories in {out}: they pass all checks")
             return card
-        scene = scene_of(self.scene, self.reference, self.vary)
-        out = self.folder
-        draw = self.strategy(scene)
+        scene, out = self.load(), self.folder
         mapper = partial(ray_map, address=self.ray) if self.ray else map
-        generate(scene, self.config, out, self.quiet, draw, mapper)
+        generate(scene, self.config, out, self.quiet, self.strategy(scene), mapper)
         card = read_json(out / CARD)
-        print(
-            f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
-        )
+        count, dropped = card["trajectories"], card["dropped"]
+        print(f"{count} trajectories in {out}, {dropped} dropped")
         expect_few_dropped(card)
         return card

@@ -1,9 +1,8 @@
 """Help texts for people: what to type in place of types, and no marks of Markdown."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
 from tyro.constructors import (
@@ -21,33 +20,25 @@ NO_DEFAULT = re.compile(r"\s*\(default:\s*(none)?\)")
 @REGISTRY.primitive_rule
 def read_option(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """An option of a plain type, or of one that may be left out: ``PATH``."""
-    kinds: tuple[Any, ...] = (info.type,)
-    is_optional = False
-    if get_origin(info.type) in (Union, UnionType):
-        kinds = tuple(kind for kind in get_args(info.type) if kind is not type(None))
-        is_optional = len(kinds) < len(get_args(info.type))
-    if len(kinds) != 1:
+    is_union = get_origin(info.type) in (Union, UnionType)
+    parts: tuple[Any, ...] = get_args(info.type) if is_union else (info.type,)
+    kind, *others = [part for part in parts if part is not NoneType] or [NoneType]
+    known: tuple[str, ...] = get_args(kind) if get_origin(kind) is Literal else ()
+    if others or not (known or kind in METAVARS):
         return None
-    kind, choices = kinds[0], None
-    make: Callable[[str], Any] = kind
-    if get_origin(kind) is Literal and all(isinstance(x, str) for x in get_args(kind)):
-        choices, make = get_args(kind), str
-    elif kind not in METAVARS:
-        return None
-    known = choices or ()
 
     def fits(x: Any) -> bool:
         if x is None:
-            return is_optional
+            return NoneType in parts
         return x in known if known else isinstance(x, kind)
 
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar="{" + ",".join(known) + "}" if known else METAVARS[kind],
-        instance_from_str=lambda words: make(words[0]),
+        instance_from_str=lambda words: words[0] if known else kind(words[0]),
         is_instance=fits,
         str_from_instance=lambda x: ["none" if x is None else str(x)],
-        choices=choices,
+        choices=known or None,
     )
 
 

@@ -22,6 +22,7 @@ from torchrl_nerd.cli.play import Play
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
+from torchrl_nerd.files import check_writable
 from torchrl_nerd.robots import PRESETS, preset_of
 from torchrl_nerd.scenes import is_import
 from torchrl_nerd.settings import SettingError, did_you_mean
@@ -63,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.dry_run:
             print("\n".join((*command.plan(), *command.settings())))
             return 0
-        command.check_record()
+        if command.record is not None:  # refuse it before any work
+            check_writable(command.record)
         command.keep(command.run())
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail((str(error) or repr(error)).splitlines()[0])
@@ -106,11 +108,11 @@ def _default(kind: type[Command], args: list[str]) -> Any:
         return tyro.MISSING_NONPROP
     preset = preset_of(scene)
     if kind is Data:
-        return Data(scene, config=preset.data)
+        return Data(scene=scene, config=preset.data)
     is_hybrid = "--kind=hybrid" in args or ("--kind", "hybrid") in pairwise(args)
     if is_hybrid and preset.hybrid is not None:
-        return Train(scene, kind="hybrid", config=preset.hybrid)
-    return Train(scene, config=preset.train)
+        return Train(scene=scene, kind="hybrid", config=preset.hybrid)
+    return Train(scene=scene, config=preset.train)
 
 
 def _fail(sentence: str, status: int = 2) -> int:

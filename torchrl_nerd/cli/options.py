@@ -1,6 +1,7 @@
 """Options that several commands share, and the scenes that they name."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import tyro
@@ -25,58 +26,52 @@ ModelName = Annotated[
         "by default what is shipped for the robot."
     ),
 ]
-Reference = Annotated[
-    Literal["rk4"] | None,
-    tyro.conf.arg(
-        help="Reference solver in place of the scene's own: MuJoCo's RK4 at four times its "
-        "substeps."
-    ),
-]
-Vary = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(
-        help="Hidden parameters that differ from trajectory to trajectory, as "
-        "mass:pole=0.3:3.0 (KIND:TARGET=LOW:HIGH), or preset: those of the robot's preset."
-    ),
-]
 
 
-def scene_of(name: str, reference: str | None, vary: tuple[str, ...] = ()) -> Scene:
-    """A scene by its name, with its own or the reference solver, see `Scene.reference`.
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Options of commands that draw data of a robot or learn it."""
 
-    ``vary``: hidden parameters, see `Variation`.
+    scene: Positional[SceneName]
+    reference: Literal["rk4"] | None = None
+    """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
+    substeps."""
+    vary: tuple[str, ...] = ()
+    """Hidden parameters that differ from trajectory to trajectory, as mass:pole=0.3:3.0
+    (KIND:TARGET=LOW:HIGH), or preset: those of the robot's preset."""
 
-    Raises:
-        ValueError: no such scene, parameter or range.
-    """
-    scene = load_scene(name)
-    ranges: dict[str, Sequence[float]] = {}
-    for given in vary:
-        if given == "preset":
-            if not preset_of(name).variation:
-                raise ValueError(
-                    f"expected NAME=LOW:HIGH for '{name}', which has no preset to vary"
-                )
-            ranges |= preset_of(name).variation
-            continue
-        parameter, _, ends = given.partition("=")
-        try:
-            low, high = map(float, ends.split(":"))
-        except ValueError:
-            raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
-        if parameter in {name.partition("=")[0] for name in vary if name != given}:
-            raise ValueError(f"expected '{parameter}' once, got it several times")
-        ranges[parameter] = low, high
-    scene = scene.reference if reference else scene
-    return scene.vary(ranges) if ranges else scene
+    def load(self) -> Scene:
+        """The scene with its own or the reference solver, and with what varies.
 
+        Raises:
+            ValueError: no such scene, parameter or range.
+        """
+        scene, ranges = load_scene(self.scene), dict[str, Sequence[float]]()
+        for given in self.vary:
+            if given == "preset":
+                if not preset_of(self.scene).variation:
+                    raise ValueError(
+                        f"expected NAME=LOW:HIGH for '{self.scene}', which has no preset "
+                        "to vary"
+                    )
+                ranges |= preset_of(self.scene).variation
+                continue
+            parameter, _, ends = given.partition("=")
+            try:
+                low, high = map(float, ends.split(":"))
+            except ValueError:
+                raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
+            if parameter in {x.partition("=")[0] for x in self.vary if x != given}:
+                raise ValueError(f"expected '{parameter}' once, got it several times")
+            ranges[parameter] = low, high
+        scene = scene.reference if self.reference else scene
+        return scene.vary(ranges) if ranges else scene
 
-def run_name(name: str, reference: str | None, vary: tuple[str, ...] = ()) -> str:
-    """The folder under ``datasets`` and ``runs`` that belongs to it."""
-    about = [
-        word for word, is_so in ((reference, reference), ("varied", vary)) if is_so
-    ]
-    return "-".join((folder_name(name), *map(str, about)))
+    @property
+    def run_name(self) -> str:
+        """The folder under ``datasets`` and ``runs`` that belongs to it."""
+        varied = "varied" if self.vary else None
+        return "-".join(filter(None, (folder_name(self.scene), self.reference, varied)))
 
 
 def recorded_scene(name: str) -> Scene:

@@ -8,15 +8,7 @@ import torch
 
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
 from torchrl_nerd.cli.command import DeviceCommand
-from torchrl_nerd.cli.options import (
-    Flat,
-    Positional,
-    Reference,
-    SceneName,
-    Vary,
-    run_name,
-    scene_of,
-)
+from torchrl_nerd.cli.options import Flat, SceneOptions
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import CARD, expect_few_dropped, generate, load_data
 from torchrl_nerd.data.strategies import preset_strategy
@@ -33,7 +25,7 @@ Kind = Literal["learned", "hybrid"]
 
 
 @dataclass(frozen=True)
-class Train(DeviceCommand):
+class Train(SceneOptions, DeviceCommand):
     """Train a model of a scene, by default with the settings of its training preset.
 
     Robots without a preset share one. Missing data are generated first. An interrupted
@@ -46,7 +38,6 @@ class Train(DeviceCommand):
     Example: nerd train ant --init-from ant-mlp --data datasets/ant datasets/ant_policy
     """
 
-    scene: Positional[SceneName]
     kind: Kind = "learned"
     """A learned model, or a hybrid where the preset has one."""
     out: Path | None = None
@@ -55,8 +46,6 @@ class Train(DeviceCommand):
     """Folders of data sets; default datasets/SCENE, generated if it does not exist."""
     init_from: str | None = None
     """Continue training from a shipped model (its name) or a checkpoint (its folder)."""
-    reference: Reference = None
-    vary: Vary = ()
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
     export: Path | None = None
     """Folder to copy the checkpoint to that the preset chooses, best or last."""
@@ -77,7 +66,7 @@ class Train(DeviceCommand):
     @property
     def folders(self) -> tuple[Path, tuple[Path, ...]]:
         """Of the run and of its data sets."""
-        name = run_name(self.scene, self.reference, self.vary)
+        name = self.run_name
         run = name if self.kind == "learned" else f"{name}-hybrid"
         return self.out or Path("runs") / run, self.data or (Path("datasets") / name,)
 
@@ -99,7 +88,7 @@ class Train(DeviceCommand):
 
     def plan(self) -> list[str]:
         """Which model would be trained on which data, and what exists already."""
-        scene = scene_of(self.scene, self.reference, self.vary)
+        scene = self.load()
         out, folders = self.folders
         initial = self.initial(scene)
         if initial is None:
@@ -121,7 +110,7 @@ class Train(DeviceCommand):
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the preset chooses."""
-        scene = scene_of(self.scene, self.reference, self.vary)
+        scene = self.load()
         preset, (out, folders) = preset_of(self.scene), self.folders
         initial = self.initial(scene)
         for folder in filter(None, (out, self.export)):

@@ -18,14 +18,12 @@ def ray_map(
 ) -> Iterator[Result]:
     """Results of ``map`` in its order; each call runs on one processor of the cluster.
 
-    A call whose worker or node is lost is repeated on another one. At most one call more
-    than the cluster has processors is running or finished, so memory stays bounded.
+    A call whose worker or node is lost is repeated on another one, so that results must
+    depend on items alone. At most one call more than the cluster has processors is running
+    or finished: memory stays bounded.
 
-    Args:
-        function: sent to the workers by cloudpickle; its result depends on its item alone.
-        items: its arguments, one per call.
-        address: ``HOST:PORT`` of a cluster, ``auto`` to find it, or ``local`` for a new one
-            on this machine. An open connection is used as it is.
+    ``address`` is ``HOST:PORT`` of a cluster, ``auto`` to find it, or ``local`` for a new
+    one on this machine. An open connection is used as it is.
 
     Raises:
         ModuleNotFoundError: no Ray.

@@ -66,32 +66,22 @@ def generate(
 ) -> Path:
     """Write a data set, or finish one that was interrupted.
 
-    Args:
-        scene: the robot.
-        config: what to draw.
-        folder: of the data set; a finished one of the same card is left as it is.
-        quiet: no progress bar.
-        strategy: name and function of another way to draw trajectories than `simulate`.
-        mapper: draws the chunks: here, or on other machines as `ray_map`.
+    A finished one of the same card is left as it is. ``strategy``: name and function of
+    another way to draw trajectories than `simulate`. ``mapper`` draws the chunks: here, or
+    on other machines as `ray_map`.
 
     Raises:
         ValueError: the folder cannot be written or holds data of another card.
     """
     name, draw = strategy or (None, partial(simulate, scene))
     card = _open_card(scene, config, writable_folder(folder), name)
-    first, count = card["chunks_done"], -(-config.trajectories // CHUNK)
-    chunks = [
-        (number, min(CHUNK, config.trajectories - number * CHUNK))
-        for number in range(first, count)
-    ]
-    wanted, done = config.trajectories, min(first * CHUNK, config.trajectories)
+    sizes = [CHUNK] * (config.trajectories // CHUNK)
+    sizes += [config.trajectories % CHUNK] * (config.trajectories % CHUNK > 0)
+    chunks = list(enumerate(sizes))[card["chunks_done"] :]
+    done = sum(sizes[: card["chunks_done"]])
     how = {"desc": f"data {scene.name}", "unit": " transitions", "unit_scale": True}
-    with tqdm(
-        total=wanted * config.steps,
-        initial=done * config.steps,
-        disable=quiet,
-        **how,
-    ) as bar:
+    how |= {"total": config.trajectories * config.steps, "initial": done * config.steps}
+    with tqdm(**how, disable=quiet) as bar:
         drawn = mapper(partial(draw_chunk, draw, config), chunks)
         for (number, rows), data in zip(chunks, drawn, strict=True):
             sound = is_sound(data)
@@ -99,9 +89,8 @@ def generate(
             write_chunk(kept, chunk_path(folder, number))
             card["trajectories"] += len(kept)
             card["dropped"] += rows - len(kept)
-            counts = Counter(card.setdefault("beyond", {}))
-            counts.update(first_beyond(scene, cast(TensorDict, data[~sound])))
-            card["beyond"] = dict(counts)
+            beyond = first_beyond(scene, cast(TensorDict, data[~sound]))
+            card["beyond"] = Counter(card.get("beyond")) + Counter(beyond)
             card["chunks_done"] = number + 1
             write_json(folder / CARD, card)
             bar.update(rows * config.steps)
@@ -114,16 +103,15 @@ def expect_few_dropped(card: dict[str, Any]) -> None:
     Raises:
         ValueError: how many, and what left the bounds first.
     """
-    dropped, kept = card["dropped"], card["trajectories"]
-    if dropped <= MOST_DROPPED * (dropped + kept):
-        return
-    beyond = Counter(card.get("beyond", {})).most_common(3)
+    dropped, count = card["dropped"], card["dropped"] + card["trajectories"]
+    beyond = Counter(card.get("beyond")).most_common(3)
     first = ", ".join(f"{name} in {count}" for name, count in beyond)
-    raise ValueError(
-        f"expected nearly all trajectories to stay within {LARGEST:g}, {dropped} of "
-        f"{dropped + kept} did not; first beyond it: {first}. Give the robot narrower "
-        "ranges, weaker actuators or more damping, or a shorter timestep"
-    )
+    if dropped > MOST_DROPPED * count:
+        raise ValueError(
+            f"expected nearly all trajectories to stay within {LARGEST:g}, {dropped} of "
+            f"{count} did not; first beyond it: {first}. Give the robot narrower ranges, "
+            "weaker actuators or more damping, or a shorter timestep"
+        )
 
 
 def load_data(scene: Scene, *folders: Path) -> TensorDict:

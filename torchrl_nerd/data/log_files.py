@@ -17,8 +17,6 @@ from torchrl_nerd import __version__
 from torchrl_nerd.data.generate import CARD
 from torchrl_nerd.data.physics_checks import check_log
 from torchrl_nerd.data.recorded import (
-    CONTROL,
-    TORQUE,
     Recording,
     complete,
     is_free_body,
@@ -26,10 +24,11 @@ from torchrl_nerd.data.recorded import (
 )
 from torchrl_nerd.data.store import chunk_path, write_chunk
 from torchrl_nerd.files import writable_folder, write_json
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import num_ctrl
 
+TORQUE, CONTROL = JOINT_TORQUE[-1], CTRL[-1]
 FREE_BODY = {
     "position": ("x", "y", "z"),
     "quaternion_wxyz": ("qw", "qx", "qy", "qz"),

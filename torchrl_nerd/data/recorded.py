@@ -6,13 +6,21 @@ from itertools import pairwise
 import numpy as np
 import torch
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_nerd.geometry.manifold import differentiate_pos, integrate_pos
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import (
+    CTRL,
+    JOINT_TORQUE,
+    NEXT_QPOS,
+    NEXT_QVEL,
+    QPOS,
+    QVEL,
+    TERRAIN,
+)
 from torchrl_nerd.scenes import Scene
 
-TORQUE, CONTROL = "joint_torque", "ctrl"
 SPLIT_SEED, TRAIN_SHARE, VALIDATION_SHARE = 0, 380 / 510, 65 / 510
 CLEAR = 0.005  # m between the lowest contact point and the ground: free flight
 FLIGHT = 8  # frames at the start of a trajectory in which free fall is measured
@@ -36,11 +44,11 @@ class Recording:
         return len(self.offsets) - 1
 
     @property
-    def columns(self) -> dict[str, Tensor]:
-        """States and what drives them by their keys, ``(N, *)``."""
-        found = {QPOS: self.qpos, QVEL: self.qvel, TORQUE: self.joint_torque}
-        extra = {TERRAIN: self.terrain, CONTROL: self.ctrl}
-        return found | {k: value for k, value in extra.items() if value is not None}
+    def columns(self) -> dict[NestedKey, Tensor]:
+        """States and what drives them, ``(N, *)``, by the keys of every other data set."""
+        found = {QPOS: self.qpos, QVEL: self.qvel, JOINT_TORQUE: self.joint_torque}
+        found |= {TERRAIN: self.terrain, CTRL: self.ctrl}
+        return {key: value for key, value in found.items() if value is not None}
 
     @property
     def inside(self) -> Tensor:
@@ -54,7 +62,8 @@ class Recording:
         rows = self.starts(1, numbers)
         counts = self.offsets.diff()[numbers]
         ends = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
-        kept = {name: column[rows] for name, column in self.columns.items()}
+        names = {key: key if isinstance(key, str) else key[-1] for key in self.columns}
+        kept = {names[key]: column[rows] for key, column in self.columns.items()}
         return replace(self, **kept, offsets=ends, time=None)
 
     def starts(self, states: int, numbers: Tensor | None = None) -> Tensor:
@@ -99,16 +108,9 @@ class Recording:
         """
         after = self.inside.nonzero()[:, 0]
         now = {key: column[after - 1] for key, column in self.columns.items()}
-        moved = {QPOS: self.qpos[after], QVEL: self.qvel[after]}
-        moved |= {key: now.pop(key) for key in (TORQUE, CONTROL) if key in now}
-        size, number = [len(after)], self.trajectory_of(after)
-        other = {"next": TensorDict(moved, size), "collector": {"traj_ids": number}}
-        return TensorDict({**now, **other}, size)
-
-
-def command_of(window: TensorDict) -> Tensor:
-    """What is held over the steps of a window: servos' controls, or the torque."""
-    return window.get(CONTROL, window[TORQUE])
+        moved = {NEXT_QPOS: self.qpos[after], NEXT_QVEL: self.qvel[after]}
+        number = {("collector", "traj_ids"): self.trajectory_of(after)}
+        return TensorDict(now | moved | number, [len(after)])
 
 
 def is_free_body(scene: Scene) -> bool:
@@ -128,10 +130,7 @@ def complete(log: Recording, scene: Scene) -> Recording:
     layout = scene.layout
     qpos = integrate_pos(layout, log.qpos, torch.zeros_like(log.qvel))
     log = replace(log, qpos=qpos)
-    is_missing = log.qvel.isnan()
-    qvel = log.qvel.clone()
-    if is_missing.any():
-        qvel = torch.where(is_missing, estimate_velocities(log, scene), qvel)
+    qvel = torch.where(log.qvel.isnan(), estimate_velocities(log, scene), log.qvel)
     if is_free_body(scene):
         flies = scene.clearances(qpos).amin(-1) > CLEAR
         steady = flies & log.inside

@@ -54,12 +54,9 @@ def as_transitions(
 ) -> TensorDict:
     """A data set ``[rows, steps]`` in TorchRL's layout.
 
-    Args:
-        scene: the robot.
-        states: parts of trajectories, ``[rows, *]``, in order: steps + 1 states in all.
-        commands: of the steps between them, parts of ``(rows, *, m)``.
-        terrain: ``(rows, terrain.size)`` where the ground varies.
-        parameters: ``(rows, variation.size)`` where they vary.
+    ``states`` are parts ``[rows, *]`` of trajectories in order, steps + 1 in all, and
+    ``commands`` parts ``(rows, *, m)`` of what drives them. Where they vary, terrain and
+    parameters are ``(rows, size)``.
     """
     path = cast(TensorDict, TensorDict.cat(states, 1))
     data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))

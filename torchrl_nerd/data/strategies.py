@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, cast
 
 import torch
@@ -86,13 +87,10 @@ def mix(*draws: Draw) -> Draw:
     """Equal shares of each, as nearly as the number of trajectories allows."""
 
     def draw(rows: int, steps: int, generator: Generator) -> TensorDict:
-        ends = [rows * (i + 1) // len(draws) for i in range(len(draws))]
-        counts = [b - a for a, b in zip([0, *ends], ends, strict=False)]
-        parts = [
-            one(count, steps, generator)
-            for one, count in zip(draws, counts, strict=True)
-            if count
-        ]
+        ends = [rows * i // len(draws) for i in range(len(draws) + 1)]
+        counts = [end - start for start, end in pairwise(ends)]
+        shares = zip(draws, counts, strict=True)
+        parts = [one(count, steps, generator) for one, count in shares if count]
         return cast(TensorDict, TensorDict.cat(parts))
 
     return draw

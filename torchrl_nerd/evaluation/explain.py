@@ -29,6 +29,8 @@ from torchrl_nerd.scenes.symmetries import Effect, base_effects, why_all_kept
 from torchrl_nerd.scenes.terrain import PLANE
 
 SERVOS = "; servos: the control is held, MuJoCo evaluates their law in every substep"
+DROPPED = "dropped: the step does not depend on it"
+FALLS = '; it falls freely, unless Scene.from_mjcf(..., terrain="plane") adds one'
 TRAJECTORIES = 64, 20  # and their steps: what self-contacts are counted in
 MEANINGS = {
     ROBOT_TORQUE: "joint torque, N and N m",
@@ -105,9 +107,8 @@ class SceneReport:
             f"\n{'coordinate moved':<30}{'change of step':>16}  feature",
         ]
         for effect in solver.effects:
-            ignored = "dropped: the step does not depend on it"
             what = f"{effect.name} {effect.key}[{effect.address}]"
-            verdict = ignored if effect.is_ignored else "kept"
+            verdict = DROPPED if effect.is_ignored else "kept"
             lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
         if solver.why_all_kept is not None:
             lines.append(f"every hinge and slide is kept: {solver.why_all_kept}")
@@ -125,16 +126,14 @@ class SceneReport:
         if bodies:
             on = ", ".join(f"{body} {count}" for body, count in bodies)
             lines.append(f"contact points kept, by body: {on}")
-        return "\n".join(
-            [
-                *lines,
-                f"self-contacts: {self._touching()}",
-                f"terrain: {self.terrain}",
-                f"control step: {solver.control_step:.6g} s, {solver.solver}",
-                f"controller: {self.controller}",
-                f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
-            ]
-        )
+        lines += [
+            f"self-contacts: {self._touching()}",
+            f"terrain: {self.terrain}",
+            f"control step: {solver.control_step:.6g} s, {solver.solver}",
+            f"controller: {self.controller}",
+            f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
+        ]
+        return "\n".join(lines)
 
     def _touching(self) -> str:
         """Which bodies touch each other, and in how many states of training data."""
@@ -162,12 +161,10 @@ def explain(scene: Scene) -> SceneReport:
     sizes = {**features.robot.sizes, **features.contact.sizes}
     meanings = {ROBOT_STATE: _state_meaning(scene), **MEANINGS}
     found, kept = scene.contacts.stands_for, len(scene.contacts)
-    fixed = found.count(-1)
+    fixed, controller = found.count(-1), scene.controller
     servos = scene.servos is not None
     effects = base_effects(model, scene.base, scene.substeps, servos)
-
     step, reason = _analytic_step(scene)
-    controller = scene.controller
     return SceneReport(
         scene=scene.name,
         features=tuple(Feature(str(k), n, meanings[str(k)]) for k, n in sizes.items()),
@@ -184,10 +181,7 @@ def explain(scene: Scene) -> SceneReport:
             contact_error=scene.contacts.error,
         ),
         contact_bodies=tuple(body_label(model, b) for b in scene.contacts.bodies),
-        self_contacts=tuple(
-            SelfContact((body_label(model, low), body_label(model, high)), share)
-            for (low, high), share in _self_contacts(scene)
-        ),
+        self_contacts=_self_contacts(scene),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
         controller=f"{type(controller).__name__}, {controller.num_actions} actions"
         + SERVOS * servos,
@@ -196,19 +190,23 @@ def explain(scene: Scene) -> SceneReport:
     )
 
 
-def _self_contacts(scene: Scene) -> list[tuple[tuple[int, int], float]]:
-    """Pairs of bodies that can touch and their share of touching states, most first."""
-    bodies = scene.model.geom_bodyid
-    pairs = {
-        (int(low), int(high)): 0.0
-        for low, high in np.sort(bodies[own_contacts(scene.model)]).reshape(-1, 2)
-    }
-    if pairs:
-        data = simulate(scene, *TRAJECTORIES, Generator().manual_seed(0))
-        states = data["next", QPOS][is_sound(data)].flatten(0, 1)
-        counts = Counter(chain.from_iterable(touching_bodies(scene.model, states)))
-        pairs |= {pair: counts[pair] / max(1, len(states)) for pair in pairs}
-    return sorted(pairs.items(), key=lambda item: (-item[1], item[0]))
+def _self_contacts(scene: Scene) -> tuple[SelfContact, ...]:
+    """Pairs of bodies that can touch, those that touch most often first."""
+    model = scene.model
+    bodies = np.sort(model.geom_bodyid[own_contacts(model)]).reshape(-1, 2)
+    pairs = {(int(low), int(high)) for low, high in bodies}
+    if not pairs:
+        return ()
+    data = simulate(scene, *TRAJECTORIES, Generator().manual_seed(0))
+    states = data["next", QPOS][is_sound(data)].flatten(0, 1)
+    counts = Counter(chain.from_iterable(touching_bodies(model, states)))
+    return tuple(
+        SelfContact(
+            (body_label(model, low), body_label(model, high)),
+            counts[low, high] / max(1, len(states)),
+        )
+        for low, high in sorted(pairs, key=lambda pair: (-counts[pair], pair))
+    )
 
 
 def _state_meaning(scene: Scene) -> str:
@@ -216,19 +214,14 @@ def _state_meaning(scene: Scene) -> str:
     parts = ["base velocity and gravity in the base frame"] * scene.base.is_floating
     parts.append("joint positions (sine and cosine of a hinge without limits)")
     parts.append("joint velocities")
-    if scene.model.jnt_limited.any():
-        parts.append("gaps to joint limits")
+    parts += ["gaps to joint limits"] * bool(scene.model.jnt_limited.any())
     return ", ".join(parts)
 
 
 def _terrain(scene: Scene, has_normal: bool) -> str:
     terrain = scene.terrain
     if terrain is None:
-        falls = (
-            '; it falls freely, unless Scene.from_mjcf(..., terrain="plane") adds one'
-        )
-        is_free = scene.base.is_floating
-        return "none that the robot can touch" + (falls if is_free else "")
+        return "none that the robot can touch" + FALLS * scene.base.is_floating
     planes = sum(surface.kind == PLANE for surface in terrain.surfaces)
     where = "drawn for each trajectory" if terrain.is_per_row else "fixed"
     normal = "a feature" if has_normal else "no feature: it follows from the state"

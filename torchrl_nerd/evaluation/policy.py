@@ -28,9 +28,7 @@ FURTHEST = 10.0  # standard deviations from the mean that a network is shown
 def mlp(sizes: Sequence[int], last_gain: float = 1.0) -> nn.Sequential:
     """Linear layers with tanh between, orthogonal weights, zero biases.
 
-    Args:
-        sizes: widths from input to output.
-        last_gain: scale of the last layer's weights; small for a cautious start.
+    ``last_gain``: scale of the last layer's weights; small for a cautious start.
     """
     linears = [nn.Linear(*pair) for pair in zip(sizes[:-1], sizes[1:], strict=True)]
     for linear in linears:
@@ -44,12 +42,9 @@ def mlp(sizes: Sequence[int], last_gain: float = 1.0) -> nn.Sequential:
 class Standardize(nn.Module):
     """(x - mean) / std, with constants that are saved with the weights.
 
-    Of several observations side by side x is the last one and the changes that led to it,
-    which have a mean and a spread of their own: velocities are not lost beside positions.
-
-    Args:
-        size: of all observations together.
-        frame_stack: how many they are.
+    Of ``frame_stack`` observations side by side, ``size`` numbers together, x is the last
+    one and the changes that led to it. These have a mean and a spread of their own, so that
+    velocities are not lost beside positions.
     """
 
     mean: Tensor
@@ -95,7 +90,7 @@ class Policy(nn.Module):
 
     Args:
         sizes: D, the widths of the hidden layers, A.
-        std: what the standard deviation begins at.
+        std: at the start.
         frame_stack: how many observations D holds, see `stack_frames`.
     """
 
@@ -118,14 +113,10 @@ class Policy(nn.Module):
         std: float = 1.0,
         frame_stack: int = 1,
     ) -> "Policy":
-        """A fresh one, standardised by the observations that random actions meet.
+        """A fresh one, standardised by what so many random ``steps`` of the env show.
 
-        Args:
-            env: shows ``frame_stack`` observations side by side, see `stack_frames`.
-            steps: of each row under random actions.
-            widths: of the hidden layers.
-            std: what the standard deviation begins at.
-            frame_stack: how many observations it sees.
+        The env shows ``frame_stack`` observations side by side, see `stack_frames`.
+        ``widths`` are of the hidden layers.
         """
         seen = env.rollout(steps, break_when_any_done=False)[OBSERVATION]
         sizes = (seen.shape[-1], *widths, env.action_spec.shape[-1])
@@ -160,10 +151,7 @@ def save_policy(
 ) -> Path:
     """Write weights, then card, each whole or not at all; nothing is pickled.
 
-    Args:
-        policy: what to save.
-        folder: where; made if missing.
-        card: what else to say: task, dynamics it was trained in, configuration.
+    ``card``: what else to say: task, dynamics it was trained in, configuration.
     """
     folder = writable_folder(Path(folder))
     write_tensors(folder / WEIGHTS, policy.state_dict())
@@ -173,11 +161,7 @@ def save_policy(
 
 
 def load_policy(folder: Path | str, task: Task | None = None) -> Policy:
-    """A policy from a folder that `save_policy` wrote.
-
-    Args:
-        folder: where.
-        task: what it must fit; not checked where not given.
+    """A policy from a folder that `save_policy` wrote; it must fit the task, if given.
 
     Raises:
         ValueError: in one sentence, what is missing, broken or of another shape.
@@ -186,9 +170,8 @@ def load_policy(folder: Path | str, task: Task | None = None) -> Policy:
     card = _read_card(folder)
     found, frame_stack = card.get("sizes"), card.get("frame_stack", 1)
     sizes = found if isinstance(found, list) else []
-    if not 2 <= len(sizes) <= MOST_LAYERS or not all(
-        type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes
-    ):
+    is_whole = all(type(size) is int and 0 < size <= LARGEST_SIZE for size in sizes)
+    if not (is_whole and 2 <= len(sizes) <= MOST_LAYERS):
         raise ValueError(f"expected the layer sizes in {folder / CARD}, got {found!r}")
     if type(frame_stack) is not int or frame_stack < 1 or sizes[0] % frame_stack:
         raise ValueError(

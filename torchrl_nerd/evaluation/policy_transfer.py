@@ -36,27 +36,16 @@ NOTE = (
 
 @dataclass(frozen=True)
 class ReturnSummary:
-    """Returns of a policy in one dynamics.
+    """Returns of a policy in one dynamics."""
 
-    | field | meaning |
-    |---|---|
-    | ``kind`` | of the dynamics: ground truth, learned, hybrid or analytic |
-    | ``model`` | its name |
-    | ``episodes`` | how many |
-    | ``mean``, ``std`` | of the returns over episodes |
-    | ``interval`` | half width of the 95% interval of the mean |
-    | ``difference`` | to the ground truth over the same initial states, a share |
-    | ``difference_interval`` | half width of its 95% interval, from paired differences |
-    """
-
-    kind: str
-    model: str
+    kind: str  # of the dynamics: ground truth, learned, hybrid or analytic
+    model: str  # its name
     episodes: int
-    mean: float
+    mean: float  # over episodes
     std: float
-    interval: float
-    difference: float
-    difference_interval: float
+    interval: float  # half width of the 95% interval of the mean
+    difference: float  # to the ground truth over the same initial states, a share
+    difference_interval: float  # half width of its interval, from paired differences
 
 
 @torch.no_grad()
@@ -83,14 +72,10 @@ def policy_returns(env: SceneEnv, actor: Actor) -> Tensor:
 def summarize(
     returns: Tensor, ground_truth: Tensor, kind: str = "learned", model: str = ""
 ) -> ReturnSummary:
-    """Mean, spread and return difference.
+    """Mean, spread and return difference of ``returns (episodes,)``.
 
-    Args:
-        returns: ``(episodes,)``.
-        ground_truth: ``(episodes,)`` in the ground truth; entry i of both began in the
-            same state. The difference is over the entries that both have.
-        kind: of the dynamics.
-        model: its name.
+    Entry i of them and of those in the ``ground_truth`` began in the same state. The
+    difference is over the entries that both have.
 
     Raises:
         ValueError: fewer than two episodes, or returns of zero, which have no difference.
@@ -124,7 +109,7 @@ def transfer(
     device: torch.device | str = "cpu",
     quiet: bool = True,
 ) -> dict[str, ReturnSummary]:
-    """The same policy from the same initial states in each dynamics.
+    """The same policy from the same initial states in each dynamics, by its name.
 
     Args:
         task: a task, or its id.
@@ -134,10 +119,7 @@ def transfer(
         slow_episodes: the first so many of them in dm_control, which steps one by one.
         seed: of the initial states.
         device: where all envs live.
-        quiet: no progress bar, as by default.
-
-    Returns:
-        Summaries by name of the dynamics.
+        quiet: no progress bar.
 
     Raises:
         ValueError: see `summarize` and `make_env`.
@@ -165,8 +147,7 @@ def model_title(scene: Scene, name: str) -> str:
 
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     """Lines for the terminal: one dynamics each, with 95% intervals."""
-    head = ["dynamics", "kind", "model", "episodes", "return", "std"]
-    head.append("return difference")
+    head = "dynamics", "kind", "model", "episodes", "return", "std", "return difference"
     body = []
     for name, s in summaries.items():
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"

@@ -12,13 +12,14 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.analytic import make_step
-from torchrl_nerd.data.recorded import Recording, command_of
+from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import NoMotion, has_step
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import command_of
 
 STATES = 80  # of a window, the start among them
 DRAWS = 2000  # of the trajectories, for intervals
@@ -32,18 +33,15 @@ Errors = dict[str, Tensor]
 def window_errors(
     dynamics: Dynamics, recording: Recording, starts: Tensor, states: int = STATES
 ) -> Errors:
-    """Errors after each step of rollouts from recorded states.
+    """Errors after each step of rollouts over so many ``states`` of a recording.
 
-    Args:
-        dynamics: of any kind.
-        recording: trajectories of its scene.
-        starts: rows of the first states, ``(windows,)``.
-        states: of a window.
+    ``starts``: rows of the first states, ``(windows,)``.
     """
     found = []
     for part in starts.split(PART):
         window = recording.windows(part, states)  # [windows, states]
-        path = open_loop(dynamics, window[:, 0], states - 1, command_of(window))
+        command = command_of(dynamics.scene, window)
+        path = open_loop(dynamics, window[:, 0], states - 1, command)
         measured = window[QPOS][:, 1:]  # (windows, states - 1, nq)
         found.append(position_errors(dynamics.scene, measured, path))
     return {name: torch.cat([part[name] for part in found]) for name in found[0]}
@@ -57,10 +55,7 @@ def error_key(scene: Scene, quantity: str, joint: str = "_error_") -> str:
 def resampled_means(values: Tensor, group: Tensor, draws: int = DRAWS) -> Tensor:
     """Means over windows of trajectories drawn with replacement, ``(draws,)``.
 
-    Args:
-        values: of each window, ``(windows,)``.
-        group: number of each window's trajectory, ``(windows,)``.
-        draws: how many.
+    ``values`` of windows, and the numbers of their trajectories, ``group``: ``(windows,)``.
     """
     found, number = group.unique(return_inverse=True)
     sums = torch.zeros(len(found)).to(values).index_add(0, number, values)
@@ -72,12 +67,9 @@ def resampled_means(values: Tensor, group: Tensor, draws: int = DRAWS) -> Tensor
 
 
 def paired_interval(a: Tensor, b: Tensor, group: Tensor) -> tuple[float, float]:
-    """95% interval of mean(a) - mean(b), over trajectories, of the same windows.
+    """95% interval over trajectories of mean(a) - mean(b), errors ``(windows, steps)``.
 
-    Args:
-        a: errors ``(windows, steps)``.
-        b: others, likewise.
-        group: number of each window's trajectory, ``(windows,)``.
+    ``group``: number of each window's trajectory, ``(windows,)``.
     """
     means = resampled_means((a - b).mean(1), group)  # (draws,)
     low, high = means.quantile(means.new_tensor((0.025, 0.975))).tolist()
@@ -123,14 +115,7 @@ def compare(
 
     ``against`` holds, for every other model, 95% intervals over trajectories of the errors
     less the other's: below 0 the model is ahead. Its keys are ``m`` and ``rad`` for the
-    base, names for joints.
-
-    Args:
-        models: by name.
-        scene: of the recording.
-        recording: trajectories.
-        starts: rows of the first states.
-        states: of a window.
+    base, names for joints. ``starts`` and ``states``: see `window_errors`.
     """
     errors = {
         name: window_errors(dynamics, recording, starts, states)
@@ -166,19 +151,16 @@ def errors_as_text(
 ) -> str:
     """The rows of `compare` as text, published mean errors last."""
     columns = ("mean", "interval", "median", "final", "p95", "first")
-    head = [f"{states} states", "quantity", *columns]
-    rows = [
-        (name, key, [error[c] for c in columns])
-        for name, row in table.items()
+    found: list[tuple[str, Mapping[str, Any]]] = [*table.items()]
+    for name, means in published.items():
+        found.append((name, {key: {"mean": mean} for key, mean in means.items()}))
+    body = [
+        [
+            *(name, key.replace("_error_", " ")),
+            *(f"{error[c]:.4f}" if c in error else "" for c in columns),
+        ]
+        for name, row in found
         for key, error in row.items()
         if key != "against"
     ]
-    rows += [
-        (n, key, [mean]) for n, row in published.items() for key, mean in row.items()
-    ]
-    body = [
-        [name, key.replace("_error_", " "), *(f"{x:.4f}" for x in values)]
-        for name, key, values in rows
-    ]
-    blank = [""] * len(columns)
-    return text_table(head, [(line + blank)[: len(head)] for line in body])
+    return text_table([f"{states} states", "quantity", *columns], body)

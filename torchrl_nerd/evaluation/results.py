@@ -6,6 +6,7 @@ was measured.
 """
 
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -37,11 +38,7 @@ def make_record(
 ) -> dict[str, Any]:
     """Results with their command line, commit, machine and seed.
 
-    Args:
-        results: what was measured.
-        seed: one or several; None where nothing is random.
-        command: that makes them again; the running script's by default.
-        device: of the models.
+    Without ``command`` it is the running script's; without a seed nothing is random.
     """
     return {
         "command": command or script_command(),
@@ -67,7 +64,7 @@ def write_results(
 
 def script_command() -> str:
     """The command line of the running script, from the repository's root."""
-    script, words = Path(sys.argv[0]), list(sys.argv[1:])
+    script, words = Path(sys.argv[0]), sys.argv[1:]
     if "--json" in words:
         at = words.index("--json")
         del words[at : at + 2]
@@ -127,11 +124,9 @@ def machine(device: str = "cpu") -> dict[str, Any]:
 
 def _processor() -> str:
     information = Path("/proc/cpuinfo")
-    if information.exists():
-        for line in information.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    said = information.read_text() if information.exists() else ""
+    model = re.search(r"^model name\s*:\s*(.*)$", said, re.M)
+    return model[1] if model else platform.processor() or platform.machine()
 
 
 def versions(*packages: str) -> dict[str, str]:

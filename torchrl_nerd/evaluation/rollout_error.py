@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import cast
 
-import mujoco
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics
-from torchrl_nerd.geometry.manifold import joint_label
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE, joint_label
 from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
@@ -33,22 +32,13 @@ def scene_of(source: Source) -> Scene:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Error of one quantity over a horizon.
+    """Error of one quantity over a horizon."""
 
-    | field | meaning |
-    |---|---|
-    | ``unit`` | m or rad |
-    | ``mean`` | over all steps and trajectories |
-    | ``interval`` | half width of the 95% interval of the mean, over trajectories |
-    | ``final`` | mean over trajectories at the last step |
-    | ``p95`` | 95th percentile over trajectories of their mean over time |
-    """
-
-    unit: str
-    mean: float
-    interval: float
-    final: float
-    p95: float
+    unit: str  # m or rad
+    mean: float  # over all steps and trajectories
+    interval: float  # half width of the mean's 95% interval, over trajectories
+    final: float  # mean over trajectories at the last step
+    p95: float  # 95th percentile over trajectories of their mean over time
 
 
 def initial_states(source: Source, num_trajectories: int, seed: int) -> TensorDict:
@@ -83,70 +73,29 @@ def action_drive(
     # (steps, n, num_actions), the same for every dynamics
     actions = 2.0 * draw - 1.0 if random_actions else torch.zeros_like(draw)
 
-    def told(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+    def act(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         qpos, qvel = state[QPOS], state[QVEL]
         return actuate(source.controller, actions[step].to(qpos.device), qpos, qvel)
 
-    return told
+    return act
 
 
-def open_loop(
+def states_of(
     dynamics: Dynamics,
     start: TensorDict,
     steps: int,
     command: Tensor | Drive | None = None,
-    stop_at_nan: bool = False,
-) -> Tensor:
-    """Positions after each step, ``(n, steps, nq)``.
-
-    Args:
-        dynamics: any.
-        start: ``qpos``, ``qvel`` and, where the terrain varies, ``terrain``, ``[n]``.
-        steps: control steps.
-        command: ``(n, steps, m)``, torques or servos' controls; or a function of step and
-            state; None for no torque (passive motion), or servos in mid range.
-        stop_at_nan: stop once a trajectory is not finite; what is left is NaN. An engine
-            takes long over states that diverge.
-    """
-    shape = (len(start), steps, start[QPOS].shape[1])
-    positions = torch.full(shape, torch.nan).to(start[QPOS])
-    for step, state in enumerate(_states(dynamics, start, steps, command)):
-        positions[:, step] = state[QPOS]
-        if stop_at_nan and not state[QPOS].isfinite().all():
-            break
-    return positions
-
-
-def rollout(
-    dynamics: Dynamics,
-    start: TensorDict,
-    steps: int,
-    command: Tensor | Drive | None = None,
-    every: int = 1,
-) -> TensorDict:
-    """``qpos`` and ``qvel``, ``[n, 1 + steps // every]``, the start first.
-
-    Args:
-        dynamics: any.
-        start: see `open_loop`.
-        steps: control steps.
-        command: ``(n, T, m)``, repeated after T steps; else as of `open_loop`.
-        every: steps between two states that are kept.
-    """
-    kept: list[TensorDictBase] = [start.select(QPOS, QVEL)]
-    for step, state in enumerate(_states(dynamics, start, steps, command), 1):
-        if step % every == 0:
-            kept.append(state.select(QPOS, QVEL))
-    return cast(TensorDict, TensorDict.stack(kept, 1))
-
-
-def _states(
-    dynamics: Dynamics,
-    start: TensorDict,
-    steps: int,
-    command: Tensor | Drive | None,
 ) -> Iterator[TensorDictBase]:
-    """The state after each step."""
+    """The state ``[n]`` after each step of a rollout.
+
+    Args:
+        dynamics: any; what it remembers is forgotten.
+        start: ``qpos``, ``qvel``; where they vary ``terrain`` and ``parameters``; ``[n]``.
+        steps: control steps.
+        command: ``(n, T, m)``, torques or servos' controls, repeated after T steps; or a
+            function of step and state; None for no torque (passive motion), or servos in
+            mid range.
+    """
     terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL, PARAMETERS, strict=False)
     if command is None:
@@ -162,6 +111,45 @@ def _states(
         yield state
 
 
+def open_loop(
+    dynamics: Dynamics,
+    start: TensorDict,
+    steps: int,
+    command: Tensor | Drive | None = None,
+    stop_at_nan: bool = False,
+) -> Tensor:
+    """Positions after each step, ``(n, steps, nq)``; see `states_of`.
+
+    ``stop_at_nan``: stop once a trajectory is not finite; what is left is NaN. An engine
+    takes long over states that diverge.
+    """
+    shape = (len(start), steps, start[QPOS].shape[1])
+    positions = torch.full(shape, torch.nan).to(start[QPOS])
+    for step, state in enumerate(states_of(dynamics, start, steps, command)):
+        positions[:, step] = state[QPOS]
+        if stop_at_nan and not state[QPOS].isfinite().all():
+            break
+    return positions
+
+
+def rollout(
+    dynamics: Dynamics,
+    start: TensorDict,
+    steps: int,
+    command: Tensor | Drive | None = None,
+    every: int = 1,
+) -> TensorDict:
+    """``qpos`` and ``qvel`` at the start and ``every`` so many steps; see `states_of`.
+
+    ``[n, 1 + steps // every]``.
+    """
+    kept: list[TensorDictBase] = [start.select(QPOS, QVEL)]
+    for step, state in enumerate(states_of(dynamics, start, steps, command), 1):
+        if step % every == 0:
+            kept.append(state.select(QPOS, QVEL))
+    return cast(TensorDict, TensorDict.stack(kept, 1))
+
+
 def position_errors(
     scene: Scene, ground_truth: Tensor, other: Tensor
 ) -> dict[str, Tensor]:
@@ -174,19 +162,18 @@ def position_errors(
     model, both, joints, props = scene.model, (ground_truth, other), {}, {}
     for joint in range(model.njnt):
         q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
+        if kind == FREE:
             if not scene.base.is_floating or q != scene.base.qpos_address:
                 body = model.body(model.jnt_bodyid[joint]).name
                 label = model.joint(joint).name or body or joint_label(model, joint)
                 place, turn = _pose_error(q, *both)
                 props |= {f"{label} position": place, f"{label} orientation": turn}
             continue
-        if kind == mujoco.mjtJoint.mjJNT_BALL:
+        if kind == BALL:
             error = orientation_error(*(x[..., q : q + 4] for x in both))
         else:
             error = ground_truth[..., q] - other[..., q]  # (n, steps)
-            is_hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
-            error = (wrap_angle(error) if is_hinge else error).abs()
+            error = (wrap_angle(error) if kind == HINGE else error).abs()
         joints[joint_label(model, joint)] = error
     if not scene.base.is_floating:
         return joints | props
@@ -209,7 +196,7 @@ def unit_of(scene: Scene, quantity: str) -> str:
     model = scene.model
     kinds = {joint_label(model, i): model.jnt_type[i] for i in range(model.njnt)}
     if quantity in kinds and not scene.base.is_floating:
-        return "m" if kinds[quantity] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+        return "m" if kinds[quantity] == SLIDE else "rad"
     return "m" if quantity.endswith("position") else "rad"
 
 
@@ -256,7 +243,7 @@ def passive_errors(
     steps = max(horizons)
     drive = action_drive(source, num_trajectories, steps, seed, random_actions)
     both = ground_truth, other
-    paths = [open_loop(one, start.to(device), steps, drive) for one in both]
+    paths = (open_loop(one, start.to(device), steps, drive) for one in both)
     errors = position_errors(scene, *paths)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})

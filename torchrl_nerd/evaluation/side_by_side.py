@@ -35,13 +35,8 @@ FORMATS: dict[str, dict[str, Any]] = {  # options of imageio's writers
 class SideBySide:
     """Two envs of one task from one start; a policy acts in each.
 
-    | attribute | meaning |
-    |---|---|
-    | ``envs`` | one per dynamics |
-    | ``names``, ``kinds`` | of the dynamics; a kind is such as ``"learned"`` |
-    | ``returns`` | sum of the rewards so far, of each |
-    | ``steps``, ``seconds`` | so far |
-    | ``ending`` | of the first episode that ended: its dynamics and how; else ``""`` |
+    ``returns`` are sums of the rewards so far; ``ending`` is that of the first episode that
+    ended, its dynamics and how.
 
     Args:
         task: id of a registered task.
@@ -115,7 +110,7 @@ class SideBySide:
 
 
 def check_video(path: Path) -> None:
-    """Check before any work that such a file can be written here.
+    """Refuse, before any work, a file that cannot be written here.
 
     Raises:
         ValueError: another suffix than .gif or .mp4, or a file that cannot be written.
@@ -140,13 +135,8 @@ def write_video(
 ) -> int:
     """Roll out, write a video, whole or not at all, and return its number of frames.
 
-    Args:
-        pair: what is rolled out, until the first of its episodes ends.
-        path: .gif or .mp4.
-        steps: at most so many.
-        width: of a frame with both robots, pixels.
-        slowdown: 2 plays at half speed.
-        quiet: no progress bar.
+    It ends with the first episode of the pair, after at most so many ``steps``. ``width``
+    is of a frame with both robots, pixels; a ``slowdown`` of 2 plays at half speed.
 
     Raises:
         ValueError: see `check_video`, or no OpenGL library works on this machine.
@@ -156,19 +146,19 @@ def write_video(
     import imageio
 
     how = {"format": path.suffix, "mode": "I", **FORMATS[path.suffix]}
-    written = []
+    is_gif, written = path.suffix == ".gif", 0
 
     def write(aside: Path) -> None:
+        nonlocal written
         bar = tqdm(range(steps + 1), "video", unit=" steps", disable=quiet)
         with imageio.get_writer(aside, **how) as opened:
             writer: Any = opened
             for frame in _frames(pair, bar, width, slowdown):
-                is_gif = path.suffix == ".gif"
                 writer.append_data(SHADES[frame] if is_gif else frame)
-                written.append(None)
+                written += 1
 
     write_atomically(path, write)
-    return len(written)
+    return written
 
 
 def _frames(

@@ -30,11 +30,8 @@ MAX_DEPTHS = 0.01, 1.0  # m: with some of the contact points in the ground, and 
 class SignedPermutations(nn.Module):
     """Images of a kind of vector under isometries: ``image[j] = sign[j] x[source[j]]``.
 
-    Sources and signs are found from samples and their images.
-
-    Args:
-        original: samples ``(N, F)``; every entry that is ever not zero is so somewhere.
-        images: the same samples under each isometry, ``(N, F)``.
+    Found from samples ``(N, F)`` and their images under each isometry. Every entry that is
+    ever not zero must be so in a sample.
 
     Raises:
         ValueError: an entry of an image that is none of the original's.
@@ -55,10 +52,7 @@ class SignedPermutations(nn.Module):
         return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
 
     def complete(self, stats: Stats) -> Stats:
-        """Statistics of all images of the samples that ``stats`` is of.
-
-        With these, normalised vectors are renumbered as raw ones are.
-        """
+        """Statistics of all images: with these, normalised vectors map as raw ones do."""
         return Stats.merge_all(
             Stats(stats.count, sign * stats.mean[source], stats.m2[source])
             for source, sign in zip(self.sources, self.signs, strict=True)
@@ -89,8 +83,6 @@ def _match(original: Tensor, image: Tensor) -> tuple[list[int], list[float]]:
 
 class Symmetry(nn.Module):
     """Isometries of a robot, the identity first, and their effect on tokens and targets.
-
-    The permutations of `TOKEN` and `TARGET` are found from random states.
 
     Raises:
         ValueError: see `find_isometries`; a feature that is zero in all of these states;

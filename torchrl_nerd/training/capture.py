@@ -34,11 +34,10 @@ def capture(
 
 
 class Captured:
-    """Replays a function; captured anew for each shape of its arguments.
+    """Replays a function of tensors or None; captured anew for each of their shapes.
 
-    Args:
-        function: of tensors or None; returns one tensor and asks the device for nothing.
-        state: all that it writes to; the calls before a capture leave no trace there.
+    The function returns one tensor and asks the device for nothing. ``state`` is all that
+    it writes to: the calls before a capture leave no trace there.
     """
 
     def __init__(

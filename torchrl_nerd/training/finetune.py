@@ -20,7 +20,7 @@ from torchrl_nerd.analytic import FreeBodyPenaltyStep
 from torchrl_nerd.analytic.free_body import PARAMETERS
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import FinetuneConfig
-from torchrl_nerd.data.recorded import Recording, command_of
+from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Model, dynamics_of
 from torchrl_nerd.evaluation.recorded_error import Errors, error_key, window_errors
 from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
@@ -28,6 +28,7 @@ from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import recorded_protocol
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import command_of
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.physics_fit import WINDOWS, fit_flight, fit_parameters
 
@@ -45,11 +46,9 @@ Curve = Sequence[Mapping[str, float]]
 def start_model(scene: Scene, name: str | None = None) -> Model:
     """The model that fine-tuning starts from.
 
-    Args:
-        scene: of the recording.
-        name: a shipped model, a checkpoint folder, or ``"analytic"``: a step whose
-            physical parameters are the published ones where there are such, else the
-            scene's own. None: analytic where some are published, else the shipped model.
+    ``name``: a shipped model, a checkpoint folder, or ``"analytic"``: a step with the
+    published physical parameters, or the scene's own where none are. None: analytic where
+    some are published, else the shipped model.
     """
     published = recorded_protocol(scene.name).parameters
     if name != ANALYTIC and (name is not None or not published):
@@ -67,7 +66,7 @@ class FineTuner:
         recording: trajectories of its scene.
         train: numbers ``(n,)`` of the trajectories to train on.
         validation: numbers of those that choose the best model and when to stop.
-        config: how.
+        config: what changes, and how.
         quiet: no progress bar.
         keep: called with every model that is better than all before.
 
@@ -228,7 +227,7 @@ def rollout_error(model: Model, window: TensorDict) -> Tensor:
     """`weighted_error` of a rollout from the first state of ``[rows, steps + 1]``."""
     steps = window.batch_size[1] - 1
     dynamics = dynamics_of(model, differentiable=True)
-    path = open_loop(dynamics, window[:, 0], steps, command_of(window))
+    path = open_loop(dynamics, window[:, 0], steps, command_of(model.scene, window))
     errors = position_errors(model.scene, window[QPOS][:, 1:], path)
     return weighted_error(model.scene, errors)
 

@@ -21,10 +21,8 @@ PROJECT = "torchrl_nerd"
 class TrainingLog:
     """Appends the metrics of each validation to ``log.csv``, which is never cut.
 
-    Args:
-        folder: of the run.
-        step: rows after this update, written by a run that was killed, are dropped.
-        logger: gets the same metrics; see `open_logger`.
+    Rows after update ``step``, written by a run that was killed, are dropped. The logger of
+    `open_logger` gets the same metrics.
 
     Raises:
         ValueError: ``log.csv`` is no table of metrics.
@@ -89,13 +87,8 @@ def open_logger(
     | ``wandb`` | Weights & Biases; with ``WANDB_MODE=offline``, ``wandb`` in the folder |
     | ``csv`` | nowhere else |
 
-    Weights & Biases begins another run where training resumes.
-
-    Args:
-        name: of the logger.
-        folder: of the run.
-        step: update at which the run begins or resumes.
-        settings: of the training, which Weights & Biases shows.
+    Weights & Biases shows the ``settings`` of the training. It begins another run where
+    training resumes, at update ``step``.
 
     Raises:
         ModuleNotFoundError: Weights & Biases is not installed.

@@ -13,15 +13,11 @@ RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root sm
 
 
 def relative_error(errors: Tensor, size: Tensor, loss_eps: float) -> Tensor:
-    """Length of an error relative to what it is an error of, ``(*batch,)``.
+    """``|errors (*batch, D)|`` over the root of ``size (*batch,) + loss_eps``.
 
-    Not its square: impacts are few and their errors large, and squares leave free flight
-    no say beside them (a quarter of the error there, see experiments/first_edition).
-
-    Args:
-        errors: ``(*batch, D)``, normalised.
-        size: mean square of the true change, ``(*batch,)``.
-        loss_eps: added to it, so that samples at rest stay finite.
+    ``size`` is the mean square of the true change; ``loss_eps`` keeps samples at rest
+    finite. Not the square of it: impacts are few and their errors large, and squares leave
+    free flight no say (a quarter of the error there, see experiments/first_edition).
     """
     square = errors.square().mean(-1) / (size + loss_eps)
     return (square + RESOLUTION**2).sqrt()
@@ -49,8 +45,6 @@ def rollout_loss(
 ) -> Tensor:
     """Error of the model's own trajectory, fed back, from an empty history.
 
-    Or after a history of so many recorded steps, whose errors count as well.
-
     Velocity errors are measured in standard deviations of one step's change, position
     errors in what such a change moves in one control step.
 
@@ -62,7 +56,7 @@ def rollout_loss(
         terrain: ``(rows, terrain.size)`` or None.
         loss_eps: see `relative_error`.
         parameters: ``(rows, variation.size)`` or None.
-        history: control steps.
+        history: recorded steps that come first; their errors count as well.
     """
     delta, layout = model.state_delta, model.scene.layout
     scale = model.normalize.std(TARGET)[: layout.nv]

@@ -44,14 +44,9 @@ def follow_gradient(
 ) -> None:
     """A step of every optimizer at its peak learning rate, of which ``ratio`` counts.
 
-    Both optimizers move weights in proportion to their learning rate. A ratio on the
-    device can change inside a CUDA graph, a learning rate cannot.
-
-    Args:
-        weights: with gradients; none moves where those are not finite.
-        optimizers: of the weights.
-        norm: of the gradient, ``()``.
-        ratio: share of the peak learning rates, ``()``.
+    Both optimizers move weights in proportion to their learning rate. A ratio ``()`` on the
+    device can change inside a CUDA graph, a learning rate cannot. No weight moves where the
+    gradient's ``norm ()`` is not finite.
     """
     is_finite = norm.isfinite()
     for grad in (weight.grad for weight in weights if weight.grad is not None):
@@ -126,8 +121,8 @@ class RunState:
 def _allocate_state(optimizer: Optimizer) -> None:
     """Give every weight the optimizer's state that its first update would create.
 
-    A resumed run can then compare names and shapes of a saved state with its own. The
-    weights keep their values: the gradient is zero and there is no weight decay.
+    A resumed run then compares names and shapes of a saved state with its own. No weight
+    moves: the gradient is zero and there is no weight decay.
     """
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     for weight in weights:

@@ -41,7 +41,7 @@ def fit_parameters(
         first: parameters to begin with.
         names: which of them to change.
         starts: rows of the first states of training windows, to draw from.
-        evaluations: of each stage.
+        evaluations: of ``error_of``, in each stage.
         seed: of the draw.
     """
     generator = Generator().manual_seed(seed)
@@ -67,9 +67,9 @@ def moved(
     after = dict(values)
     for name, by in zip(names, x.tolist(), strict=True):
         if name in SCALED:
-            after[name] = values[name] * float(np.exp(SCALED[name] * by))
+            after[name] *= float(np.exp(SCALED[name] * by))
         else:
-            after[name] = values[name] + SHIFTED[name] * by
+            after[name] += SHIFTED[name] * by
     return after
 
 

@@ -14,12 +14,7 @@ from torchrl_nerd.data.simulate import as_transitions
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import append_frame, frame_stack_of
-from torchrl_nerd.evaluation.policy import (
-    WEIGHTS,
-    load_policy,
-    make_actor,
-    policy_task,
-)
+from torchrl_nerd.evaluation.policy import WEIGHTS, load_policy, make_actor, policy_task
 from torchrl_nerd.keys import ACTION, OBSERVATION, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate
@@ -40,15 +35,7 @@ def policy_data(
 
     They start with the task's resets and continue where an episode would end. Actions are
     the policy's mean plus normal noise, clipped to [-1, 1]; the noise of each trajectory
-    has a standard deviation from U(0, ``noise``).
-
-    Args:
-        task: its resets, observations and controller.
-        actor: any TorchRL policy.
-        rows: trajectories.
-        steps: control steps of each.
-        generator: of initial states and noise.
-        noise: largest standard deviation of the noise, in units of the action.
+    has a standard deviation from U(0, ``noise``), in units of the action.
 
     Raises:
         ValueError: a task that pushes a robot with servos by torques.
@@ -93,8 +80,7 @@ def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, D
     """A saved policy as a strategy for `generate`: its name, and what it draws.
 
     The name contains a hash of the weights and the noise: no data set mixes two policies.
-
-    `save_policy` wrote the folder; its card names the task. ``noise``: see `policy_data`.
+    See `save_policy` for the folder, whose card names the task, and `policy_data`.
 
     Raises:
         ValueError: in one sentence, no such policy, one for another scene, or a

@@ -7,10 +7,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import states_of
 from torchrl_nerd.keys import NEXT_QVEL, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.training_range import magnitudes
-from torchrl_nerd.scenes.commands import command_of, drive
+from torchrl_nerd.scenes.commands import command_of
 
 REST_SPEED = 1e-4  # m/s, rad/s: slower is rest in the data; soft friction creeps faster
 ROWS, MIN_ROWS = 256, 16
@@ -49,12 +50,8 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
 
 def _speeds(model: NeRD, states: TensorDict, steps: int) -> Tensor:
     """What 99% of the states' speeds ``(nv,)`` in so many steps are below."""
-    dynamics, terrain = NeRDDynamics(model), states.get(TERRAIN, None)
-    command, speeds = command_of(model.scene, states), []
-    now = states.select(QPOS, QVEL)
-    dynamics.reset(now)
-    for _ in range(steps):
-        torque, ctrl = drive(model.scene, command, now[QPOS], now[QVEL])
-        now = dynamics.step(now, torque, terrain, ctrl)
-        speeds.append(magnitudes(model.sleep.vectors, now[QVEL]))
+    start = states.select(QPOS, QVEL, TERRAIN, strict=False)
+    command = command_of(model.scene, states)[:, None]  # (rows, 1, m)
+    path = states_of(NeRDDynamics(model), start, steps, command)
+    speeds = [magnitudes(model.sleep.vectors, state[QVEL]) for state in path]
     return torch.quantile(torch.cat(speeds), QUANTILE, dim=0)

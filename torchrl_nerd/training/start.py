@@ -35,18 +35,12 @@ def begin_from(
 ) -> NeRD:
     """A model with weights and statistics of another one, which is left as it is.
 
-    The statistics stay as they are: what the network's inputs mean is part of what it
-    learned. The training range is left to be fitted.
-
-    Args:
-        start: whose weights.
-        scene: the robot.
-        config: must describe a network like that of ``start``.
-        symmetry: images of samples that will be shown.
+    What the network's inputs mean, their statistics, is part of what it learned. The
+    training range is left to be fitted.
 
     Raises:
-        ValueError: in one sentence, another network, kind or step, inputs of another
-            width, or statistics that the images do not share.
+        ValueError: in one sentence, a configuration of another network, kind or step,
+            inputs of another width, or statistics that the symmetry's images do not share.
     """
     if start.config != network_config(config.network):
         names = [name for name, known in NETWORKS.items() if known == start.config]

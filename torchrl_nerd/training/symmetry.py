@@ -36,7 +36,7 @@ class Isometry(nn.Module):
     Args:
         body: ``(3, 3)``, of vectors in the axes of the floating base. Where it is a
             reflection, the world is mirrored as well, so that the base stays a rotation.
-        sources: ``(nv,)``: joint v's image is sign times joint source.
+        sources: ``(nv,)``: dof v of the image is sign times dof source.
         signs: ``(nv,)``.
         actuated: dofs with a motor, in the order of torques.
     """
@@ -60,9 +60,7 @@ class Isometry(nn.Module):
         super().__init__()
         parity = np.linalg.det(body)
         world, mirror = np.eye(3), np.ones(4)
-        if (
-            parity < 0.0
-        ):  # axes of rotations are axial: those in the mirror's plane flip
+        if parity < 0.0:  # axes of rotations in the mirror's plane flip: they are axial
             world, mirror = MIRROR, np.array((1.0, -1.0, 1.0, -1.0))
         turn = np.empty(4)
         mujoco.mju_mat2Quat(turn, (world @ body.T).reshape(-1))

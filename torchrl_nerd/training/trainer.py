@@ -64,7 +64,7 @@ class Trainer:
         horizons: control steps of the validation rollouts.
         random_actions: validate under random actions in place of zero ones.
         quiet: no progress bar.
-        logger: ``tensorboard``, ``wandb``, or ``csv`` for ``log.csv`` alone.
+        logger: see `open_logger`.
         init_from: a model whose weights and statistics the training continues, see
             `begin_from`. The training range covers its data and these.
         compile: compile network and loss of one step.
@@ -96,8 +96,7 @@ class Trainer:
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.validation = source, horizons, random_actions
-        self.quiet = quiet
-        self.logger: LoggerName = logger
+        self.quiet, self.logger = quiet, logger
         torch.manual_seed(config.seed)
         self._build(data, init_from)
         self.optimizers = self.make_optimizers()
@@ -107,9 +106,7 @@ class Trainer:
         one = torch.ones((), device=self.device)
         self.lr_ratio, self.ema_share = one, one.clone()
         self.losses = self._make_losses(compile)
-        self._follow = {
-            name: partial(self.follow, x) for name, x in self.losses.items()
-        }
+        self._follow = {k: partial(self.follow, x) for k, x in self.losses.items()}
         if self.device.type == "cuda" and self.model.kind == "learned":
             written = self.state.tensors
             self._follow = {k: Captured(x, written) for k, x in self._follow.items()}
@@ -242,7 +239,7 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Mean errors of the averaged model; the best model so far is saved."""
-        self.errors = validate(self.averaged_model(), *self.validation, self.device)
+        self.errors = validate(self.averaged_model(), *self.validation)
         found = score(self.errors)
         # the first model is saved even if its rollouts diverge
         if found < self.best or not (self.folder / "best").exists():

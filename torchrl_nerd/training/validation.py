@@ -3,8 +3,6 @@
 from dataclasses import asdict
 from typing import Any
 
-import torch
-
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
 from torchrl_nerd.modules.nerd import NeRD
@@ -22,19 +20,11 @@ def validate(
     source: Source,
     horizons: tuple[int, ...],
     random_actions: bool,
-    device: torch.device,
 ) -> Errors:
     """Errors of a model on the device that it is on; see `passive_errors`."""
-    return passive_errors(
-        source,
-        NeRDDynamics(model),
-        MujocoDynamics(model.scene),
-        list(horizons),
-        num_trajectories=ROLLOUTS,
-        seed=SEED,
-        device=device,
-        random_actions=random_actions,
-    )
+    both = NeRDDynamics(model), MujocoDynamics(model.scene)
+    how = {"device": model.device, "random_actions": random_actions}
+    return passive_errors(source, *both, list(horizons), ROLLOUTS, SEED, **how)
 
 
 def score(errors: Errors) -> float:

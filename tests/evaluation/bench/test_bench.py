@@ -36,6 +36,7 @@ from torchrl_nerd.evaluation.bench.errors import (
 from torchrl_nerd.evaluation.bench.rates import mid_states
 from torchrl_nerd.evaluation.bench.report import (
     PERTURBATION,
+    BenchConfig,
     BenchReport,
     bench,
     bench_table,
@@ -107,7 +108,8 @@ def test_driven_beside_passive_where_there_are_actuators(name):
 def test_a_whole_benchmark(name, tmp_path, monkeypatch):
     monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)  # speeds need not be exact here
     scene = load_scene(name)
-    report = bench(scene, (1, 3), num_trajectories=4, rounds=1, steps=3, variants=())
+    sizes = {"num_trajectories": 4, "rounds": 1, "steps": 3}
+    report = bench(scene, BenchConfig(batches=(1, 3), variants=(), **sizes))
     expected = {c.name for c in [*simulators(scene, 1), *models(scene)]}
     shown = {row.name for row in report.errors if row.kind != "sensitivity"} - {PAPER}
     assert shown == expected and set(shipped_models(scene)) <= expected
@@ -133,8 +135,8 @@ def test_a_whole_benchmark(name, tmp_path, monkeypatch):
 
 def brief(scene: Scene, **how) -> BenchReport:
     """Two trajectories, two steps, nothing compiled."""
-    sizes = {"num_trajectories": 2, "rounds": 1, "steps": 2}
-    return bench(scene, (2,), **sizes, **{"variants": (), **how})
+    how = {"num_trajectories": 2, "rounds": 1, "steps": 2, "variants": ()} | how
+    return bench(scene, BenchConfig(batches=(2,), **how))
 
 
 def test_a_third_party_robot_with_a_model_of_ones_own(tmp_path, monkeypatch):
@@ -143,7 +145,7 @@ def test_a_third_party_robot_with_a_model_of_ones_own(tmp_path, monkeypatch):
     scene = load_scene("dm_control/hopper-stand")
     model = NeRD(scene, FeatureConfig(), NETWORKS["mlp-1x32"]).eval()
     folder = save_checkpoint(model, tmp_path / "hopper", make_card(model))
-    report = brief(scene, names=[str(folder)])
+    report = brief(scene, models=(str(folder),))
     assert {row.name for row in report.errors if row.kind == "learned"} == {str(folder)}
     means = {(row.name, row.quantity): row.mean for row in report.errors}
     for row in report.errors:
@@ -256,10 +258,10 @@ def test_nobody_beats_the_front(generator):
 def test_bad_requests_are_refused_in_a_sentence():
     scene = load_scene("cartpole")
     with pytest.raises(ValueError, match="rounds"):
-        bench(scene, rounds=0)
+        bench(scene, BenchConfig(rounds=0))
     with pytest.raises(ValueError, match="batch 0"):
-        bench(scene, (0,))
+        bench(scene, BenchConfig(batches=(0,)))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):
-        bench(scene, names=["nowhere"])
+        bench(scene, BenchConfig(models=("nowhere",)))
     with pytest.raises(ValueError, match="unknown variant 'fast'"):
-        bench(scene, variants=("fast",))
+        bench(scene, BenchConfig(variants=("fast",)))

@@ -34,17 +34,11 @@ COARSE = (1, 4)  # substeps of the rivals
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to step a scene.
+    """One way to step a scene."""
 
-    | field | meaning |
-    |---|---|
-    | ``name`` | of its row in the table |
-    | ``kind`` | one of `KINDS` |
-    | ``make`` | its dynamics, for the scene or the same robot on another terrain |
-    """
-
-    name: str
-    kind: str
+    name: str  # of its row in the table
+    kind: str  # one of `KINDS`
+    # its dynamics, for the scene or the same robot on another terrain
     make: Callable[[Scene], Dynamics]
 
 
@@ -74,9 +68,7 @@ def mujoco_name(scene: Scene) -> str:
 def simulators(scene: Scene, threads: int | None = None) -> list[Candidate]:
     """No motion; MuJoCo at 1, 2, 4, ... of the scene's substeps, and other integrators.
 
-    Args:
-        scene: the robot; its own integrator and number of substeps are among them.
-        threads: of MuJoCo's pool; see `MujocoDynamics`.
+    ``threads``: of MuJoCo's pool, see `MujocoDynamics`.
     """
 
     def candidate(substeps: int, integrator: int | None) -> Candidate:
@@ -101,11 +93,8 @@ def models(
 ) -> list[Candidate]:
     """Models of a scene: the analytic step first, then hybrid ones, then learned ones.
 
-    Args:
-        scene: the robot.
-        names: shipped models or checkpoint folders; all that are shipped by default.
-        device: where they compute.
-        variants: which of `VARIANTS` to add to each.
+    All that are shipped, or those of these ``names`` (checkpoint folders too), each with
+    those of the `VARIANTS` that fit it.
 
     Raises:
         ValueError: an unknown variant; see `from_pretrained`.
@@ -113,11 +102,9 @@ def models(
     for variant in variants:
         look_up("variant", variant, dict.fromkeys(VARIANTS))
     own = ["analytic"] if has_step(scene) else []
-    found = [
-        candidate
-        for name in dict.fromkeys((*own, *(names or shipped_models(scene))))
-        for candidate in _ways(name, from_pretrained(name, scene).to(device), variants)
-    ]
+    found = []
+    for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
+        found += _ways(name, from_pretrained(name, scene).to(device), variants)
     return sorted(found, key=lambda c: KINDS.index(c.kind))
 
 
@@ -133,16 +120,15 @@ def has_step(scene: Scene) -> bool:
 def _ways(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidate]:
     """A model and its variants; an analytic step has no network and no history."""
     yield _candidate(name, model)
-    has_window = isinstance(model, NeRD) and isinstance(
-        model.network, CausalTransformer
-    )
     for variant in variants:
         label = f"{name}, {variant}"
         if variant == "compiled":
             yield _candidate(label, model, compile=True)
-        elif variant == "bf16" and isinstance(model, NeRD):
+        elif not isinstance(model, NeRD):
+            continue
+        elif variant == "bf16":
             yield _candidate(label, copy.deepcopy(model).to(torch.bfloat16))
-        elif variant == "window" and has_window:
+        elif isinstance(model.network, CausalTransformer):
             yield _candidate(label, model, inference="window")
 
 

@@ -32,6 +32,7 @@ DRIVEN = "driven"
 GROUND_TRUTH = "ground truth"
 PAPER = "paper (NeRD)"
 QUANTITIES = 3  # side by side: more do not fit on a line
+NO_RATES: Mapping[str, Mapping[str, float]] = {}
 
 Errors = dict[str, Tensor]
 """Quantity of `position_errors` -> ``(n, steps)``, m or rad."""
@@ -39,24 +40,14 @@ Errors = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """One case: what every candidate starts from, is driven by and is measured against.
-
-    | field | meaning |
-    |---|---|
-    | ``case`` | its name |
-    | ``source`` | whose initial states and controller |
-    | ``start`` | initial states, ``[n]`` |
-    | ``drive`` | joint torques and controls |
-    | ``solver`` | name of the MuJoCo that made the ground truth, see `mujoco_name` |
-    | ``ground_truth`` | positions after each step, ``(n, steps, nq)`` |
-    """
+    """One case: what every candidate starts from, is driven by and is measured against."""
 
     case: str
-    source: Source
-    start: TensorDict
+    source: Source  # whose initial states and controller
+    start: TensorDict  # initial states, [n]
     drive: Drive
-    solver: str
-    ground_truth: Tensor
+    solver: str  # of the ground truth, see `mujoco_name`
+    ground_truth: Tensor  # positions after each step, (n, steps, nq)
 
     @property
     def scene(self) -> Scene:
@@ -64,12 +55,7 @@ class EvaluationSet:
         return scene_of(self.source)
 
     def errors(self, dynamics: Dynamics, start: TensorDict | None = None) -> Errors:
-        """Error at every step; NaN where it diverges.
-
-        Args:
-            dynamics: of the same robot and terrain.
-            start: other initial states ``[n]`` than the set's.
-        """
+        """Error at every step from these initial states or the set's; NaN: it diverges."""
         start = self.start if start is None else start
         steps = self.ground_truth.shape[1]
         path = open_loop(dynamics, start, steps, self.drive, stop_at_nan=True)
@@ -143,24 +129,16 @@ def together(parts: Sequence[Errors]) -> Errors:
 
 @dataclass(frozen=True)
 class ErrorRow:
-    """One candidate, one case, one horizon, one quantity.
-
-    | field | meaning |
-    |---|---|
-    | ``case``, ``steps`` | what was rolled out, how long |
-    | ``name``, ``kind`` | of the candidate |
-    | ``quantity``, ``unit`` | what is measured, in m or rad |
-    | ``mean``, ``interval``, ``final``, ``p95`` | see `ErrorSummary`; None: not published |
-    """
+    """One candidate, one case, one horizon, one quantity; see `ErrorSummary`."""
 
     case: str
     steps: int
-    name: str
+    name: str  # of the candidate
     kind: str
     quantity: str
     unit: str
     mean: float
-    interval: float | None = None
+    interval: float | None = None  # None: not published
     final: float | None = None
     p95: float | None = None
 
@@ -181,37 +159,25 @@ def error_rows(
         errors: (name, kind) -> errors at every step.
         published: (case, horizon, quantity) -> the paper's mean error, m or rad.
     """
-    rows, quantities = (
-        [],
-        dict.fromkeys(k for by_name in errors.values() for k in by_name),
-    )
+    rows, about = [], (case, horizon)
     for (name, kind), by_name in errors.items():
         part = {k: e[:, :horizon] for k, e in by_name.items()}  # (n, horizon)
         for quantity, error in summarize(scene, part).items():
-            rows.append(ErrorRow(case, horizon, name, kind, quantity, **vars(error)))
-    for quantity in quantities:
-        mean = published.get((case, horizon, quantity))
+            rows.append(ErrorRow(*about, name, kind, quantity, **vars(error)))
+    for quantity in dict.fromkeys(row.quantity for row in rows):
+        mean = published.get((*about, quantity))
         if mean is not None:
-            about = (
-                case,
-                horizon,
-                PAPER,
-                "published",
-                quantity,
-                unit_of(scene, quantity),
-            )
-            rows.append(ErrorRow(*about, mean))
+            unit = unit_of(scene, quantity)
+            rows.append(ErrorRow(*about, PAPER, "published", quantity, unit, mean))
     return rows
 
 
 def error_table(
-    rows: Sequence[ErrorRow], rates: Mapping[str, Mapping[str, float]] | None = None
+    rows: Sequence[ErrorRow], rates: Mapping[str, Mapping[str, float]] = NO_RATES
 ) -> str:
     """Text of the rows of one case and horizon: a line for every candidate.
 
-    Args:
-        rows: see `error_rows`.
-        rates: column -> name -> control steps per second.
+    ``rates``: column -> name -> control steps per second.
     """
     quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
     candidates = list(dict.fromkeys((row.name, row.kind) for row in rows))
@@ -226,18 +192,13 @@ def error_table(
         shown = quantities[first : first + QUANTITIES]
         titles = [title for q, unit in shown for title in (f"{q} ({unit})", "", "")]
         head = ["name", "kind", *("mean", "final", "p95") * len(shown)]
-        body = [
-            [
-                name,
-                kind,
-                *(x for q, _ in shown for x in found.get((name, q), ["-"] * 3)),
-            ]
-            for name, kind in candidates
-        ]
-        for column, speeds in (rates or {}).items():
-            head.append(column)
-            for line in body:
-                line.append(f"{speeds[line[0]]:,.0f}" if line[0] in speeds else "-")
+        head += rates
+        body = []
+        for name, kind in candidates:
+            cells = [x for q, _ in shown for x in found.get((name, q), ["-"] * 3)]
+            speeds = [speed.get(name) for speed in rates.values()]
+            cells += ["-" if x is None else f"{x:,.0f}" for x in speeds]
+            body.append([name, kind, *cells])
         tables.append(text_table(head, body, titles))
     return "\n\n".join(tables)
 

@@ -11,10 +11,14 @@ from tensordict import TensorDict
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import Candidate
-from torchrl_nerd.evaluation.rollout_error import initial_states, scene_of
-from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
+from torchrl_nerd.evaluation.rollout_error import (
+    initial_states,
+    rollout,
+    scene_of,
+    states_of,
+)
+from torchrl_nerd.keys import PARAMETERS, TERRAIN
 from torchrl_nerd.robots import Source
-from torchrl_nerd.scenes.commands import drive, held, idle
 
 SAMPLE_SECONDS = 0.1  # one sample lasts about as long
 MAX_STEP = 64  # control steps to the latest moment that states are taken at
@@ -25,21 +29,13 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True)
 class RateRow:
-    """Speed of one candidate with one batch.
-
-    | field | meaning |
-    |---|---|
-    | ``name``, ``kind`` | of the candidate |
-    | ``batch`` | trajectories stepped together |
-    | ``steps_per_s`` | control steps of all of them per second, median over rounds |
-    | ``warm_up_s`` | of the first two steps, which compile where there is a compiler |
-    """
+    """Speed of one candidate with one batch."""
 
     name: str
     kind: str
-    batch: int
-    steps_per_s: float
-    warm_up_s: float
+    batch: int  # trajectories stepped together
+    steps_per_s: float  # control steps of all of them per second, median over rounds
+    warm_up_s: float  # of the first two steps, which compile where there is a compiler
 
 
 def rate_rows(
@@ -50,15 +46,9 @@ def rate_rows(
     seed: int,
     device: torch.device | str = "cpu",
 ) -> list[RateRow]:
-    """Medians over rounds, in each of which every candidate has one sample.
+    """Medians over ``rounds``, in each of which every candidate has one sample.
 
-    Args:
-        candidates: whose speed is measured.
-        source: its initial states.
-        batch: trajectories stepped together.
-        rounds: samples of each candidate.
-        seed: of the states.
-        device: of all states.
+    All start from `mid_states` ``[batch]`` on ``device``.
     """
     state, scene = mid_states(source, batch, seed).to(device), scene_of(source)
     runners = [Runner(stepper(c.make(scene), state)) for c in candidates]
@@ -72,31 +62,24 @@ def rate_rows(
 
 def mid_states(source: Source, batch: int, seed: int) -> TensorDict:
     """States ``[batch]`` at random moments of passive motion, with their terrain."""
-    start, scene = initial_states(source, batch, seed), scene_of(source)
-    terrain = start.get(TERRAIN, None)
-    torque, ctrl = held(scene, idle(scene, batch, MAX_STEP))
-    first = start.select(QPOS, QVEL)
-    path = MujocoDynamics(scene).rollout(first, torque, terrain, ctrl)
+    start, dynamics = (
+        initial_states(source, batch, seed),
+        MujocoDynamics(scene_of(source)),
+    )
+    path = rollout(dynamics, start.exclude(PARAMETERS), MAX_STEP)
     generator = torch.Generator().manual_seed(seed)
-    moment = torch.randint(MAX_STEP, (batch,), generator=generator)
+    moment = 1 + torch.randint(MAX_STEP, (batch,), generator=generator)
     # one moment of each trajectory: [batch]
     state = cast(TensorDict, path[torch.arange(batch), moment])
-    if terrain is not None:
-        state[TERRAIN] = terrain
-    return state
+    return state.update(start.select(TERRAIN, strict=False))
 
 
 def stepper(dynamics: Dynamics, state: TensorDict) -> Callable[[int], None]:
     """A function that makes so many steps from ``state`` ``[batch]``, without torque."""
-    start, terrain = state.select(QPOS, QVEL), state.get(TERRAIN, None)
-    command = idle(dynamics.scene, len(state)).to(state[QPOS])
 
     def run(steps: int) -> None:
-        now = start
-        dynamics.reset(now)
-        for _ in range(steps):
-            torque, ctrl = drive(dynamics.scene, command, now[QPOS], now[QVEL])
-            now = dynamics.step(now, torque, terrain, ctrl)
+        for _ in states_of(dynamics, state, steps):
+            pass
 
     return run
 

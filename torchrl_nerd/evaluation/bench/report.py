@@ -1,6 +1,6 @@
 """The benchmark of a scene: error and speed of every candidate."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -27,24 +27,36 @@ ALL = "all"
 """The case of all cases together."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig:
+    """What `bench` measures, and how finely."""
+
+    models: tuple[str, ...] = ()
+    """As --model of other commands, several of them; all that are shipped by default."""
+    variants: tuple[str, ...] = ("compiled",)
+    """Other ways to run each model, see nerd eval: compiled, window, bf16."""
+    batches: tuple[int, ...] = (1, 64, 512, 4096)
+    """How many trajectories are stepped together, for the rates."""
+    num_trajectories: int = 256
+    """How many trajectories of each case the errors are means of."""
+    rounds: int = 5
+    """Samples of each candidate's speed; the median is shown."""
+    seed: int = 500
+    """Of the initial states."""
+    steps: int | None = None
+    """Horizon of the errors; the paper's by default."""
+
+
 @dataclass(frozen=True)
 class BenchReport:
-    """What `bench` measured; ``asdict`` of it is what JSON holds.
-
-    | field | meaning |
-    |---|---|
-    | ``scene``, ``steps``, ``num_trajectories`` | rolled out, how long, how many a case |
-    | ``ground_truth`` | what errors are measured against |
-    | ``errors`` | rows over all cases together, see `ErrorRow` |
-    | ``rates`` | rows of every batch, see `RateRow` |
-    """
+    """What `bench` measured; ``asdict`` of it is what JSON holds."""
 
     scene: str
-    steps: int
-    num_trajectories: int
-    ground_truth: str
-    errors: list[ErrorRow]
-    rates: list[RateRow]
+    steps: int  # the horizon of the errors
+    num_trajectories: int  # of each case
+    ground_truth: str  # the solver that errors are measured against
+    errors: list[ErrorRow]  # over all cases together
+    rates: list[RateRow]  # of every batch
 
     @property
     def batches(self) -> list[int]:
@@ -73,8 +85,7 @@ class BenchReport:
 def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
     """Names that no other beats in both error and rate, the most accurate first.
 
-    Args:
-        points: name -> (error, steps per second); points that are not finite never win.
+    ``points``: name -> (error, steps per second); those that are not finite never win.
     """
     front: list[str] = []
     fastest = 0.0
@@ -98,69 +109,54 @@ def reference_of(scene: Scene) -> Scene:
 
 def bench(
     scene: Scene,
-    batches: Sequence[int] = (1, 64, 512, 4096),
-    num_trajectories: int = 256,
-    rounds: int = 5,
-    seed: int = 500,
-    steps: int | None = None,
-    variants: Sequence[str] = ("compiled",),
+    config: BenchConfig,
     device: torch.device | str = "cpu",
     quiet: bool = False,
-    names: Sequence[str] = (),
 ) -> BenchReport:
     """Error and speed of MuJoCo and of the models of a scene on this machine.
 
-    Args:
-        scene: the robot.
-        batches: trajectories stepped together, for the rates.
-        num_trajectories: of each case, for the errors.
-        rounds: samples of each candidate's speed.
-        seed: of the initial states.
-        steps: horizon of the errors; the protocol's by default.
-        variants: other ways to run each model, see `VARIANTS`.
-        device: of learned models and of every state whose steps are timed; MuJoCo's
-            states then travel to the processor and back within its time.
-        quiet: no progress bars.
-        names: of models, see `models`.
+    ``device``: of learned models and of every state whose steps are timed; MuJoCo's states
+    then travel to the processor and back within its time.
 
     Raises:
         ValueError: a setting out of range, or no such model.
     """
-    expect_at_least(1, rounds=rounds, **{f"batch {b}": b for b in batches})
-    expect_at_least(2, num_trajectories=num_trajectories)
+    counts = {f"batch {batch}": batch for batch in config.batches}
+    expect_at_least(1, rounds=config.rounds, **counts)
+    expect_at_least(2, num_trajectories=config.num_trajectories)
     protocol = protocol_of(scene)
     threads = torch.get_num_threads()  # as many for MuJoCo
-    candidates = [*simulators(scene, threads), *models(scene, names, device, variants)]
+    candidates = simulators(scene, threads)
+    candidates += models(scene, config.models, device, config.variants)
     published = {horizon for _, horizon, _ in protocol.published}
-    horizon = steps or max(published or protocol.horizons)
+    horizon = config.steps or max(published or protocol.horizons)
+    about = config.num_trajectories, horizon, config.seed, device
 
     def ground_truth(here: Scene) -> MujocoDynamics:
         return MujocoDynamics(reference_of(here), threads)
 
     sets = [
         evaluation_set(
-            *(case, source, case in protocol.random_actions, ground_truth),
-            *(num_trajectories, horizon, seed, device),
+            case, source, case in protocol.random_actions, ground_truth, *about
         )
         for case, source in protocol.cases.items()
     ]
     errors = measure(sets, candidates, quiet=quiet)
     name = f"ground truth, perturbed by {PERTURBATION:.0e}"
+    shake = PERTURBATION, config.seed
     errors[name, "sensitivity"] = together(
-        [s.errors(ground_truth(s.scene), s.perturbed(PERTURBATION, seed)) for s in sets]
+        [s.errors(ground_truth(s.scene), s.perturbed(*shake)) for s in sets]
     )
     moving = [c for c in candidates if c.kind != "baseline"]
-    rates = [
-        row
-        for batch in tqdm(batches, "rates", unit=" batches", disable=quiet)
-        for row in rate_rows(moving, sets[-1].source, batch, rounds, seed, device)
-    ]
+    rates, how = [], (config.rounds, config.seed, device)
+    for batch in tqdm(config.batches, "rates", unit=" batches", disable=quiet):
+        rates += rate_rows(moving, sets[-1].source, batch, *how)
     case = ALL if len(sets) > 1 else sets[0].case
     paper = _published(protocol, horizon, case)
     return BenchReport(
         scene=scene.name,
         steps=horizon,
-        num_trajectories=num_trajectories,
+        num_trajectories=config.num_trajectories,
         ground_truth=sets[-1].solver,
         errors=error_rows(scene, case, horizon, errors, paper),
         rates=rates,
@@ -169,14 +165,11 @@ def bench(
 
 def bench_table(report: BenchReport) -> str:
     """Errors with rates as text, and which candidates nothing beats in both."""
+    rates = {f"batch {b}": report.speeds(b) for b in report.batches}
     lines = [
         f"{report.scene}: {report.steps} steps, {report.num_trajectories} trajectories per "
-        f"case. Ground truth: {report.ground_truth}. Rates in control steps/s.",
-        "",
-        error_table(
-            report.errors, {f"batch {b}": report.speeds(b) for b in report.batches}
-        ),
-        "",
+        f"case. Ground truth: {report.ground_truth}. Rates in control steps/s.\n",
+        f"{error_table(report.errors, rates)}\n",
     ]
     for quantity in dict.fromkeys(row.quantity for row in report.errors):
         front = pareto_front(report.points(report.batch, quantity))

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from typing import Any
 from zlib import crc32
@@ -13,7 +13,11 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import position_errors, rollout
-from torchrl_nerd.evaluation.stability import states
+from torchrl_nerd.evaluation.stability.states import (
+    clear_of_ground,
+    sample_states,
+    settled_states,
+)
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
@@ -22,47 +26,27 @@ from torchrl_nerd.scenes.sampling import sample_commands
 
 @dataclass(frozen=True)
 class Metric:
-    """One number that a case measured.
+    """One number that a case measured in a dynamics."""
 
-    | field | meaning |
-    |---|---|
-    | ``name`` | with its unit |
-    | ``value`` | in the dynamics that the case ran in |
-    | ``limit`` | largest allowed value; infinite: the number is for information |
-    | ``mujoco_limit`` | the same for MuJoCo, it validates the case; None: ``limit`` |
-    """
-
-    name: str
+    name: str  # with its unit
     value: float
-    limit: float = inf
-    mujoco_limit: float | None = None
+    limit: float = inf  # largest allowed value; infinite: the number is for information
+    mujoco_limit: float | None = None  # that validates the case; None: ``limit``
 
-    @property
-    def passes(self) -> bool:
+    def passes(self, in_mujoco: bool = False) -> bool:
         """Whether it is within the limit, as NaN is not, or has none."""
-        return self.limit == inf or self.value <= self.limit
-
-    @property
-    def passes_in_mujoco(self) -> bool:
-        """The same of MuJoCo's limit."""
-        limit = self.limit if self.mujoco_limit is None else self.mujoco_limit
-        return replace(self, limit=limit).passes
+        limit = self.mujoco_limit if in_mujoco else None
+        limit = self.limit if limit is None else limit
+        return limit == inf or self.value <= limit
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One run of a case: what is stepped, and the random numbers.
-
-    | field | meaning |
-    |---|---|
-    | ``dynamics`` | under test |
-    | ``generator`` | of starts and torques |
-    | ``scale`` | fraction of long rollouts and large batches, in (0, 1] |
-    """
+    """One run of a case: what is stepped, and the random numbers."""
 
     dynamics: Dynamics
-    generator: Generator
-    scale: float = 1.0
+    generator: Generator  # of starts and torques
+    scale: float = 1.0  # fraction of long rollouts and large batches, in (0, 1]
 
     @property
     def scene(self) -> Scene:
@@ -88,16 +72,16 @@ class Trial:
         return max(least, round(self.scale * count))
 
     def starts(self, count: int) -> TensorDict:
-        """States ``[count]`` from the scene's training range."""
-        return states.sample_states(self.scene, count, self.generator)
+        """See `sample_states`."""
+        return sample_states(self.scene, count, self.generator)
 
     def settled(self, count: int) -> TensorDict:
-        """Up to ``count`` states at rest, see `settled_states`."""
-        return states.settled_states(self.scene, count).clone()
+        """See `settled_states`."""
+        return settled_states(self.scene, count).clone()
 
     def in_air(self, count: int, speed: float) -> TensorDict:
         """States ``[count]`` that nothing touches, at a fraction of the training speeds."""
-        start = states.clear_of_ground(self.scene, self.starts(count))
+        start = clear_of_ground(self.scene, self.starts(count))
         return start.set(QVEL, speed * start[QVEL])
 
     def commands(self, count: int, steps: int) -> Tensor:
@@ -156,25 +140,16 @@ def hard_case(
 
 @dataclass(frozen=True)
 class Result:
-    """One case in both dynamics.
-
-    | field | meaning |
-    |---|---|
-    | ``case``, ``physics`` | what was tried, and what should happen |
-    | ``ground_truth``, ``tested`` | metrics; none of MuJoCo where a model is needed |
-    | ``ground_truth_passes``, ``passes`` | whether all are within their limits |
-    | ``tolerances`` | limits of the dynamics under test |
-    | ``seconds`` | for both |
-    """
+    """One case in both dynamics."""
 
     case: str
-    physics: str
-    ground_truth: dict[str, float]
+    physics: str  # what should happen
+    ground_truth: dict[str, float]  # metrics; none where a model is needed
     tested: dict[str, float]
-    ground_truth_passes: bool
+    ground_truth_passes: bool  # whether all are within their limits
     passes: bool
-    tolerances: dict[str, float]
-    seconds: float
+    tolerances: dict[str, float]  # limits of the dynamics under test
+    seconds: float  # for both
 
 
 def run_cases(
@@ -182,11 +157,7 @@ def run_cases(
 ) -> Iterator[Result]:
     """Every case that applies, in MuJoCo and in the dynamics under test.
 
-    Args:
-        tested: any dynamics; cases of models are left out for others.
-        cases: which.
-        seed: of starts and torques; each case has a stream of its own, the same in both.
-        scale: fraction of long rollouts and large batches, in (0, 1].
+    Of ``seed`` each case has random numbers of its own, the same in both.
     """
     for case in cases:
         if not case.supports(tested):
@@ -202,8 +173,8 @@ def run_cases(
             physics=" ".join((case.run.__doc__ or "").split()),
             ground_truth={m.name: m.value for m in exact},
             tested={m.name: m.value for m in mine},
-            ground_truth_passes=all(m.passes_in_mujoco for m in exact),
-            passes=all(m.passes for m in mine),
+            ground_truth_passes=all(m.passes(in_mujoco=True) for m in exact),
+            passes=all(m.passes() for m in mine),
             tolerances={m.name: m.limit for m in mine if m.limit < inf},
             seconds=round(time.monotonic() - began, 1),
         )

@@ -9,10 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.rollout_error import rollout
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.commands import held, idle
 
 SETTLE, AT_REST = 5.0, 1e-3  # s; m/s and rad/s
 TRIES = 8
@@ -26,12 +26,9 @@ def sample_states(scene: Scene, count: int, generator: Generator) -> TensorDict:
 
 @cache
 def settled_states(scene: Scene, count: int) -> TensorDict:
-    """Where the robot comes to rest in MuJoCo, dropped from its training range.
+    """Up to ``count`` states at rest, at least one: dropped from the training range.
 
     Where the ground varies, on that of the file.
-
-    Returns:
-        Up to ``count`` states at rest, at least one.
 
     Raises:
         ValueError: it never came to rest.
@@ -57,10 +54,8 @@ def _drop(scene: Scene, count: int, generator: Generator) -> TensorDict:
     if scene.terrain is not None and scene.terrain.is_per_row:
         start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(count, -1)
     steps = round(SETTLE / scene.control_step)
-    torque, ctrl = held(scene, idle(scene, count, steps))
-    path = MujocoDynamics(scene).rollout(start, torque, start.get(TERRAIN, None), ctrl)
-    for key in (QPOS, QVEL):
-        start[key] = path[key][:, -1].clone()
+    path = rollout(MujocoDynamics(scene), start, steps, every=steps)
+    start.update(path[:, -1])
     return cast(TensorDict, start[torch.amax(start[QVEL].abs(), -1) < AT_REST])
 
 
@@ -75,14 +70,9 @@ def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
 
 
 def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
-    """States of a floating robot, rotated about the world's origin with their ground.
+    """States ``[*batch]``, rotated about the world's origin by ``quat (*batch, 4)``.
 
-    Ground that all trajectories share stays.
-
-    Args:
-        scene: the robot.
-        states: ``[*batch]``.
-        quat: ``(*batch, 4)``.
+    So is their ground, unless all trajectories share it.
     """
     q, v = scene.base.qpos_address, scene.base.dof_address
     states = states.clone()
