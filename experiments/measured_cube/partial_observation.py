@@ -24,11 +24,10 @@ from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, dynamics_of
 from torchrl_nerd.evaluation.recorded_error import (
     STATES,
-    Errors,
     summarize_windows,
     window_errors,
 )
-from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
+from torchrl_nerd.evaluation.rollout_error import Errors, open_loop, position_errors
 from torchrl_nerd.files import write_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import start_model, weighted_error

@@ -90,8 +90,9 @@ def test_tokens_and_targets_are_renumbered(scene, data):
     for number, isometry in enumerate(symmetry.isometries):
         there = raw_tokens(*encode, isometry(flat))
         choice = torch.full((len(flat),), number)
-        for key, x, expected in zip((TOKEN, TARGET), here, there, strict=True):
-            image = symmetry.permutations[key](x[:, None], choice)[:, 0]
+        both = symmetry.tokens, symmetry.targets
+        for images, x, expected in zip(both, here, there, strict=True):
+            image = images(x[:, None], choice)[:, 0]
             torch.testing.assert_close(image, expected, rtol=1e-6, atol=1e-6)
 
 
@@ -101,7 +102,7 @@ def test_statistics_are_those_of_all_images(scene, data):
     found = symmetry.complete(data_stats(scene, data))
     images = [isometry(data) for isometry in symmetry.isometries]
     expected = data_stats(scene, torch.cat(images))
-    for key in (TOKEN, TARGET):
+    for key, own in ((TOKEN, symmetry.tokens), (TARGET, symmetry.targets)):
         assert found[key].count == expected[key].count
         torch.testing.assert_close(
             found[key].mean, expected[key].mean, atol=1e-6, rtol=0
@@ -109,11 +110,7 @@ def test_statistics_are_those_of_all_images(scene, data):
         torch.testing.assert_close(
             found[key].std, expected[key].std, rtol=1e-5, atol=1e-6
         )
-        for source, sign in zip(
-            symmetry.permutations[key].sources,
-            symmetry.permutations[key].signs,
-            strict=True,
-        ):
+        for source, sign in zip(own.sources, own.signs, strict=True):
             mean, std = found[key].mean, found[key].std
             torch.testing.assert_close(mean, sign * mean[source], atol=1e-9, rtol=1e-9)
             torch.testing.assert_close(std, std[source], atol=1e-12, rtol=1e-9)

@@ -2,8 +2,7 @@
 
 import shlex
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,9 @@ class Command(ABC):
 
     def settings(self) -> list[str]:
         """Every option and its value, a line each."""
-        return [f"  {name:<28} {value}" for name, value in _leaves(self)]
+        options = asdict(self)
+        options |= options.pop("config", {})
+        return [f"  {k:<28} {v}" for k, v in options.items() if k != "dry_run"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,13 +98,3 @@ class MeasuringCommand(DeviceCommand):
                     values = value if isinstance(value, tuple) else (value,)
                     words += [f"--{option}", *map(str, values)]
         return shlex.join(words)
-
-
-def _leaves(options: Any) -> Iterator[tuple[str, Any]]:
-    """Names and values of all options, those of nested dataclasses in their place."""
-    for field in fields(options):
-        value = getattr(options, field.name)
-        if is_dataclass(value):
-            yield from _leaves(value)
-        elif field.name != "dry_run":
-            yield field.name, value

@@ -7,12 +7,7 @@ from typing import Any, Literal
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import (
-    ModelName,
-    Positional,
-    SceneName,
-    recorded_scene,
-)
+from torchrl_nerd.cli.options import ModelName, Positional, SceneName, recorded_scene
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.bench.candidates import (

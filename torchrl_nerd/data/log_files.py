@@ -91,16 +91,11 @@ def read_log(path: Path, scene: Scene) -> Recording:
     if is_pose:
         parts = [tensors.get(name, none[:, :3]) for name in FREE_BODY]
         tensors |= {QPOS: torch.cat(parts[:2], 1), QVEL: torch.cat(parts[2:], 1)}
-    log = Recording(
-        tensors[QPOS],
-        tensors.get(QVEL, none),
-        tensors.get(TORQUE, none.new_zeros(count, motors)),
-        _offsets(arrays, count, path),
-        scene.control_step,
-        tensors.get("time"),
-        tensors.get(TERRAIN),
-        tensors.get(CONTROL),
-    )
+    columns = {QVEL: none, TORQUE: none.new_zeros(count, motors)}
+    names = (QPOS, QVEL, TORQUE, "time", TERRAIN, CONTROL)
+    columns |= {name: tensors[name] for name in names if name in tensors}
+    offsets = _offsets(arrays, count, path)
+    log = Recording(**columns, offsets=offsets, frame=scene.control_step)
     if log.time is None:
         return log
     return replace(log, frame=float(log.time.diff()[log.inside[1:]].median()))

@@ -187,7 +187,6 @@ def split_trajectories(count: int) -> dict[str, Tensor]:
     Of the 510 published tosses of a cube: 380, 65 and 65, by the recommended seed.
     """
     order = torch.from_numpy(np.random.default_rng(SPLIT_SEED).permutation(count))
-    train = round(TRAIN_SHARE * count)
-    last = train + round(VALIDATION_SHARE * count)
-    parts = {"train": order[:train], "validation": order[train:last]}
-    return {**parts, "test": order[last:]}
+    train, validation = round(TRAIN_SHARE * count), round(VALIDATION_SHARE * count)
+    parts = order.tensor_split((train, train + validation))
+    return dict(zip(("train", "validation", "test"), parts, strict=True))

@@ -124,8 +124,7 @@ def transfer(
     Raises:
         ValueError: see `summarize` and `make_env`.
     """
-    returns, about = {}, {}
-    names = dict.fromkeys((*map(str, dynamics), GROUND_TRUTH))
+    names, returns = dict.fromkeys((*map(str, dynamics), GROUND_TRUTH)), {}
     counts = {"dm_control": min(episodes, slow_episodes)}
     envs = {  # all at first: an unknown name is refused before any episode
         name: make_env(task, name, counts.get(name, episodes), seed, device)
@@ -133,11 +132,11 @@ def transfer(
     }
     for name, env in tqdm(envs.items(), "dynamics", disable=quiet):
         returns[name] = policy_returns(env, actor)
-        about[name] = env.dynamics.kind, env.model_name or name
-    return {
-        name: summarize(value, returns[GROUND_TRUTH], *about[name])
-        for name, value in returns.items()
-    }
+    found = {}
+    for name, env in envs.items():
+        about = env.dynamics.kind, env.model_name or name
+        found[name] = summarize(returns[name], returns[GROUND_TRUTH], *about)
+    return found
 
 
 def model_title(scene: Scene, name: str) -> str:

@@ -15,7 +15,12 @@ from torchrl_nerd.analytic import make_step
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import NoMotion, has_step
-from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
+from torchrl_nerd.evaluation.rollout_error import (
+    Errors,
+    open_loop,
+    position_errors,
+    unit_of,
+)
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene
@@ -25,9 +30,6 @@ STATES = 80  # of a window, the start among them
 DRAWS = 2000  # of the trajectories, for intervals
 PART = 2048  # windows rolled out at a time
 BASE = {"base_position": "m", "base_orientation": "rad"}
-
-Errors = dict[str, Tensor]
-"""Quantity of `position_errors` -> ``(windows, states - 1)``, m or rad."""
 
 
 def window_errors(

@@ -25,6 +25,10 @@ Drive = Callable[[int, TensorDictBase], tuple[Tensor, Tensor | None]]
 """``(step, state [n]) -> joint torque (n, num_actuated), N and N m, and ctrl (n, nu)``."""
 
 
+Errors = dict[str, Tensor]
+"""Quantity of `position_errors` -> ``(n, steps)``, m or rad."""
+
+
 def scene_of(source: Source) -> Scene:
     """The robot and its terrain."""
     return source if isinstance(source, Scene) else source.scene
@@ -150,9 +154,7 @@ def rollout(
     return cast(TensorDict, TensorDict.stack(kept, 1))
 
 
-def position_errors(
-    scene: Scene, ground_truth: Tensor, other: Tensor
-) -> dict[str, Tensor]:
+def position_errors(scene: Scene, ground_truth: Tensor, other: Tensor) -> Errors:
     """Error of every quantity at every step, ``(n, steps)``, from ``(n, steps, nq)``.
 
     A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
@@ -205,7 +207,7 @@ def interval_of_mean(samples: Tensor) -> float:
     return float(1.96 * samples.std() / len(samples) ** 0.5)
 
 
-def summarize(scene: Scene, errors: dict[str, Tensor]) -> dict[str, ErrorSummary]:
+def summarize(scene: Scene, errors: Errors) -> dict[str, ErrorSummary]:
     """Summary of each quantity of `position_errors`, ``(n, steps)``, m or rad.
 
     Errors that are not finite stay visible.

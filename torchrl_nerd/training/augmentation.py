@@ -113,21 +113,15 @@ class Symmetry(nn.Module):
                 f"none for {still}: train without use_symmetry"
             )
         tokens, targets = zip(*images, strict=True)
-        found = {TOKEN: SignedPermutations(tokens[0], tokens)}
-        found[TARGET] = SignedPermutations(targets[0], targets)
-        self.permutations = nn.ModuleDict(found)
-
-    def of(self, key: NestedKey) -> SignedPermutations:
-        """The permutations of `TOKEN` or `TARGET`."""
-        return cast(SignedPermutations, self.permutations[str(key)])
+        self.tokens = SignedPermutations(tokens[0], tokens)
+        self.targets = SignedPermutations(targets[0], targets)
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
         """Statistics of tokens and targets with all their images."""
-        return {key: self.of(key).complete(value) for key, value in stats.items()}
+        found = {TOKEN: self.tokens.complete(stats[TOKEN])}
+        return found | {TARGET: self.targets.complete(stats[TARGET])}
 
     def keeps(self, normalize: Normalize) -> bool:
         """Whether images of normalised tokens and targets are those of raw ones."""
-        return all(
-            self.of(key).keep(normalize.mean(key), normalize.std(key))
-            for key in (TOKEN, TARGET)
-        )
+        both = (TOKEN, self.tokens), (TARGET, self.targets)
+        return all(x.keep(normalize.mean(key), normalize.std(key)) for key, x in both)

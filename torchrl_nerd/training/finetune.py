@@ -22,8 +22,13 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Model, dynamics_of
-from torchrl_nerd.evaluation.recorded_error import Errors, error_key, window_errors
-from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
+from torchrl_nerd.evaluation.recorded_error import error_key, window_errors
+from torchrl_nerd.evaluation.rollout_error import (
+    Errors,
+    open_loop,
+    position_errors,
+    unit_of,
+)
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import recorded_protocol

@@ -16,7 +16,7 @@ from torchrl_nerd.keys import (
     QVEL,
     TERRAIN,
 )
-from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes.commands import command_of
 from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.samples import normalised
@@ -98,8 +98,8 @@ class Sequences:
             return inputs, targets
         count = len(self.symmetry.isometries)
         choice = self._sent(torch.randint(count, (rows,), generator=generator))
-        token = self.symmetry.of(TOKEN)(inputs.token, choice)
-        return inputs._replace(token=token), self.symmetry.of(TARGET)(targets, choice)
+        token = self.symmetry.tokens(inputs.token, choice)
+        return inputs._replace(token=token), self.symmetry.targets(targets, choice)
 
     def rollout(
         self, rows: int, length: int, generator: Generator

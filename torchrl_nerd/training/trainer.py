@@ -37,13 +37,7 @@ from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Inputs, Sequences
 from torchrl_nerd.training.start import begin_from, fingerprint, make_model
-from torchrl_nerd.training.validation import (
-    Errors,
-    for_card,
-    metrics,
-    score,
-    validate,
-)
+from torchrl_nerd.training.validation import Errors, for_card, metrics, score, validate
 
 STATE = "state.json"  # card of a run that can be resumed
 

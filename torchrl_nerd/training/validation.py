@@ -16,10 +16,7 @@ Errors = dict[int, dict[str, ErrorSummary]]
 
 
 def validate(
-    model: NeRD,
-    source: Source,
-    horizons: tuple[int, ...],
-    random_actions: bool,
+    model: NeRD, source: Source, horizons: tuple[int, ...], random_actions: bool
 ) -> Errors:
     """Errors of a model on the device that it is on; see `passive_errors`."""
     both = NeRDDynamics(model), MujocoDynamics(model.scene)

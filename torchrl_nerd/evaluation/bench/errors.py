@@ -13,6 +13,7 @@ from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import Candidate, mujoco_name
 from torchrl_nerd.evaluation.rollout_error import (
     Drive,
+    Errors,
     action_drive,
     initial_states,
     open_loop,
@@ -33,9 +34,6 @@ GROUND_TRUTH = "ground truth"
 PAPER = "paper (NeRD)"
 QUANTITIES = 3  # side by side: more do not fit on a line
 NO_RATES: Mapping[str, Mapping[str, float]] = {}
-
-Errors = dict[str, Tensor]
-"""Quantity of `position_errors` -> ``(n, steps)``, m or rad."""
 
 
 @dataclass(frozen=True)

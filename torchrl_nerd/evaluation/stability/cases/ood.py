@@ -19,13 +19,7 @@ from torchrl_nerd.evaluation.stability.case import Metric, Trial, hard_case
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.commands import (
-    command_key,
-    command_of,
-    drive,
-    drive_of,
-    idle,
-)
+from torchrl_nerd.scenes.commands import command_key, command_of, drive, drive_of, idle
 
 COUNT, LENGTH, STEPS, DRIVEN = 200, 40, 60, 5
 FASTEST = 4.0  # speeds and torques relative to those of training, at most
