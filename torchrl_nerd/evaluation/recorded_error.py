@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.analytic import make_step
@@ -39,14 +40,16 @@ def window_errors(
 
     ``starts``: rows of the first states, ``(windows,)``.
     """
-    found = []
-    for part in starts.split(PART):
-        window = recording.windows(part, states)  # [windows, states]
-        command = command_of(dynamics.scene, window)
-        path = open_loop(dynamics, window[:, 0], states - 1, command)
-        measured = window[QPOS][:, 1:]  # (windows, states - 1, nq)
-        found.append(position_errors(dynamics.scene, measured, path))
+    parts = (recording.windows(part, states) for part in starts.split(PART))
+    found = [errors_along(dynamics, window) for window in parts]
     return {name: torch.cat([part[name] for part in found]) for name in found[0]}
+
+
+def errors_along(dynamics: Dynamics, window: TensorDict) -> Errors:
+    """Errors of a rollout from the first of consecutive states ``[windows, states]``."""
+    command = command_of(dynamics.scene, window)
+    path = open_loop(dynamics, window[:, 0], window.shape[1] - 1, command)
+    return position_errors(dynamics.scene, window[QPOS][:, 1:], path)
 
 
 def error_key(scene: Scene, quantity: str, joint: str = "_error_") -> str:

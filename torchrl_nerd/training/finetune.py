@@ -22,18 +22,15 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Model, dynamics_of
-from torchrl_nerd.evaluation.recorded_error import error_key, window_errors
-from torchrl_nerd.evaluation.rollout_error import (
-    Errors,
-    open_loop,
-    position_errors,
-    unit_of,
+from torchrl_nerd.evaluation.recorded_error import (
+    error_key,
+    errors_along,
+    window_errors,
 )
-from torchrl_nerd.keys import QPOS
+from torchrl_nerd.evaluation.rollout_error import Errors, unit_of
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import recorded_protocol
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.commands import command_of
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.physics_fit import WINDOWS, fit_flight, fit_parameters
 
@@ -147,11 +144,9 @@ class FineTuner:
             step.set_values(values)
             return float(weighted_error(scene, self.errors(rows)).mean())
 
-        flight = fit_flight(scene, self.recording.select(self.train))
-        first, seed = step.values() | flight, self.config.seed
-        stages = fit_parameters(
-            error_of, first, PARAMETERS, self.starts, evaluations, seed
-        )
+        first = step.values() | fit_flight(scene, self.recording.select(self.train))
+        how = evaluations, self.config.seed
+        stages = fit_parameters(error_of, first, PARAMETERS, self.starts, *how)
         with self._bar(planned, epoch) as bar:
             for found in stages:
                 step.set_values(found)
@@ -230,11 +225,8 @@ class FineTuner:
 
 def rollout_error(model: Model, window: TensorDict) -> Tensor:
     """`weighted_error` of a rollout from the first state of ``[rows, steps + 1]``."""
-    steps = window.batch_size[1] - 1
     dynamics = dynamics_of(model, differentiable=True)
-    path = open_loop(dynamics, window[:, 0], steps, command_of(model.scene, window))
-    errors = position_errors(model.scene, window[QPOS][:, 1:], path)
-    return weighted_error(model.scene, errors)
+    return weighted_error(model.scene, errors_along(dynamics, window))
 
 
 def weighted_error(scene: Scene, errors: Errors) -> Tensor:
