@@ -189,8 +189,7 @@ def error_table(
     for first in range(0, len(quantities), QUANTITIES):
         shown = quantities[first : first + QUANTITIES]
         titles = [title for q, unit in shown for title in (f"{q} ({unit})", "", "")]
-        head = ["name", "kind", *("mean", "final", "p95") * len(shown)]
-        head += rates
+        head = ["name", "kind", *("mean", "final", "p95") * len(shown), *rates]
         body = []
         for name, kind in candidates:
             cells = [x for q, _ in shown for x in found.get((name, q), ["-"] * 3)]

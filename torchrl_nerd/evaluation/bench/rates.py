@@ -17,7 +17,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     scene_of,
     states_of,
 )
-from torchrl_nerd.keys import PARAMETERS, TERRAIN
+from torchrl_nerd.keys import TERRAIN
 from torchrl_nerd.robots import Source
 
 SAMPLE_SECONDS = 0.1  # one sample lasts about as long
@@ -62,11 +62,8 @@ def rate_rows(
 
 def mid_states(source: Source, batch: int, seed: int) -> TensorDict:
     """States ``[batch]`` at random moments of passive motion, with their terrain."""
-    start, dynamics = (
-        initial_states(source, batch, seed),
-        MujocoDynamics(scene_of(source)),
-    )
-    path = rollout(dynamics, start.exclude(PARAMETERS), MAX_STEP)
+    start = initial_states(source, batch, seed)
+    path = rollout(MujocoDynamics(scene_of(source)), start, MAX_STEP)
     generator = torch.Generator().manual_seed(seed)
     moment = 1 + torch.randint(MAX_STEP, (batch,), generator=generator)
     # one moment of each trajectory: [batch]
@@ -97,9 +94,7 @@ def _seconds(
 class Runner:
     """Runs for about as long as a sample lasts.
 
-    Args:
-        run: makes that many steps; two of them, ``warm_up_s`` long, warm it up.
-        clock: what times it.
+    ``run`` makes so many steps; two of them, ``warm_up_s`` long, warm it up.
     """
 
     def __init__(
