@@ -93,7 +93,7 @@ def states_of(
     """The state ``[n]`` after each step of a rollout.
 
     Args:
-        dynamics: any; what it remembers is forgotten.
+        dynamics: any; its past is forgotten.
         start: ``qpos``, ``qvel``; where they vary ``terrain`` and ``parameters``; ``[n]``.
         steps: control steps.
         command: ``(n, T, m)``, torques or servos' controls, repeated after T steps; or a
