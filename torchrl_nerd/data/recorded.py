@@ -62,8 +62,9 @@ class Recording:
         rows = self.starts(1, numbers)
         counts = self.offsets.diff()[numbers]
         ends = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
-        names = {key: key if isinstance(key, str) else key[-1] for key in self.columns}
-        kept = {names[key]: column[rows] for key, column in self.columns.items()}
+        names = "qpos", "qvel", "joint_torque", "terrain", "ctrl"
+        found = {name: getattr(self, name) for name in names}
+        kept = {name: x[rows] for name, x in found.items() if x is not None}
         return replace(self, **kept, offsets=ends, time=None)
 
     def starts(self, states: int, numbers: Tensor | None = None) -> Tensor:

@@ -118,8 +118,8 @@ class Symmetry(nn.Module):
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
         """Statistics of tokens and targets with all their images."""
-        found = {TOKEN: self.tokens.complete(stats[TOKEN])}
-        return found | {TARGET: self.targets.complete(stats[TARGET])}
+        tokens = self.tokens.complete(stats[TOKEN])
+        return {TOKEN: tokens, TARGET: self.targets.complete(stats[TARGET])}
 
     def keeps(self, normalize: Normalize) -> bool:
         """Whether images of normalised tokens and targets are those of raw ones."""

@@ -90,7 +90,8 @@ class Trainer:
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
         self.validation = source, horizons, random_actions
-        self.quiet, self.logger = quiet, logger
+        self.quiet = quiet
+        self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
         self._build(data, init_from)
         self.optimizers = self.make_optimizers()
