@@ -8,10 +8,7 @@ def text_table(
 ) -> str:
     """Lines with aligned columns, the first two to the left.
 
-    Args:
-        head: titles of the columns.
-        body: lines of cells.
-        titles: over the columns after the first two; each may be as wide as three columns.
+    ``titles``: above the columns after the first two, each as wide as three at most.
     """
     widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
     lines = [

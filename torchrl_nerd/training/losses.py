@@ -13,10 +13,10 @@ RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root sm
 
 
 def relative_error(errors: Tensor, size: Tensor, loss_eps: float) -> Tensor:
-    """``|errors (*batch, D)|`` over the root of ``size (*batch,) + loss_eps``.
+    """``sqrt(mean(errors^2) / (size + loss_eps))``, of normalised errors ``(*batch, D)``.
 
-    ``size`` is the mean square of the true change; ``loss_eps`` keeps samples at rest
-    finite. Not the square of it: impacts are few and their errors large, and squares leave
+    ``size (*batch,)`` is the mean square of the true change; ``loss_eps`` keeps samples at
+    rest finite. Not its square: impacts are few and their errors large, and squares leave
     free flight no say (a quarter of the error there, see experiments/first_edition).
     """
     square = errors.square().mean(-1) / (size + loss_eps)

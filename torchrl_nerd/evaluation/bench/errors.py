@@ -150,12 +150,8 @@ def error_rows(
 ) -> list[ErrorRow]:
     """Rows of one case and horizon: every candidate in its order, the paper last.
 
-    Args:
-        scene: the robot.
-        case: its name.
-        horizon: control steps over which errors are averaged.
-        errors: (name, kind) -> errors at every step.
-        published: (case, horizon, quantity) -> the paper's mean error, m or rad.
+    ``errors``: (name, kind) -> errors at every step, which are averaged over the horizon.
+    ``published``: (case, horizon, quantity) -> the paper's mean error, m or rad.
     """
     rows, about = [], (case, horizon)
     for (name, kind), by_name in errors.items():
