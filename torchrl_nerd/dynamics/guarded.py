@@ -15,9 +15,6 @@ Guard = Literal["flag", "truncate", "raise", "fallback"]
 as ``truncated``; refuse to go on; or let MuJoCo step it."""
 
 
-PATIENCE = 24  # control steps
-
-
 class UntrustedError(RuntimeError):
     """An input too far from what the model was trained on."""
 
@@ -37,7 +34,7 @@ class GuardedDynamics:
             a fallback where torques may be late.
     """
 
-    patience = PATIENCE
+    patience = 24  # control steps
 
     def __init__(self, learned: NeRDDynamics, guard: Guard = "flag") -> None:
         if guard not in (known := get_args(Guard)):

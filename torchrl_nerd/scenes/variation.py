@@ -34,8 +34,8 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.scenes.parameter_kinds import KINDS, MOTOR, Fields, Kind
+from torchrl_nerd.scenes.support import ON_JOINT
 
-ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 Ranges = Mapping[str, Sequence[float]]
 """Name of each parameter -> lowest and highest value."""
 

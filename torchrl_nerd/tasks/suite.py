@@ -89,7 +89,7 @@ class SuiteTask(Task):
         if self._formula is None:
             return self._judged(dict(next_state.items()) | {ACTION: action})[..., 0]
         qpos, qvel = next_state[QPOS], next_state[QVEL]
-        ctrl = self._ctrl(action.to(qpos.dtype))
+        ctrl = own_actuators(self).ctrl(action.to(qpos.dtype))
         return self._formula.reward(qpos, qvel, ctrl, self._extra(next_state))
 
     def terminated(self, next_state: State) -> Tensor:
@@ -115,16 +115,12 @@ class SuiteTask(Task):
         none = state[QPOS][..., :0]
         return none if felt is None else felt[..., self._forces].to(none.dtype)
 
-    def _ctrl(self, action: Tensor) -> Tensor:
-        """MuJoCo's controls at an action, ``(*batch, nu)``."""
-        return own_actuators(self).ctrl(action)
-
     def _judged(self, state: State) -> Tensor:
         """Reward, end and observation of each env; the control is zero after a reset."""
         qpos = state[QPOS]
         ctrl = qpos.new_zeros(*qpos.shape[:-1], self._num_ctrl)
         if ACTION in state.keys():
-            ctrl = self._ctrl(state[ACTION].to(qpos.dtype))
+            ctrl = own_actuators(self).ctrl(state[ACTION].to(qpos.dtype))
         felt = qpos.new_full((*qpos.shape[:-1], len(self._forces)), torch.nan)
         if SENSORDATA in state.keys():
             felt = state[SENSORDATA][..., self._forces]
