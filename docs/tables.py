@@ -2,7 +2,7 @@
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
 ``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
-``gpu_errors``, ``hidden_parameters`` or ``robots_that_load``.
+``gpu_errors``, ``hidden_parameters``, ``robots_that_load`` or ``policies``.
 """
 
 import json
@@ -307,6 +307,36 @@ def robots_table(folder: Path = RESULTS) -> str:
     return "\n\n".join((rows(loads), rows(table), why, made_by(record)))
 
 
+def policies_table(folder: Path = RESULTS) -> str:
+    """Policies that learned in a model alone, and in MuJoCo: returns, frames, minutes."""
+    table = [["task", "learned in", "robot's frames", "minutes", "return in MuJoCo"]]
+    table[0] += ["in the model"]
+    records = [record for _, record in sorted(read("policies", folder).items())]
+    for record in records:
+        found, task = record["results"], record["results"]["configuration"]["name"]
+        spent = {k: f"{sum(v.values()) / 60:.0f}" for k, v in found["seconds"].items()}
+        few, last = (found[way][-1]["robot_frames"] for way in ("model", "mujoco"))
+        ways = (
+            ("model", few, spent["model"], "learned in the model, in MuJoCo"),
+            ("MuJoCo", last, spent["mujoco"], "learned in MuJoCo"),
+            ("MuJoCo", few, "-", "learned in MuJoCo, the model's robot frames"),
+        )
+        believed = found["returns"]["learned in the model, in the model"]
+        for way, frames, minutes, name in ways:
+            returns = found["returns"][name]
+            cells = f"{frames:,}", minutes, spread(returns)
+            table.append(
+                [task, way, *cells, spread(believed) if way == "model" else "-"]
+            )
+    lines = [made_by(record) for record in records]
+    return "\n\n".join((rows(table), *lines)) if records else ""
+
+
+def spread(returns: dict[str, float]) -> str:
+    """Mean return and half of its 95% interval."""
+    return f"{returns['mean']:,.0f} ± {returns['interval']:,.0f}"
+
+
 TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
@@ -319,6 +349,7 @@ TABLES = {
     "gpu_errors": gpu_errors_table,
     "hidden_parameters": hidden_parameters_tables,
     "robots_that_load": robots_table,
+    "policies": policies_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -326,6 +357,8 @@ COMMANDS |= {"state_dtype": MEASURED, "gpu_rates": "make gpu", "gpu_errors": "ma
 COMMANDS |= {"hidden_parameters": "python -m experiments.hidden_parameters"}
 ROBOTS = "python experiments/robots_that_load.py --json results/robots_that_load.json"
 COMMANDS |= {"robots_that_load": ROBOTS}
+POLICIES = "python experiments/policies_in_the_model.py TASK --json FILE"
+COMMANDS |= {"policies": POLICIES}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -220,14 +220,14 @@ def in_the_model(cfg: Config) -> dict:
     assert model is not None
     save_policy(learner.policy, cfg.folder / "policy", {})
     seed, count = cfg.seed + 10_000, cfg.episodes
-    believed = policy_returns(NeRDEnv(task, model, count, seed), learner.actor)
-    truth = returns_of(cfg, learner.actor, count, seed)
+    promised = policy_returns(NeRDEnv(task, model, count, seed), learner.actor)
+    reached = returns_of(cfg, learner.actor, count, seed)
     return {
         "curve": curve,
         "robot_frames": SEGMENT * len(data),
         "seconds": clock.seconds,
-        "truth": truth,
-        "believed": believed,
+        "reached": reached,
+        "promised": promised,
     }
 
 
@@ -244,14 +244,14 @@ def in_mujoco(cfg: Config) -> dict:
         curve.append({"robot_frames": robot_frames, "return": found})
         print(f"MuJoCo, {curve[-1]}", flush=True)
         clock.note("watching")
-    truth = returns_of(cfg, learner.actor, cfg.episodes, cfg.seed + 10_000)
-    return {"curve": curve, "seconds": clock.seconds, "truth": truth}
+    reached = returns_of(cfg, learner.actor, cfg.episodes, cfg.seed + 10_000)
+    return {"curve": curve, "seconds": clock.seconds, "reached": reached}
 
 
 def few_frames(cfg: Config, robot_frames: int) -> Tensor:
     """Returns of a policy that learned from as many robot frames as the model had."""
     actions = robot_frames // task_of(cfg).frame_skip
-    return in_mujoco(replace(cfg, frames=actions, rounds=1))["truth"]
+    return in_mujoco(replace(cfg, frames=actions, rounds=1))["reached"]
 
 
 def main(cfg: Config) -> None:
@@ -260,13 +260,13 @@ def main(cfg: Config) -> None:
         ways = pool.submit(in_the_model, cfg), pool.submit(in_mujoco, cfg)
         learned, rival = (way.result() for way in ways)
         few = pool.submit(few_frames, cfg, learned["robot_frames"]).result()
-    truth, believed = learned.pop("truth"), learned.pop("believed")
-    theirs = rival.pop("truth")
+    reached, promised = learned.pop("reached"), learned.pop("promised")
+    theirs = rival.pop("reached")
     how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
     same = "ground truth"
     returns = {
-        "learned in the model, in MuJoCo": summarize(truth, theirs, same),
-        "learned in the model, in the model": summarize(believed, truth),
+        "learned in the model, in MuJoCo": summarize(reached, theirs, same),
+        "learned in the model, in the model": summarize(promised, reached),
         "learned in MuJoCo": summarize(theirs, theirs, same),
         "learned in MuJoCo, the model's robot frames": summarize(few, theirs, same),
     }

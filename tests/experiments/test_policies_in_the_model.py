@@ -1,0 +1,55 @@
+"""Policies that learn in a model alone: what fails there, the data, the whole of it."""
+
+import json
+
+import pytest
+import tables
+import torch
+from policies_in_the_model import SEGMENT, Config, Trusted, along_the_policy, main
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+
+from torchrl_nerd import NeRDEnv, make_env
+from torchrl_nerd.evaluation.policy import Policy, make_actor
+from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.robots import make_task
+
+
+def test_an_episode_fails_where_the_model_has_no_data():
+    env = TransformedEnv(
+        NeRDEnv("cartpole/swingup", num_envs=2, guard="flag"), Trusted(0.5)
+    )
+    state = env.reset()
+    state[QVEL][1] = 500.0
+    after = env.rand_step(env.reset(state, set_state=True))["next"]
+    assert after["trust"][0] > 0.5 > after["trust"][1]
+    for key in ("done", "terminated"):
+        assert after[key].flatten().tolist() == [False, True]
+
+
+def test_pieces_begin_before_the_robot_fell():
+    task = make_task("gymnasium/Hopper-v5")
+    actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
+    cfg = Config(task.name, along=6, length=3 * SEGMENT, noise=1.0)
+    found = along_the_policy(task, actor, cfg, 0)
+    assert found.batch_size[1] == SEGMENT
+    assert cfg.along <= len(found) < 3 * cfg.along  # it falls within seconds
+    start = found[:, 0]
+    assert not task.terminated({key: start[key] for key in (QPOS, QVEL)}).any()
+    assert isinstance(found, TensorDict)
+    torch.testing.assert_close(found[:, 1:][QPOS], found[:, :-1]["next", QPOS])
+
+
+@pytest.mark.slow
+def test_a_round_of_seconds(tmp_path):
+    """Both ways, the report, and the table of the site that is made of it."""
+    sizes = {"trajectories": 20, "updates": 20, "more_updates": 10, "rounds": 2}
+    sizes |= {"along": 4, "length": SEGMENT, "frames": 4096, "num_envs": 64}
+    sizes |= {"horizon": 16, "minibatch": 512, "episodes": 4}
+    path = tmp_path / "policies_Hopper.json"
+    main(Config("gymnasium/Hopper-v5", out=tmp_path, json=path, **sizes))
+    found = json.loads(path.read_text())["results"]
+    assert [x["robot_frames"] for x in found["mujoco"]] == [2048, 4096]
+    assert found["model"][-1]["robot_frames"] >= 20 * SEGMENT
+    assert {"data", "model", "policy"} == found["seconds"]["model"].keys()
+    assert tables.policies_table(tmp_path).count("| gymnasium/Hopper-v5 |") == 3
