@@ -13,6 +13,12 @@ from typing import Any
 
 RESULTS = Path(__file__).parents[1] / "results"
 MARKER = re.compile(r"^<!-- table: (\w+) -->$", re.M)
+RETURNS = (  # of experiments/policies_in_the_model.py
+    "learned in the model, in MuJoCo",
+    "learned in the model, in the model",
+    "learned in MuJoCo",
+    "learned in MuJoCo, the model's robot frames",
+)
 QUANTITIES = 3  # side by side: more do not fit on the page
 BATCH = 512
 
@@ -312,24 +318,25 @@ def policies_table(folder: Path = RESULTS) -> str:
     table = [["task", "learned in", "robot's frames", "minutes", "return in MuJoCo"]]
     table[0] += ["in the model"]
     records = [record for _, record in sorted(read("policies", folder).items())]
+    rivals = {}  # of a task: those of its last record
     for record in records:
-        found, task = record["results"], record["results"]["configuration"]["name"]
+        found, how = record["results"], record["results"]["configuration"]
         spent = {k: f"{sum(v.values()) / 60:.0f}" for k, v in found["seconds"].items()}
         few, last = (found[way][-1]["robot_frames"] for way in ("model", "mujoco"))
-        ways = (
-            ("model", few, spent["model"], "learned in the model, in MuJoCo"),
-            ("MuJoCo", last, spent["mujoco"], "learned in MuJoCo"),
-            ("MuJoCo", few, "-", "learned in MuJoCo, the model's robot frames"),
+        own, promised, same, fewer = (
+            spread(found["returns"][name]) for name in RETURNS
         )
-        believed = found["returns"]["learned in the model, in the model"]
-        for way, frames, minutes, name in ways:
-            returns = found["returns"][name]
-            cells = f"{frames:,}", minutes, spread(returns)
-            table.append(
-                [task, way, *cells, spread(believed) if way == "model" else "-"]
-            )
+        way = f"model, {how['network']}"
+        table.append([how["name"], way, f"{few:,}", spent["model"], own, promised])
+        rivals[how["name"]] = [
+            [how["name"], "MuJoCo", f"{last:,}", spent["mujoco"], same, "-"],
+            [how["name"], "MuJoCo", f"{few:,}", "-", fewer, "-"],
+        ]
+    table += [row for found in rivals.values() for row in found]
     lines = [made_by(record) for record in records]
-    return "\n\n".join((rows(table), *lines)) if records else ""
+    return (
+        "\n\n".join((rows([table[0], *sorted(table[1:])]), *lines)) if records else ""
+    )
 
 
 def spread(returns: dict[str, float]) -> str:

@@ -64,7 +64,7 @@ class Config:
     length: int = 1000  # control steps of each, until the robot falls
     more_updates: int = 1000  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
-    network: str = "mlp-4x128"
+    network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
     num_envs: int = 512
