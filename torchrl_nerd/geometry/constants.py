@@ -52,14 +52,18 @@ def placed(module: Module, like: Tensor) -> Module:
 
 
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    # compiled code holds constants itself; elsewhere than here it would copy them there
-    if torch.compiler.is_compiling() and device.type == "cpu":
+    if torch.compiler.is_compiling() and _bakes(device):
         return torch.tensor(values, dtype=dtype, device=device)
     key = values, dtype, str(device)
     if key not in _kept:
         with torch.inference_mode(False):
             _kept[key] = torch.tensor(values, dtype=dtype, device=device)
     return _kept[key]
+
+
+def _bakes(device: torch.device) -> bool:
+    """Whether compiled code holds constants itself; elsewhere it would copy them there."""
+    return device.type == "cpu"
 
 
 def _frozen(values: Any) -> Any:
