@@ -39,10 +39,17 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     env that has ended begins its next episode at the next step, whatever its action then
     is, with a reward of zero: Gymnasium's mode ``NEXT_STEP``.
 
-    Arguments are those of `make_env`, with the seed of resets until `reset` is given
-    another, a ``render_mode`` of None or ``"rgb_array"`` for images of ``height`` and
-    ``width`` pixels by `render`, and ``max_episode_steps`` until ``truncated``, where the
-    task's horizon is longer.
+    Args:
+        task: id of a task, or a task.
+        dynamics: as for `make_env`.
+        num_envs: how many envs.
+        seed: of the resets, until `reset` is given another; None for a fresh one.
+        device: where the env computes.
+        render_mode: ``"rgb_array"`` for images by `render`, or None.
+        max_episode_steps: steps until ``truncated``, where the task's horizon is longer.
+        height: of an image, pixels.
+        width: of an image, pixels.
+        camera_id: of an image, see `envs.rendering.Renderer`.
 
     Raises:
         ValueError: what `make_env` refuses, an unknown render mode, or no steps.
@@ -166,7 +173,11 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
-    Arguments are those of `GymnasiumVectorEnv`, but for ``num_envs``.
+    Args:
+        task: id of a task, or a task.
+        dynamics: as for `make_env`.
+        render_mode: ``"rgb_array"`` or None.
+        settings: other arguments of `GymnasiumVectorEnv`, but ``num_envs``.
 
     Raises:
         TypeError: ``num_envs``, or an unknown argument.

@@ -56,9 +56,12 @@ class AnalyticStep(nn.Module, ABC):
     ) -> StepResult:
         """The state after one control step.
 
-        From ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``. The ``joint_torque (*batch,
-        num_actuated)``, N m and N, is held over the step; None for none. Of the ``terrain
-        (*batch, terrain.size)`` None is the scene's own.
+        Args:
+            qpos: ``(*batch, nq)``, float64.
+            qvel: ``(*batch, nv)``.
+            joint_torque: ``(*batch, num_actuated)``, N m and N, held over the step; None
+                for none.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
         """
         batch = qpos.shape[:-1]
         given = (

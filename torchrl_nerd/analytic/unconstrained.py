@@ -26,8 +26,11 @@ class UnconstrainedStep(AnalyticStep):
 
     Limits act on the joints of a robot with a fixed base, see `JointLimits`; a floating
     base's joints move as if they had none. ``velocity_defect (*batch, nv)`` is by how much
-    the second dynamics evaluation changed the step's velocity. The scene is a robot of
-    hinges and slides, on a floating or a fixed base; a ground is allowed and ignored.
+    the second dynamics evaluation changed the step's velocity.
+
+    Args:
+        scene: a robot of hinges and slides, on a floating or a fixed base, without dry
+            friction. A ground is allowed and ignored.
 
     Raises:
         ValueError: in one sentence, another robot.

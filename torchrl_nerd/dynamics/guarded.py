@@ -24,10 +24,14 @@ class GuardedDynamics:
 
     ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
     the inverse of `OODScore`: 0.5 is twice as far out. An env that is not finite has trust
-    0. ``guard`` says what to do with envs below trust 1, the untrusted ones. In
-    ``"fallback"`` MuJoCo steps them until they have been trusted for ``patience`` steps in
-    a row: a swing that is too fast at its bottom is familiar at its top. The network sees
-    the states of MuJoCo, so that it takes over again with their history.
+    0. Envs below trust 1 are untrusted. In ``"fallback"`` MuJoCo steps them until they have
+    been trusted for ``patience`` steps in a row: a swing that is too fast at its bottom is
+    familiar at its top. The network sees the states of MuJoCo, so that it takes over again
+    with their history.
+
+    Args:
+        learned: what steps the trusted envs.
+        guard: what to do with the others.
 
     Raises:
         ValueError: an unknown guard, a model that does not know what it was trained on, or

@@ -51,8 +51,12 @@ class MujocoDynamics(Engine):
     solver's warm start is carried from step to step, as ``mj_step`` does (it changes
     results by less than the solver's tolerance), and cleared for envs that are reset.
     Where the scene varies, each env has the ``parameters`` of its state; without any all
-    are as the scene is. By default as many threads step as the environment variable
-    ``NERD_THREADS`` says, or all processors that the process may use.
+    are as the scene is.
+
+    Args:
+        scene: robot, ground and substeps.
+        num_threads: that step; by default as many as the environment variable
+            ``NERD_THREADS`` says, or all processors that the process may use.
 
     Raises:
         ValueError: a number of threads below 1.
@@ -131,9 +135,12 @@ class MujocoDynamics(Engine):
     ) -> TensorDict:
         """Many control steps in one call: what `step` gives one after the other.
 
-        Arguments are those of `Dynamics.step`, but for ``joint_torque (rows, T,
-        num_actuated)`` and ``ctrl (rows, T, nu)``, each held over its control step. With
-        ``ctrl`` the torque is not used, and may be None.
+        Args:
+            state: ``qpos (rows, nq)``, ``qvel (rows, nv)``.
+            joint_torque: ``(rows, T, num_actuated)``, each held over its control step;
+                with ``ctrl`` it is not used, and may be None.
+            terrain: ``(rows, terrain.size)`` where the ground varies.
+            ctrl: ``(rows, T, nu)``, each held: MuJoCo's actuators act in every substep.
 
         Returns:
             ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo

@@ -27,9 +27,11 @@ from torchrl_nerd.tasks import Task
 class GroundTruthEnv(SceneEnv):
     """A `SceneEnv` on MuJoCo's batched rollout, dm_control's `Physics` or MuJoCo Warp.
 
-    The ``engine`` is ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``),
-    which runs on ``device``; the others use the CPU. The task may be given by its id. Other
-    arguments are those of `SceneEnv`.
+    Args:
+        task: id of a registered task, or a task.
+        engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``).
+        num_envs, seed, dump_dir, state_dtype: see `SceneEnv`.
+        device: where all tensors live, and MuJoCo Warp runs; the others use the CPU.
 
     Raises:
         ValueError: an unknown engine, or one that cannot step this scene.

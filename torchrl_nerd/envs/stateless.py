@@ -16,8 +16,11 @@ class StatelessEnv(EnvBase):
     For TorchRL's planners (`CEMPlanner`, `MPPIPlanner`), which try many actions from one
     state. A view of a `SceneEnv`: a tensordict of another state than it was left in sets
     that state, with an empty history; one that it has just returned goes on, with its
-    history. A reset begins episodes as in ``env``; without a tensordict, all of them. Every
-    tensordict has ``num_envs`` elements, such as states to plan for times candidates.
+    history. A reset begins episodes as in ``env``; without a tensordict, all of them.
+
+    Args:
+        env: what steps; every tensordict has ``num_envs`` elements, such as states to
+            plan for times candidates.
 
     Examples:
         >>> from torchrl_nerd.envs import make_env

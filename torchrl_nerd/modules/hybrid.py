@@ -29,8 +29,12 @@ class HybridNeRD(NeRD):
     no influence. The analytic change stays float64. It may exceed all changes in the
     data, so the sum is bounded by the largest speeds alone.
 
-    Arguments are those of `NeRD`, and a ``step`` of the scene or of its reference solver.
-    The network's last layer is zero at first.
+    Args:
+        scene: the robot and its ground.
+        step: of that scene, or of its reference solver.
+        features: as for `NeRD`.
+        network: as for `NeRD`; its last layer is zero at first.
+        stats: as for `NeRD`.
     """
 
     kind: ClassVar[str] = "hybrid"

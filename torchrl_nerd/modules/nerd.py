@@ -72,9 +72,14 @@ class Encoded(NamedTuple):
 class NeRD(nn.Module):
     """The learned solver of one robot: state, torque and ground in, next state out.
 
-    ``stats`` are those of raw features and targets: zero mean and unit variance where none
-    are given and weights are yet to be loaded. What it sees of a state and what it predicts
-    are `SceneFeatures` and `StateDelta`, unless others are given.
+    Args:
+        scene: the robot and its ground.
+        features: which predictions of the contact law are among its features.
+        network: size and kind of the network.
+        stats: of raw features and targets; zero mean and unit variance where not given
+            (weights that are yet to be loaded).
+        scene_features: what it sees of a state; `SceneFeatures` where not given.
+        state_delta: what it predicts; see `StateDelta`.
     """
 
     kind: ClassVar[str] = "learned"
@@ -152,9 +157,11 @@ class NeRD(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The next ``qpos`` and ``qvel``, and the features, for `ood_score`.
 
-        ``drive (*batch, num_actuated + num_ctrl)``: see `drive_of`. Of the ``terrain
-        (*batch, terrain.size)`` None is the scene's own. ``network_step``, which keeps the
-        history, is ``(*batch, token_size) -> (*batch, D)``.
+        Args:
+            state: ``qpos (*batch, nq)`` and ``qvel (*batch, nv)``.
+            drive: ``(*batch, num_actuated + num_ctrl)``, see `drive_of`.
+            terrain: ``(*batch, terrain.size)``; None for the scene's own ground.
+            network_step: ``(*batch, token_size) -> (*batch, D)``: keeps the history.
         """
         encoded = self.encode(*state, drive, terrain)
         after = self.decode(state, encoded, network_step(encoded.token))
