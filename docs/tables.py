@@ -13,12 +13,6 @@ from typing import Any
 
 RESULTS = Path(__file__).parents[1] / "results"
 MARKER = re.compile(r"^<!-- table: (\w+) -->$", re.M)
-RETURNS = (  # of experiments/policies_in_the_model.py
-    "learned in the model, in MuJoCo",
-    "learned in the model, in the model",
-    "learned in MuJoCo",
-    "learned in MuJoCo, the model's robot frames",
-)
 QUANTITIES = 3  # side by side: more do not fit on the page
 BATCH = 512
 
@@ -315,28 +309,29 @@ def robots_table(folder: Path = RESULTS) -> str:
 
 def policies_table(folder: Path = RESULTS) -> str:
     """Policies that learned in a model alone, and in MuJoCo: returns, frames, minutes."""
-    table = [["task", "learned in", "robot's frames", "minutes", "return in MuJoCo"]]
-    table[0] += ["in the model"]
+    head = ["task", "learned in", "robot's frames", "minutes", "return in MuJoCo"]
+    lines: dict[
+        tuple[str, str, int], list[str]
+    ] = {}  # rivals of several models are one
     records = [record for _, record in sorted(read("policies", folder).items())]
-    rivals = {}  # of a task: those of its last record
     for record in records:
         found, how = record["results"], record["results"]["configuration"]
         spent = {k: f"{sum(v.values()) / 60:.0f}" for k, v in found["seconds"].items()}
-        few, last = (found[way][-1]["robot_frames"] for way in ("model", "mujoco"))
-        own, promised, same, fewer = (
-            spread(found["returns"][name]) for name in RETURNS
-        )
-        way = f"model, {how['network']}"
-        table.append([how["name"], way, f"{few:,}", spent["model"], own, promised])
-        rivals[how["name"]] = [
-            [how["name"], "MuJoCo", f"{last:,}", spent["mujoco"], same, "-"],
-            [how["name"], "MuJoCo", f"{few:,}", "-", fewer, "-"],
-        ]
-    table += [row for found in rivals.values() for row in found]
-    lines = [made_by(record) for record in records]
-    return (
-        "\n\n".join((rows([table[0], *sorted(table[1:])]), *lines)) if records else ""
-    )
+        few, most = (found[way][-1]["robot_frames"] for way in ("model", "mujoco"))
+        promised = spread(found["returns"]["learned in the model, in the model"])
+        network = f"model, {how['network']}"
+        for name, way, frames, minutes, in_model in (
+            ("the model, in MuJoCo", network, few, spent["model"], promised),
+            ("MuJoCo", "MuJoCo", most, spent["mujoco"], "-"),
+            ("MuJoCo, the rule of trust", "MuJoCo, rule of trust", most, "-", "-"),
+            ("MuJoCo, the model's robot frames", "MuJoCo", few, "-", "-"),
+        ):
+            if (returns := found["returns"].get(f"learned in {name}")) is not None:
+                about = how["name"], way, f"{frames:,}"
+                line = [*about, minutes, spread(returns), in_model]
+                lines.setdefault(about, line)
+    table = rows([[*head, "in the model"], *lines.values()]) if lines else ""
+    return "\n\n".join(filter(None, (table, *map(made_by, records))))
 
 
 def spread(returns: dict[str, float]) -> str:

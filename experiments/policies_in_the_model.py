@@ -6,7 +6,8 @@
 2. In rounds: PPO in the model alone, where an episode fails as soon as a step is unlike the
    data; trajectories along the policy in MuJoCo, from which the model goes on learning.
 3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
-   policy had in the model, one for as many as the model's data cost the robot.
+   policy had in the model, one for as many as the model's data cost the robot, and one
+   whose episodes fail where those in the model do.
 4. All play whole episodes in MuJoCo, from the same held-out starts.
 
 The two ways take a processor each at the same time, so that their wall times compare.
@@ -25,15 +26,17 @@ import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
 
 from torchrl_nerd import NeRDEnv, make_env
+from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
+from torchrl_nerd.dynamics import GuardedDynamics, NeRDDynamics
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation.policy import make_actor, save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
@@ -86,16 +89,28 @@ class Config:
 
 
 class Trusted(Transform):
-    """Ends an episode as failed where the model is asked for what it has no data of."""
+    """Ends an episode as failed where a model is asked for what it has no data of.
 
-    def __init__(self, least: float) -> None:
+    Args:
+        least: trust that a step needs.
+        judge: whose trust it is, where the env has none. It keeps no past.
+    """
+
+    def __init__(self, least: float, judge: GuardedDynamics | None = None) -> None:
         super().__init__()
-        self.least = least
+        self.least, self.judge = least, judge
 
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        lost = next_tensordict[TRUST] < self.least  # (num_envs, 1)
+        found = next_tensordict
+        if self.judge is not None:
+            state, ctrl = (
+                tensordict.select(QPOS, QVEL),
+                next_tensordict.get("ctrl", None),
+            )
+            found = self.judge.step(state, next_tensordict["joint_torque"], None, ctrl)
+        lost = found[TRUST] < self.least  # (num_envs, 1)
         for key in ("done", "terminated"):
             next_tensordict[key] = next_tensordict[key] | lost
         return next_tensordict
@@ -118,7 +133,7 @@ class Clock:
 class Learner:
     """PPO that keeps its policy, critic and step size when it changes envs."""
 
-    def __init__(self, cfg: Config, env: TransformedEnv) -> None:
+    def __init__(self, cfg: Config, env: EnvBase) -> None:
         names = ("num_envs", "horizon", "minibatch", "lr", "gamma", "widths", "seed")
         kept = {name: getattr(cfg, name) for name in names}
         self.cfg = ppo.Run(total_frames=cfg.frames, **kept)
@@ -128,7 +143,7 @@ class Learner:
         self.batch = cfg.num_envs * cfg.horizon
         self.updates, self.done = max(1, cfg.frames // self.batch), 0
 
-    def learn(self, env: TransformedEnv, share: float) -> float:
+    def learn(self, env: EnvBase, share: float) -> float:
         """A share of all frames in an env; the mean reward of the last batch."""
         count, optimizer = max(1, round(share * self.updates)), self.parts[2]
         how, reward = replace(self.cfg, total_frames=count * self.batch), 0.0
@@ -160,6 +175,11 @@ def begin(cfg: Config) -> tuple[Task, Clock]:
 def returns_of(cfg: Config, actor: Actor, count: int, seed: int) -> Tensor:
     """Of whole episodes in MuJoCo, ``(count,)``."""
     return policy_returns(make_env(task_of(cfg), "mujoco", count, seed), actor)
+
+
+def watched(cfg: Config, actor: Actor) -> float:
+    """Mean return in MuJoCo, from starts that the report does not use."""
+    return float(returns_of(cfg, actor, WATCHED, cfg.seed + 100).mean())
 
 
 def along_the_policy(task: Task, actor: Actor, cfg: Config, number: int) -> TensorDict:
@@ -201,7 +221,7 @@ def in_the_model(cfg: Config) -> dict:
     task, clock = begin(cfg)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
     data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
-    learner = Learner(cfg, TransformedEnv(make_env(task, "mujoco", 8, cfg.seed)))
+    learner = Learner(cfg, make_env(task, "mujoco", 8, cfg.seed))
     for number in range(cfg.rounds):
         more = along_the_policy(task, learner.actor, cfg, number)
         data = cast(TensorDict, TensorDict.cat((data, more)))
@@ -212,7 +232,7 @@ def in_the_model(cfg: Config) -> dict:
         env = TransformedEnv(inner, Trusted(cfg.trust))
         reward = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
-        found = float(returns_of(cfg, learner.actor, WATCHED, cfg.seed + 100).mean())
+        found = watched(cfg, learner.actor)
         frames = SEGMENT * len(data)
         curve.append({"robot_frames": frames, "return": found, "reward": reward})
         print(f"model, round {number + 1}: {curve[-1]}", flush=True)
@@ -224,22 +244,29 @@ def in_the_model(cfg: Config) -> dict:
     reached = returns_of(cfg, learner.actor, count, seed)
     return {
         "curve": curve,
-        "robot_frames": SEGMENT * len(data),
         "seconds": clock.seconds,
         "reached": reached,
         "promised": promised,
     }
 
 
-def in_mujoco(cfg: Config) -> dict:
-    """A policy learned in MuJoCo, what it took, and how it does."""
+def in_mujoco(cfg: Config, is_judged: bool = False) -> dict:
+    """A policy learned in MuJoCo, what it took, and how it does.
+
+    ``is_judged``: its episodes fail as those in the model do, by the models of the rounds.
+    """
     task, clock = begin(cfg)
-    env = TransformedEnv(make_env(task, "mujoco", cfg.num_envs, cfg.seed))
+    env: EnvBase = make_env(task, "mujoco", cfg.num_envs, cfg.seed)
     learner, curve = Learner(cfg, env), []
-    for _ in range(cfg.rounds):
+    for number in range(cfg.rounds):
+        if is_judged:
+            model = cast(NeRD, load_checkpoint(cfg.folder / f"model_{number}" / "last"))
+            rule = Trusted(cfg.trust, GuardedDynamics(NeRDDynamics(model)))
+            env = make_env(task, "mujoco", cfg.num_envs, cfg.seed + number)
+            env = TransformedEnv(env, rule)
         learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
-        found = float(returns_of(cfg, learner.actor, WATCHED, cfg.seed + 100).mean())
+        found = watched(cfg, learner.actor)
         robot_frames = learner.done * learner.batch * task.frame_skip
         curve.append({"robot_frames": robot_frames, "return": found})
         print(f"MuJoCo, {curve[-1]}", flush=True)
@@ -259,7 +286,10 @@ def main(cfg: Config) -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         ways = pool.submit(in_the_model, cfg), pool.submit(in_mujoco, cfg)
         learned, rival = (way.result() for way in ways)
-        few = pool.submit(few_frames, cfg, learned["robot_frames"]).result()
+        robot_frames = learned["curve"][-1]["robot_frames"]
+        fewer = pool.submit(few_frames, cfg, robot_frames)
+        judged = pool.submit(in_mujoco, cfg, True).result()
+        few = fewer.result()
     reached, promised = learned.pop("reached"), learned.pop("promised")
     theirs = rival.pop("reached")
     how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
@@ -269,6 +299,9 @@ def main(cfg: Config) -> None:
         "learned in the model, in the model": summarize(promised, reached),
         "learned in MuJoCo": summarize(theirs, theirs, same),
         "learned in MuJoCo, the model's robot frames": summarize(few, theirs, same),
+        "learned in MuJoCo, the rule of trust": summarize(
+            judged["reached"], theirs, same
+        ),
     }
     for name, found in returns.items():
         print(f"{name}: {found.mean:.1f} +- {found.interval:.1f}")
