@@ -17,9 +17,11 @@ from torch import Tensor
 
 from torchrl_nerd import NeRDEnv, load_scene
 from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.dynamics.base import check_step
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.geometry import constants
 from torchrl_nerd.robots import TASKS
+from torchrl_nerd.scenes import Scene
 
 ROWS, STEPS = 4, 50
 QUICK = {("ant/run", "streaming"), ("anymal/forward", "analytic")}
@@ -92,6 +94,23 @@ def test_all_of_it_is_one_graph(task_id, kind, generator):
         paths.append(after)
     for key, value in paths[0].items():
         torch.testing.assert_close(paths[1][key], value, rtol=1e-6, atol=1e-6)
+
+
+def test_shapes_of_several_scenes_are_checked_in_one_graph():
+    """From the second scene on, Dynamo takes a width for a symbol."""
+
+    def checked(scene: Scene, state: TensorDict, torque: Tensor) -> Tensor:
+        check_step(scene, state, torque, None)
+        return torque + 1.0
+
+    traced = torch.compile(checked, backend="eager", fullgraph=True)
+    for name in ("cartpole", "cube", "franka"):
+        scene = load_scene(name)
+        qpos, qvel = (torch.zeros(ROWS, n) for n in (scene.model.nq, scene.model.nv))
+        torque = torch.zeros(ROWS, len(scene.actuated))
+        torch._dynamo.mark_static(qpos)
+        state = TensorDict(qpos=qpos, qvel=qvel, batch_size=[ROWS])
+        assert torch.equal(checked(scene, state, torque), traced(scene, state, torque))
 
 
 @pytest.mark.parametrize("is_compiled", [False, True])

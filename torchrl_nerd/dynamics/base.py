@@ -187,8 +187,8 @@ def check_step(
         ("joint_torque", joint_torque, len(scene.actuated)),
         ("ctrl", ctrl, scene.model.nu),
     ):
-        got = None if value is None else tuple(value.shape)
-        if got not in (None, (rows, width)):
+        if value is not None and value.shape != (rows, width):
+            got = tuple(value.shape)
             raise ValueError(f"expected {name} of shape {(rows, width)}, got {got}")
 
 
