@@ -4,8 +4,9 @@
 
 They take turns on one thread; processor time of an action of one row, TorchRL's
 bookkeeping and resets included. Actions are random and held, from the starts of episodes
-on, so robots that fall spend some steps in the air. Seconds of the first compiled step are
-those of new processes: a cold one, and a warm one that finds its code in torch's cache.
+on, so robots that fall spend some steps in the air. Seconds of the first compiled step,
+reset included, are those of new processes: a cold one, and a warm one that finds its code
+in torch's cache.
 """
 
 import os
@@ -31,9 +32,8 @@ FIRST_STEP = """
 import sys, time
 from torchrl_nerd import make_env
 env = make_env(sys.argv[1], num_envs=int(sys.argv[2]), seed=0, compile=True)
-env.rollout(1)
 began = time.perf_counter()
-env.rollout(2)
+env.rollout(3)
 print(time.perf_counter() - began)
 """
 

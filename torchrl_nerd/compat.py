@@ -38,13 +38,6 @@ def compile_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return {**isolated, **options, "options": {**TRUSTING, **own}}
 
 
-def graph_break() -> None:
-    """End a compiled piece here; the next one begins after it."""
-    break_here = getattr(getattr(torch, "_dynamo", None), "graph_break", None)
-    if break_here is not None:
-        break_here()
-
-
 def tensordict_of(
     entries: dict[str, Any], batch_size: torch.Size, device: torch.device | None
 ) -> TensorDict:

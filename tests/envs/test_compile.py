@@ -49,14 +49,19 @@ def path(env: SceneEnv, actions: torch.Tensor) -> list[TensorDictBase]:
 
 @pytest.mark.parametrize("task_id", slow_but(QUICK, TASKS))
 def test_its_pieces_are_the_eager_steps(task_id, generator):
-    """Traced, and run as they were traced: every bit is the same."""
+    """Traced, and run as they were traced: every bit is the same.
+
+    But of a linear solve, whose last bits depend on where its operands lie in memory.
+    """
+    solves = task_id == "franka/reach_osc"
     maker = EnvMaker(task_id, "streaming", generator)
     eager, traced = maker(ROWS), maker(ROWS)
     traced.compile(backend="eager", fullgraph=True)
     actions = random_actions(eager, STEPS, generator)
     for one, other in zip(path(eager, actions), path(traced, actions), strict=True):
         assert set(one.keys()) == set(other.keys())
-        assert all(torch.equal(one[key], other[key]) for key in one.keys())
+        bound = {"atol": 1e-9 * solves, "rtol": 0.0}
+        torch.testing.assert_close(one, other, **bound)
 
 
 @pytest.mark.slow
@@ -71,7 +76,10 @@ def test_a_compiled_task_is_close_to_eager(task_id, generator):
 
 def check_is_compiled(env: SceneEnv) -> None:
     """Step and reset went through the compiler, where there is one."""
-    for piece in (env._transit, env._restart):
+    transition = env._transition
+    is_held = env.task.frame_skip > 1  # over control steps, each a piece of its own
+    apart = (transition._advance, transition._judge) if is_held else (env._transit,)
+    for piece in (*apart, env._restart):
         assert isinstance(piece, Compiled)
         assert (piece._run is not None) == HAS_COMPILER
 

@@ -124,7 +124,7 @@ class SceneEnv(RenderedEnv):
         )
 
     def compile(self, *, warmup: int | None = None, **kwargs: Any) -> "SceneEnv":
-        """Make one compiled piece of a step, and one of a reset; returns the env itself.
+        """Compile a step and a reset; returns the env itself.
 
         TorchRL calls it for ``compile=``. Without a compiler, eager with one warning.
         ``warmup`` eager steps come first, 1 where not given. ``kwargs`` are those of
@@ -137,10 +137,9 @@ class SceneEnv(RenderedEnv):
             # in parts on threads a model compiles its own step, the env what is round it
             inner.compile = not kwargs and inner.parts(self.batch_size.numel()) > 1
             self._transition.is_round = inner.compile
-            # analytic steps for one thread are long code; a network's are not
-            self._transition.is_whole = not inner.is_single_threaded
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
-        self._transit = Compiled(self._transition.step, **options)
+        is_whole = self.device.type != "cpu"  # as a graph of an accelerator has to be
+        self._transit = self._transition.compile(is_whole, **options)
         self._restart = Compiled(self._transition.restart, **options)
         return self
 
@@ -148,6 +147,7 @@ class SceneEnv(RenderedEnv):
         """Step without a compiler; returns the env itself."""
         if (inner := self._torch_dynamics) is not None:
             inner.compile = False
+        self._transition.eager()
         self._transit = self._transition.step
         self._restart = self._transition.restart
         return self

@@ -4,15 +4,15 @@ Functions of tensors with one memory, the history that the dynamics keeps, so th
 of a control step can be compiled into one piece.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import reduce
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.compat import graph_break
-from torchrl_nerd.compiled import uncompiled
+from torchrl_nerd.compiled import Compiled, uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.envs.faults import find_faults
 from torchrl_nerd.geometry.manifold import normalize_pos
@@ -33,6 +33,7 @@ from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
+MOVING = QPOS, QVEL, PARAMETERS  # what a control step sees of a state
 FLAGS = ("done", "terminated", "truncated")
 
 
@@ -48,13 +49,29 @@ class Transition:
 
     # the dynamics has compiled code of its own, and `step` compiles to what is round it
     is_round = False
-    # all control steps of an action are one compiled piece, not one each
-    is_whole = True
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         self.task, self.dynamics = task, dynamics
         is_guarded = isinstance(dynamics, GuardedDynamics)
         self.is_truncating = is_guarded and dynamics.guard == "truncate"
+        self.eager()
+
+    def eager(self) -> None:
+        """`step` is Python."""
+        self._advance, self._judge = self._control_step, self._outcome
+
+    def compile(self, is_whole: bool, **options: Any) -> Callable[..., Tensors]:
+        """`step`, compiled with the ``options`` of `Compiled`.
+
+        It is one piece where it ``is_whole`` or one control step long. Else a control step
+        is one and what follows the last is another: four in one piece take four minutes.
+        """
+        self.eager()
+        if is_whole or self.task.frame_skip == 1:
+            return Compiled(self.step, **options)
+        self._advance = Compiled(self._control_step, **options)
+        self._judge = Compiled(self._outcome, **options)
+        return self.step
 
     def step(self, state: Tensors, action: Tensor, age: Tensor) -> Tensors:
         """All that one action leads to; an env at fault keeps its state and ends.
@@ -70,13 +87,26 @@ class Transition:
         # an action that is not finite is a fault, found below; the physics gets zeros
         given = torch.where(action.isfinite().all(-1, keepdim=True), action, 0.0)
         terrain = state.get(TERRAIN)
-        moved, drive = self._control_step(state, given, terrain)
-        trust = moved.get(TRUST)
-        for _ in range(self.task.frame_skip - 1):
-            if not self.is_whole:
-                graph_break()  # two in one piece take minutes to compile
-            moved, drive = self._control_step(moved, given, terrain)
-            trust = None if trust is None else torch.minimum(trust, moved[TRUST])
+        moved, drive, trusts = state, {}, []
+        for _ in range(self.task.frame_skip):
+            moving = {key: moved[key] for key in MOVING if key in moved}
+            moved, drive = self._advance(moving, given, terrain)
+            if TRUST in moved:
+                trusts.append(moved[TRUST])
+        trust = reduce(torch.minimum, trusts) if trusts else None
+        return self._judge(state, action, given, age, moved, drive, trust)
+
+    def _outcome(
+        self,
+        state: Tensors,
+        action: Tensor,
+        given: Tensor,
+        age: Tensor,
+        moved: Tensors,
+        drive: Tensors,
+        trust: Tensor | None,
+    ) -> Tensors:
+        """What `step` returns, from the state before and that after all control steps."""
         fault = find_faults(action, state, moved)  # (num_envs, 1)
         is_good = fault == 0
         kept = {k: torch.where(is_good, moved[k], state[k]) for k in (QPOS, QVEL)}
@@ -113,10 +143,9 @@ class Transition:
         return value[:, None]
 
     def _control_step(
-        self, moving: Tensors, action: Tensor, terrain: Tensor | None
+        self, state: Tensors, action: Tensor, terrain: Tensor | None
     ) -> tuple[Tensors, Tensors]:
         """The state one control step later, and what drove it: torque and ``ctrl``."""
-        state = {key: moving[key] for key in (QPOS, QVEL, PARAMETERS) if key in moving}
         torque, ctrl = actuate(self.task.controller, action, state[QPOS], state[QVEL])
         move = self._move_apart if self.is_round else self._move
         moved, drive = move(state, torque, terrain, ctrl), {"joint_torque": torque}

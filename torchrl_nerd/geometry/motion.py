@@ -31,6 +31,8 @@ def matmul(a: Tensor, b: Tensor) -> Tensor:
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """Cross products of vectors ``(3, n, N)``: twice as fast as torch's own here."""
+    if not (a.shape[-1] and b.shape[-1]):  # of no robots, as where only positions count
+        return a * b
     pairs = (1, 2), (2, 0), (0, 1)
     return torch.stack([a[i] * b[j] - a[j] * b[i] for i, j in pairs])
 
