@@ -2,12 +2,13 @@
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
 ``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
-``gpu_errors``, ``hidden_parameters``, ``robots_that_load`` or ``policies``.
+``gpu_errors``, ``hidden_parameters``, ``robots_that_load``, ``policies`` or ``open_loop``.
 """
 
 import json
 import re
 from collections.abc import Iterable
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -310,9 +311,8 @@ def robots_table(folder: Path = RESULTS) -> str:
 def policies_table(folder: Path = RESULTS) -> str:
     """Policies that learned in a model alone, and in MuJoCo: returns, frames, minutes."""
     head = ["task", "learned in", "robot's frames", "minutes", "return in MuJoCo"]
-    lines: dict[
-        tuple[str, str, int], list[str]
-    ] = {}  # rivals of several models are one
+    # rivals of several models are one
+    lines: dict[tuple[str, str, str], list[str]] = {}
     records = [record for _, record in sorted(read("policies", folder).items())]
     for record in records:
         found, how = record["results"], record["results"]["configuration"]
@@ -334,6 +334,47 @@ def policies_table(folder: Path = RESULTS) -> str:
     return "\n\n".join(filter(None, (table, *map(made_by, records))))
 
 
+def open_loop_table(folder: Path = RESULTS) -> str:
+    """Third-party robots: a network beside MuJoCo at few substeps, and their rates."""
+    head = ["robot", "actions", "network", "no motion", "MuJoCo, 1 substep"]
+    head += ["4 substeps", "network's rate", "1 substep", "its own", "front"]
+    lines, records = [], read("open_loop", folder)
+    for robot, record in records.items():
+        found = record["results"]
+        errors, rates, exact = (found[k] for k in ("errors", "rates", "ground_truth"))
+        coarse = [
+            [k for k in errors if k.startswith("MuJoCo") and f", {n} substep" in k]
+            for n in (1, 4)
+        ]
+        rivals = [[k for k in same if k != exact] for same in coarse]
+        fastest = max((rates[k] for k in rivals[0]), default=None)
+        speeds = rates["compiled"], fastest, rates[exact]
+        shown = [rate(x) for x in speeds]
+        for case in dict.fromkeys(k.split(", ")[0] for k in errors["learned"]):
+            columns = [["learned"], ["no motion"], *rivals]
+            cells = (short_and_long(errors, names, case) for names in columns)
+            front = [v for k, v in found["on_the_front"].items() if k.startswith(case)]
+            place = f"{sum(front)} of {len(front)}"
+            lines.append([robot, case, *cells, *shown, place])
+    table = rows([head, *lines]) if lines else ""
+    return "\n\n".join(filter(None, (table, *map(made_by, records.values()))))
+
+
+def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
+    """Mean errors of the joints (rad) over 20 and 100 steps, the least of some rows."""
+    places = [f"{case}, {steps} steps, rad" for steps in (20, 100)]
+    if not names:
+        return "-"
+    means = ([errors[name][where]["mean"] for name in names] for where in places)
+    best = (min((x for x in found if isfinite(x)), default=inf) for found in means)
+    return " / ".join(map(number, best))
+
+
+def rate(value: float | None) -> str:
+    """Thousands of control steps per second."""
+    return "-" if value is None else f"{value / 1000:,.0f}k"
+
+
 def spread(returns: dict[str, float]) -> str:
     """Mean return and half of its 95% interval."""
     return f"{returns['mean']:,.0f} ± {returns['interval']:,.0f}"
@@ -352,6 +393,7 @@ TABLES = {
     "hidden_parameters": hidden_parameters_tables,
     "robots_that_load": robots_table,
     "policies": policies_table,
+    "open_loop": open_loop_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -361,6 +403,7 @@ ROBOTS = "python experiments/robots_that_load.py --json results/robots_that_load
 COMMANDS |= {"robots_that_load": ROBOTS}
 POLICIES = "python experiments/policies_in_the_model.py TASK --json FILE"
 COMMANDS |= {"policies": POLICIES}
+COMMANDS |= {"open_loop": "python experiments/open_loop.py ROBOT --json FILE"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -1,0 +1,166 @@
+"""A network that learns a third-party robot, beside MuJoCo at few substeps: error and rate.
+
+    python experiments/open_loop.py gymnasium/Hopper-v5 --json FILE
+
+1. Random trajectories of the robot in MuJoCo, as `nerd data` makes them.
+2. A network that learns from them: updates on single steps, then on rollouts.
+3. Its error on test starts, passive and under random actions, against MuJoCo with the
+   robot's own integrator and substeps; MuJoCo with other ones is measured by the same.
+4. Control steps per second of all of them, in turns on one thread.
+
+A run that is stopped goes on where it was.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from tyro.conf import Positional
+
+from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.data.simulate import is_sound, simulate
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.evaluation.bench.candidates import Candidate, models, simulators
+from torchrl_nerd.evaluation.bench.errors import (
+    GROUND_TRUTH,
+    ErrorRow,
+    cases_of,
+    error_rows,
+    evaluation_set,
+    measure,
+)
+from torchrl_nerd.evaluation.bench.rates import rate_rows
+from torchrl_nerd.evaluation.bench.report import pareto_front
+from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.robots import load_scene, protocol_of
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.seeds import fold_in
+from torchrl_nerd.training.trainer import Trainer
+
+STEPS = 100  # control steps of a training trajectory
+HORIZONS = (20, 100)  # of the errors, control steps
+Errors = dict[str, dict[str, dict[str, float]]]
+"""Name -> case, horizon and unit -> mean, final and 95th percentile of the error."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to learn, and what to measure."""
+
+    robot: Positional[str]  # gymnasium/ID, dm_control/DOMAIN-TASK or an MJCF file
+    trajectories: int = 5000  # random ones of 100 control steps
+    network: str = "mlp-4x128"
+    updates: int = 5000  # on 1,024 single steps
+    rollout_updates: int = 500  # on 128 rollouts of 8 steps
+    seed: int = 0  # of data and weights
+    test_seed: int = 500  # of the starts and actions of the report
+    test_trajectories: int = 256  # of each case
+    batch: int = 512  # stepped together, for the rates
+    rounds: int = 5  # of the rates
+    out: Path = Path("runs/open_loop")
+    json: Path | None = None
+    """Write the results to this file."""
+
+    @property
+    def folder(self) -> Path:
+        """Of the model."""
+        return self.out / Path(self.robot).stem
+
+
+def train(scene: Scene, cfg: Config) -> Path:
+    """Where the model is that has learned from random trajectories."""
+    data = simulate(scene, cfg.trajectories, STEPS, fold_in(cfg.seed, 0))
+    how = TrainConfig(
+        network=cfg.network,
+        steps=cfg.updates,
+        rollout_steps=cfg.rollout_updates,
+        single_step_fraction=1.0,
+        loss_eps=0.02,
+        validate_every=cfg.updates + cfg.rollout_updates,  # at the end alone
+        save_every=500,
+        seed=cfg.seed,
+    )
+    about = scene, data[is_sound(data)], scene, how, cfg.folder
+    Trainer(*about, horizons=HORIZONS, logger="csv").run()
+    return cfg.folder / "last"
+
+
+def errors_of(
+    scene: Scene, candidates: Sequence[Candidate], cfg: Config
+) -> list[ErrorRow]:
+    """Of all candidates, in every case and over every horizon."""
+    rows, about = [], (cfg.test_trajectories, max(HORIZONS), cfg.test_seed)
+    for case, source, is_driven in cases_of(protocol_of(scene)):
+        chosen = evaluation_set(case, source, is_driven, MujocoDynamics, *about)
+        errors = measure([chosen], candidates)
+        for horizon in HORIZONS:
+            rows += error_rows(scene, case, horizon, errors, {})
+    return rows
+
+
+def by_unit(rows: Sequence[ErrorRow]) -> Errors:
+    """Means over the quantities of one unit, such as all joints."""
+    parts: dict[str, dict[str, list[ErrorRow]]] = {}
+    for row in rows:
+        where = f"{row.case}, {row.steps} steps, {row.unit}"
+        parts.setdefault(row.name, {}).setdefault(where, []).append(row)
+    numbers = "mean", "interval", "final", "p95"
+    return {
+        name: {
+            where: {n: sum(getattr(r, n) for r in same) / len(same) for n in numbers}
+            for where, same in found.items()
+        }
+        for name, found in parts.items()
+    }
+
+
+def compare(scene: Scene, model: Path, cfg: Config) -> dict[str, Any]:
+    """Errors, rates, and where nothing is both faster and more exact than the model."""
+    engines = simulators(scene, threads=1)
+    learned = models(scene, [str(model)], variants=("compiled",))
+    rows = errors_of(scene, [*engines, learned[0]], cfg)
+    moving = [c for c in (*engines, *learned) if c.kind != "baseline"]
+    about = scene, cfg.batch, cfg.rounds, cfg.test_seed
+    rates = {row.name: row.steps_per_s for row in rate_rows(moving, *about)}
+    name, compiled = (c.name for c in learned)
+    errors, own = by_unit(rows), rates.pop(compiled)
+    faster = rates | {name: max(own, rates[name])}
+    places = list(errors[name])
+    front = {
+        where: name
+        in pareto_front({k: (errors[k][where]["mean"], faster[k]) for k in faster})
+        for where in places
+    }
+    shown = {name: "learned"}
+    return {
+        "ground_truth": next(r.name for r in rows if r.kind == GROUND_TRUTH),
+        "errors": {shown.get(k, k): v for k, v in errors.items()},
+        "rates": {shown.get(k, k): v for k, v in rates.items()} | {"compiled": own},
+        "on_the_front": front,
+    }
+
+
+def main(cfg: Config) -> None:
+    """Data, training and the report of one robot."""
+    torch.set_num_threads(1)
+    os.environ["NERD_THREADS"] = "1"
+    scene = load_scene(cfg.robot)
+    model = train(scene, cfg)
+    with torch.no_grad():
+        results = compare(scene, model, cfg)
+    for name, found in results["errors"].items():
+        means = ", ".join(f"{x['mean']:.3g}" for x in found.values())
+        print(f"{name}: {means}; {results['rates'].get(name, 0.0):,.0f} steps/s")
+    print(results["on_the_front"], f"compiled {results['rates']['compiled']:,.0f}")
+    if cfg.json is not None:
+        how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
+        results = {"robot": cfg.robot, "configuration": how} | results
+        write_results(cfg.json, results, cfg.test_seed)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
