@@ -23,11 +23,11 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results model-cartpole-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results model-cartpole-adaptive model-double_pendulum-adaptive model-franka-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z_-]+:.*## / { printf "  %-26s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z_ -]+:.*## / { printf "  %-26s %s\n", $$1, $$2 }' Makefile
 
 setup: $(STAMP) ## make .venv, the only step before any `.venv/bin/nerd ...`
 
@@ -99,17 +99,17 @@ PRETRAINED := torchrl_nerd/pretrained
 ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rollout-restarts 1 \
 	--save-every 500 --threads 1
 
-ADAPTIVE := --vary preset --data datasets/cartpole_varied --network transformer-2x64@32 \
-	--single-step-fraction 0 --sequence-length 64 --batch-size 32 --rollout-history 20 --threads 1
+ADAPTIVE := --vary preset --network transformer-2x64@32 --single-step-fraction 0 \
+	--sequence-length 64 --batch-size 32 --rollout-history 20 --threads 1
 
-model-cartpole-adaptive: $(STAMP) ## a Cartpole that finds its masses, damping and motor strength
-	$(NERD) data cartpole --vary preset --trajectories 7000 --steps 200 --out datasets/cartpole_varied
-	$(NERD) train cartpole $(ADAPTIVE) --steps 6000 --rollout-steps 500 --rollout-length 10 \
-		--rollout-batch-size 64 --validate-every 7000 --out runs/cartpole_varied
-	$(NERD) train cartpole $(ADAPTIVE) --init-from runs/cartpole_varied/last --steps 3500 \
-		--lr 0.005 --adamw-lr 0.0015 --rollout-steps 700 --rollout-length 20 \
-		--rollout-batch-size 48 --validate-every 9000 --save-every 250 --out runs/cartpole_adaptive
-	cp runs/cartpole_adaptive/last/* $(PRETRAINED)/cartpole-adaptive/
+model-cartpole-adaptive model-double_pendulum-adaptive model-franka-adaptive: model-%-adaptive: $(STAMP) ## a robot that finds its hidden parameters
+	$(NERD) data $* --vary preset --trajectories 7000 --steps 200 --out datasets/$*_varied
+	$(NERD) train $* $(ADAPTIVE) --data datasets/$*_varied --steps 6000 --rollout-steps 500 \
+		--rollout-length 10 --rollout-batch-size 64 --validate-every 7000 --out runs/$*_varied
+	$(NERD) train $* $(ADAPTIVE) --data datasets/$*_varied --init-from runs/$*_varied/last \
+		--steps 3500 --lr 0.005 --adamw-lr 0.0015 --rollout-steps 700 --rollout-length 20 \
+		--rollout-batch-size 48 --validate-every 9000 --save-every 250 --out runs/$*_adaptive
+	cp runs/$*_adaptive/last/* $(PRETRAINED)/$*-adaptive/
 
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 30000 --out datasets/ant

@@ -143,9 +143,8 @@ def rates(scene: Scene) -> list[dict[str, Any]]:
     The bands take turns, so that a machine that others use slows all alike.
     """
     found: dict[int, list[float]] = {band: [] for band in BANDS}
-    state = TensorDict(
-        scene.sample_initial(ENVS, Generator().manual_seed(0))[0], [ENVS]
-    )
+    start = scene.sample_initial(ENVS, Generator().manual_seed(0))[0]
+    terrain, state = start.pop(TERRAIN, None), TensorDict(start, [ENVS])
     torque = torch.zeros(ENVS, len(scene.actuated), dtype=torch.float64)
     features = FeatureConfig()
     dynamics = {
@@ -158,7 +157,7 @@ def rates(scene: Scene) -> list[dict[str, Any]]:
         for band, each in dynamics.items():
             began = time.perf_counter()
             for _ in range(10):
-                each.step(state, torque)
+                each.step(state, torque, terrain)
             if turn:  # the first one warms up
                 found[band].append(10 * ENVS / (time.perf_counter() - began))
     rows = []

@@ -9,8 +9,12 @@ from hidden_parameters.__main__ import HISTORIES, Options, main
 from hidden_parameters.adaptation import one_step_errors
 from hidden_parameters.identify import identify
 from hidden_parameters.motions import draw_parameters, motions
+from hidden_parameters.policies import Options as PolicyOptions
+from hidden_parameters.policies import by_part
+from hidden_parameters.policies import main as learn_policies
 
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.robots import load_scene, preset_of
 
@@ -62,12 +66,38 @@ def test_errors_and_hidden_states_are_those_of_the_model(generator):
     assert hidden.shape == (ROWS, 9, 2 * 64)
 
 
+def test_returns_are_averaged_in_equal_parts_of_a_parameter(generator):
+    own = torch.rand(9, 2, generator=generator)
+    found = by_part(own[:, 0], own, ["own", "other"])
+    low, middle, high = found["own"]
+    assert (
+        low < middle < high and abs(low + middle + high - 3 * own[:, 0].mean()) < 1e-5
+    )
+    assert abs(sum(found["other"]) - sum(found["own"])) < 1e-5
+
+
 @pytest.mark.slow
-def test_all_of_it_at_a_tiny_budget(generator, tmp_path, capsys):
-    model = random_model(load_scene("cartpole"), generator)
+@pytest.mark.parametrize("name", ["cartpole", "double_pendulum"])
+def test_all_of_it_at_a_tiny_budget(name, generator, tmp_path, capsys):
+    model = random_model(load_scene(name), generator)
     save_checkpoint(model, tmp_path / "model", make_card(model))
     path = tmp_path / "found.json"
-    main(Options("cartpole", {"model": tmp_path / "model"}, 4, 0, fit=False, json=path))
+    main(Options(name, {"model": tmp_path / "model"}, 4, 0, fit=False, json=path))
     rows = json.loads(path.read_text())["results"]["errors"]
     assert len(rows) == 3 * 2 * len(HISTORIES)
     assert capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_policies_of_seconds(generator, tmp_path):
+    """Every way learns, and those in the varied model are measured there as well."""
+    features = FeatureConfig(parameters=True)
+    model = random_model(SCENE, generator, "mlp-2x32", features)
+    save_checkpoint(model, tmp_path / "told", make_card(model))
+    path = tmp_path / "found.json"
+    sizes = {"frames": 32768, "history": 2, "seeds": (0,), "episodes": 8}
+    how = PolicyOptions("cartpole/swingup", tmp_path / "told", json=path, **sizes)
+    learn_policies(how)
+    rows = json.loads(path.read_text())["results"]["policies"]
+    assert len(rows) == 6 and all(len(row["by_parameter"]) == 5 for row in rows)
+    assert ["promised" in row for row in rows] == [True, True] + 4 * [False]
