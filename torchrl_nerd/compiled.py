@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 Function = TypeVar("Function", bound=Callable[..., Any])
 PATIENCE = 5.0  # s of silence
 WAIT = (
-    "compiling a step: up to two minutes for a walking robot on two cores, seconds once "
+    "compiling a step: half a minute to a minute and a half on two cores, seconds once "
     "torch has it in its cache"
 )
 WARM = 2  # calls of one part after the other: an eager one, and one that compiles

@@ -1,4 +1,4 @@
-"""Policies that learn in one varied model, tried in MuJoCo on robots unlike any before.
+"""Policies that learn in one varied model, tried in MuJoCo on robots drawn anew.
 
     python -m experiments.hidden_parameters.policies cartpole/swingup \
         --told runs/varied_told/last --json results/varied_policies_cartpole.json
