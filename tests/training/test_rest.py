@@ -6,9 +6,9 @@ from dynamics_helpers import random_model, roll
 from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
-from torchrl_nerd.configs import NO_PREDICTIONS
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import SCENES
@@ -27,9 +27,9 @@ def states_at_rest(scene, generator, rows=32):
     return state
 
 
-def sluggish_model(scene, generator, size):
+def sluggish_model(scene, generator, size, features=NO_PREDICTIONS):
     """Keeps every velocity but for noise of a size, in m/s and rad/s."""
-    model = NeRD(scene, NO_PREDICTIONS, network_config("mlp-1x32")).eval()
+    model = NeRD(scene, features, network_config("mlp-1x32")).eval()
     with torch.no_grad():
         for weight in model.network.head.parameters():
             weight.copy_(size * torch.randn(weight.shape, generator=generator))
@@ -51,6 +51,15 @@ def test_noise_at_rest_no_longer_carries_a_robot_away(name, generator):
     assert (found > 0.0).all() and torch.equal(model.sleep.sleep_speed, found)
     end = after(model, states, 50)
     assert torch.equal(end[QPOS], states[QPOS]) and not end[QVEL].any()
+
+
+def test_a_model_that_is_told_the_parameters_finds_them_at_rest(generator):
+    scene = load_scene("double_pendulum").vary({"mass:link1": (0.5, 2.0)})
+    model = sluggish_model(scene, generator, 1e-5, FeatureConfig(parameters=True))
+    states = states_at_rest(scene, generator)
+    states[PARAMETERS] = scene.variation.draw(len(states), generator)
+    find_rest(model, states)
+    assert (model.sleep.sleep_speed > 0.0).all()
 
 
 @each_on_ground

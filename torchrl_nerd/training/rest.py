@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import states_of
-from torchrl_nerd.keys import NEXT_QVEL, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import NEXT_QVEL, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.training_range import magnitudes
 from torchrl_nerd.scenes.commands import command_of
@@ -50,7 +50,7 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
 
 def _speeds(model: NeRD, states: TensorDict, steps: int) -> Tensor:
     """What 99% of the states' speeds ``(nv,)`` in so many steps are below."""
-    start = states.select(QPOS, QVEL, TERRAIN, strict=False)
+    start = states.select(QPOS, QVEL, TERRAIN, PARAMETERS, strict=False)
     command = command_of(model.scene, states)[:, None]  # (rows, 1, m)
     path = states_of(NeRDDynamics(model), start, steps, command)
     speeds = [magnitudes(model.sleep.vectors, state[QVEL]) for state in path]
