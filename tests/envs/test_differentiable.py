@@ -1,5 +1,7 @@
 """Gradients through rollouts of an env, window after window."""
 
+import copy
+
 import pytest
 import torch
 from dynamics_helpers import random_model
@@ -8,6 +10,7 @@ from torchrl_nerd.envs import NeRDEnv, make_env
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.robots import make_task
 
+TASK = "cartpole/swingup"
 ROWS, STEPS = 3, 4
 
 
@@ -76,3 +79,14 @@ def test_a_compiled_env_steps_as_an_eager_one(seed):
             td = env.step(td.set("action", action))["next"]
         ends.append(td["qpos"])
     torch.testing.assert_close(ends[0], ends[1], atol=1e-5, rtol=1e-5)
+
+
+def test_a_loaded_state_has_no_past(env, generator):
+    """And the graph of the past stays whole."""
+    gain = torch.randn(4, 1, generator=generator).requires_grad_()
+    reward = window(env, gain, env.reset())
+    env.load_state_dict(copy.deepcopy(make_env(TASK, num_envs=ROWS).state_dict()))
+    after = env.step(env.rand_action())["next"]
+    assert not after["qpos"].requires_grad
+    (gradient,) = torch.autograd.grad(reward, gain)
+    assert gradient.any()

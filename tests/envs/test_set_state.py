@@ -24,6 +24,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 
+from torchrl_nerd.envs import StatelessEnv
 from torchrl_nerd.envs.frame_stack import stack_frames
 
 ROWS, STEPS = 4, 3
@@ -227,3 +228,38 @@ def test_a_collector_goes_on_from_its_state_dict(dynamics, generator):
     collector.load_state_dict(collector.state_dict())
     assert torch.equal(env.state["qpos"], before["next", "qpos"][:, -1])
     collector.shutdown()
+
+
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
+def test_one_state_that_is_loaded_changes_no_other(dynamics, generator):
+    """As where a planner goes back and forth between two."""
+    env = EnvMaker("cartpole/swingup", dynamics, generator)(ROWS)
+    actions, saved = random_actions(env, STEPS, generator), []
+    env.reset()
+    for action in actions:
+        act_all(env, action[None])
+        saved.append((env.state_dict(), env.state))
+    for kept, state in (*saved, *saved):
+        env.load_state_dict(kept)
+        assert not unequal_keys(env.state, state)
+
+
+def test_an_empty_state_leaves_the_history(generator):
+    make = EnvMaker("cartpole/swingup", "streaming", generator)
+    actions, ends = random_actions(make(ROWS), 2 * STEPS, generator), []
+    for is_loaded in (False, True):
+        env = make(ROWS)
+        env.reset()
+        act_all(env, actions[:STEPS])
+        if is_loaded:
+            env.load_state_dict({})
+        ends.append(act_all(env, actions[STEPS:]))
+    assert not unequal_keys(*ends)
+
+
+def test_an_env_inside_a_module_is_restored_too(generator):
+    make = EnvMaker("cartpole/swingup", "mujoco", generator)
+    one, other = (StatelessEnv(make(ROWS, seed=seed)) for seed in (5, 6))
+    one.reset()
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(one.reset()["qpos"], other.reset()["qpos"])

@@ -188,11 +188,21 @@ class SceneEnv(RenderedEnv):
         An empty one, which TorchRL's collectors keep of an env, changes nothing.
         """
         if not state_dict:
-            state_dict = self.state_dict()
-        result = super().load_state_dict(state_dict, *args, **kwargs)
-        self._keys = row_keys(self.seed, len(self._episode), self.device)
-        self.dynamics.reset(self.state)
-        return result
+            return super().load_state_dict({}, strict=False)
+        return super().load_state_dict(state_dict, *args, **kwargs)
+
+    @unaffected
+    def _load_from_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> None:
+        """What torch calls, of an env inside another module too."""
+        if state_dict:
+            # torch writes into these tensors, which an earlier `state_dict` or a graph of
+            # gradients may share
+            for name, value in self._buffers.items():
+                self._buffers[name] = cast(Tensor, value).detach().clone()
+        super()._load_from_state_dict(state_dict, *args, **kwargs)
+        if state_dict:
+            self._keys = row_keys(self.seed, len(self._episode), self.device)
+            self.dynamics.reset(self.state)
 
     @property
     def state(self) -> TensorDict:
