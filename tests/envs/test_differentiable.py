@@ -90,3 +90,30 @@ def test_a_loaded_state_has_no_past(env, generator):
     assert not after["qpos"].requires_grad
     (gradient,) = torch.autograd.grad(reward, gain)
     assert gradient.any()
+
+
+@pytest.mark.parametrize("network", ["transformer-2x64", "gru", "mlp-2x32"])
+@pytest.mark.parametrize("inference", ["streaming", "window"])
+def test_no_grad_records_nothing_and_breaks_nothing(network, inference, generator):
+    """Weights ask for gradients, and the history is part of an earlier graph."""
+    model = random_model(make_task(TASK).scene, generator, network)
+    env = NeRDEnv(TASK, model, ROWS, inference=inference, differentiable=True)
+    weights = [*model.network.parameters()]
+    slopes = []
+    for is_followed in (False, True):
+        env.set_seed(0)
+        now = env.reset()
+        for _ in range(2):
+            now = env.step(now.set("action", 0.1 * torch.ones(ROWS, 1)))["next"]
+            now = now.exclude("reward")
+        total = now["qpos"].sum()
+        if is_followed:
+            with torch.no_grad():
+                env.rollout(3, auto_reset=False, tensordict=now.detach())
+            for value in vars(env.dynamics._memory).values():
+                tensors = value if isinstance(value, list) else [value]
+                assert not any(x.requires_grad for x in tensors)
+        slopes.append(torch.autograd.grad(total, weights, allow_unused=True))
+    for slope, expected in zip(*slopes, strict=True):
+        assert (slope is None) == (expected is None)
+        assert slope is None or torch.equal(slope, expected)

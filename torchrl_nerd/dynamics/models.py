@@ -148,8 +148,11 @@ class TorchDynamics:
         self._prepare(len(qpos))
         told = None if self.scene.servos is None or ctrl is None else ctrl.to(qpos)
         drive = drive_of(joint_torque.to(qpos), told, self._told(state, qpos))
+        is_recorded = self.differentiable and torch.is_grad_enabled()
+        if self.differentiable and not is_recorded:  # it is part of an earlier graph
+            self._memory = self.history()
         given = qpos, qvel, drive, ground, self._memory, is_scored
-        with torch.set_grad_enabled(self.differentiable):
+        with torch.set_grad_enabled(is_recorded):
             next_qpos, next_qvel, score = self._run(given)
         moved = {QPOS: next_qpos.to(there), QVEL: next_qvel.to(there)}
         after = TensorDict(moved, state.batch_size, device=state.device)
