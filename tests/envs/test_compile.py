@@ -210,3 +210,14 @@ def test_without_a_compiler_it_says_so_once_and_goes_on(generator, monkeypatch):
     assert len(ours) == 2  # a step, a reset
     for one, other in zip(found, path(expected, actions), strict=True):
         assert all(torch.equal(one[key], other[key]) for key in one.keys())
+
+
+def test_eager_steps_come_first(generator):
+    """As many as asked, of a task whose actions are held too."""
+    env = make_env("franka/reach", num_envs=ROWS).compile(warmup=2, backend="eager")
+    now, pieces = env.reset(), (env._transition._advance, env._transition._judge)
+    for step in range(3):
+        assert all(piece._run is None for piece in pieces), step
+        now = env.step(now.set("action", torch.zeros(ROWS, 7)))["next"]
+        now = now.exclude("reward")
+    assert all(piece._run is not None for piece in pieces)

@@ -65,11 +65,13 @@ class Transition:
 
         It is one piece where it ``is_whole`` or one control step long. Else a control step
         is one and what follows the last is another: four in one piece take four minutes.
+        ``warmup`` counts actions.
         """
         self.eager()
         if is_whole or self.task.frame_skip == 1:
             return Compiled(self.step, **options)
-        self._advance = Compiled(self._control_step, **options)
+        warmup = self.task.frame_skip * options["warmup"]
+        self._advance = Compiled(self._control_step, **options | {"warmup": warmup})
         self._judge = Compiled(self._outcome, **options)
         return self.step
 
