@@ -20,6 +20,7 @@ from safetensors import safe_open
 from tensordict import TensorDict
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd.envs.faults import REASONS
 
 ROWS, STEPS = 4, 3
 each_junk = pytest.mark.parametrize("junk", [float("nan"), float("inf"), -float("inf")])
@@ -180,3 +181,17 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
     act(env, bad)
     assert path.stat().st_mtime_ns == stamp
     assert all(len(value) == 4 for value in dump.values())
+
+
+@pytest.mark.parametrize("task_id", ["franka/reach", "franka/reach_osc"])
+def test_a_row_that_fails_while_its_action_is_held_hands_out_numbers(
+    task_id, generator
+):
+    """The torque, too, that the next control step would have asked for."""
+    env = EnvMaker(task_id, "mujoco", generator)(ROWS)
+    start = env.reset().select(*env.state.keys())
+    start["qvel"][1] = 5e3
+    start_at(env, start)
+    after = act(env, random_actions(env, 1, generator)[0])
+    assert REASONS[int(after["fault"][1])] == "diverged"
+    assert all(value.isfinite().all() for value in after.values())

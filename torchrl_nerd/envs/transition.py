@@ -123,6 +123,8 @@ class Transition:
             after[TRUST] = trust
             if self.is_truncating:
                 truncated = truncated | (trust < 1.0)
+        # of a state that was not finite, neither is the torque that answers it
+        drive = {k: torch.where(x.isfinite(), x, 0.0) for k, x in drive.items()}
         earned = self.task.reward(state, given, shown)
         reward = self._per_env("reward", earned, action)
         return after | {
