@@ -125,3 +125,16 @@ def test_bad_arguments_are_named(scene, generator):
     ignorant = NeRDDynamics(NeRD(scene, NO_PREDICTIONS, NETWORKS["mlp-4x64"]))
     with pytest.raises(ValueError, match="knows what it was trained on"):
         GuardedDynamics(ignorant)
+
+
+def test_mujoco_steps_rows_of_float32(generator):
+    make = EnvMaker("cartpole/swingup", "streaming", generator)
+    how = {"guard": "fallback", "state_dtype": torch.float32}
+    env = NeRDEnv(make.task, make.model, 2, **how)
+    start = env.reset()
+    start["qvel"][0] = start["qvel"][0] + 200.0
+    env.reset(start, set_state=True)
+    action = random_actions(env, 1, generator)[0]
+    after = env.step(TensorDict({"action": action}, env.batch_size))["next"]
+    assert after["trust"][0] < 1.0 and not after["fault"].any()
+    assert after["qvel"].dtype == torch.float32

@@ -107,7 +107,7 @@ class GuardedDynamics:
             self.ground_truth.reset(some)  # no warm start of other envs
             exact = self.ground_truth.step(some, joint_torque[rows], ground, told)
             for key in (QPOS, QVEL):
-                after[key] = after[key].index_put((rows,), exact[key])
+                after[key] = after[key].index_put((rows,), exact[key].to(after[key]))
         return after.set(TRUST, trust[:, None].to(torch.float32))
 
     def _not_yet_calm(self, untrusted: Tensor) -> Tensor:
