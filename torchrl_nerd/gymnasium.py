@@ -21,6 +21,7 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_nerd.envs.actor import as_action
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
@@ -137,7 +138,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _begin(self, mask: np.ndarray) -> np.ndarray:
         """Begin episodes where the mask says; observations of all envs."""
-        rows = torch.from_numpy(mask)[:, None].to(self.env.device)
+        rows = torch.from_numpy(mask.copy())[:, None].to(self.env.device)
         fresh = self.env.reset(TensorDict({"_reset": rows}, self.env.batch_size))
         return _numpy(fresh[OBSERVATION])
 
@@ -146,7 +147,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Observations, rewards, terminated, truncated of all envs; an empty info."""
         env, begins = self.env, self._is_over  # (num_envs,): whose action is ignored
-        given = torch.as_tensor(np.asarray(actions), dtype=torch.float32).to(env.device)
+        given = as_action(actions).to(env.device)
         after = env.step(TensorDict({ACTION: given}, env.batch_size))["next"]
         observation, reward = _numpy(after[OBSERVATION]), after["reward"].double()
         columns = reward, after["terminated"], after["truncated"]  # (num_envs, 1) each

@@ -314,3 +314,22 @@ def test_bad_arguments_are_refused_in_one_sentence():
         env.step(np.zeros(2))
     with pytest.raises(TypeError, match="num_envs"):
         gymnasium.make(ID, num_envs=3)  # one env is not three
+
+
+def test_arrays_of_any_layout_are_taken():
+    """Read-only ones, as JAX's are, and reversed ones."""
+    envs = GymnasiumVectorEnv(TASK, "mujoco", num_envs=2, seed=0)
+    actions = np.array([[-0.5], [0.5]], np.float32)
+    fixed = actions[::-1].copy()
+    fixed.setflags(write=False)
+    found = []
+    for given in (fixed, actions[::-1], fixed.astype(np.float64), fixed.tolist()):
+        envs.reset(seed=0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found.append(envs.step(given)[0])
+    for observation in found[1:]:
+        np.testing.assert_array_equal(observation, found[0])
+    mask = np.array([True, False])[::-1]
+    fresh, _ = envs.reset(options={"reset_mask": mask})
+    assert (fresh[0] == found[0][0]).all() and (fresh[1] != found[0][1]).any()

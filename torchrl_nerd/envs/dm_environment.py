@@ -8,6 +8,7 @@ import torch
 from dm_env import specs
 from tensordict import TensorDict
 
+from torchrl_nerd.envs.actor import as_action
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
@@ -55,8 +56,7 @@ class DmEnvironment(dm_env.Environment):
         """Act, or begin an episode where none is; ValueError for another shape."""
         if self._is_over:
             return self.reset()
-        given = torch.as_tensor(np.asarray(action), dtype=torch.float32)
-        row = {ACTION: given.to(self.env.device)[None]}  # (1, A)
+        row = {ACTION: as_action(action).to(self.env.device)[None]}  # (1, A)
         after = self.env.step(TensorDict(row, self.env.batch_size))["next"]
         self._is_over = bool(after["done"])
         make = dm_env.transition
