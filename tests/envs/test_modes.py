@@ -148,3 +148,18 @@ def test_rotations_have_finite_slopes(dtype):
     none = torch.zeros(4, dtype=dtype, requires_grad=True)
     (slope,) = torch.autograd.grad(quat_normalize(none).sum(), none)
     assert slope.isfinite().all()
+
+
+def test_float32_too_is_made_for_gradients():
+    """An env made in inference mode, and a task that was asked there."""
+    task = make_task("franka/reach")
+    with torch.inference_mode():
+        qpos = torch.zeros(ROWS, 7)
+        task.observation({"qpos": qpos, "goal": torch.zeros(ROWS, 3)})
+        how = {"differentiable": True, "state_dtype": torch.float32}
+        env = make_env(task, "nerd", ROWS, **how)
+    action = torch.zeros(env.action_spec.shape, requires_grad=True)
+    after = env.step(env.reset().set("action", action))["next"]
+    slopes = after["observation"].sum() + after["reward"].sum()
+    (slope,) = torch.autograd.grad(slopes, action)
+    assert slope.isfinite().all() and slope.any()

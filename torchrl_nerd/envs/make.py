@@ -89,6 +89,7 @@ class NeRDEnv(SceneEnv):
         torch.Size([3, 5, 2])
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         task: str | Path | Task,

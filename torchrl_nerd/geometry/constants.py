@@ -47,7 +47,8 @@ def placed(module: Module, like: Tensor) -> Module:
         return module.to(like.device)
     copies = vars(module).setdefault("_coarse", {})
     if like.dtype not in copies:
-        copies[like.dtype] = cast_constants(copy.deepcopy(module), like.dtype)
+        with torch.inference_mode(False):  # kept, whoever asks first
+            copies[like.dtype] = cast_constants(copy.deepcopy(module), like.dtype)
     return copies[like.dtype].to(like.device)
 
 
