@@ -53,3 +53,16 @@ def test_no_memory_at_all_is_refused():
     task = make_task("cartpole/swingup")
     with pytest.raises(ValueError, match="frame_stack"):
         stack_frames(make_env(task, "mujoco"), 0)
+
+
+def test_held_envs_keep_their_frames(dynamics, seed):
+    env = stack_frames(make_env("franka/reach", dynamics, ROWS, seed), 3)
+    last = env.rollout(4, break_when_any_done=False)[:, -1]["next"].clone()
+    moves = torch.tensor([True, False, True, False])
+    given = {"action": env.rand_action()["action"], "_step": moves}
+    after = env.step(last.clone().update(given))["next"]
+    still = (after["observation"] == last["observation"]).all(-1)
+    assert torch.equal(still, ~moves)
+    action = env.rand_action()["action"]
+    later = env.step(after.exclude("reward").set("action", action))["next"]
+    assert torch.equal(later["observation"][:, :26], after["observation"][:, 13:])

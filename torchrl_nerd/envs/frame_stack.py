@@ -3,6 +3,7 @@
 from typing import cast
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import CatFrames, TransformedEnv
 
@@ -34,8 +35,25 @@ def stack_frames(env: SceneEnv, frame_stack: int) -> SceneEnv:
     expect_at_least(1, frame_stack=frame_stack)
     if frame_stack == 1:
         return env
-    stacked = TransformedEnv(env, CatFrames(frame_stack, -1, [OBSERVATION]))
+    stacked = TransformedEnv(env, _Frames(frame_stack, -1, [OBSERVATION]))
     return cast(SceneEnv, stacked)  # which hands every other attribute on
+
+
+class _Frames(CatFrames):
+    """`CatFrames` that leave an env alone whose ``_step`` is False."""
+
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
+        moves, name = tensordict.get("_step", None), f"_cat_buffers_{OBSERVATION}"
+        if moves is None:
+            return super()._step(tensordict, next_tensordict)
+        before = self.get_buffer(name).clone()
+        after = super()._step(tensordict, next_tensordict)
+        rows = moves.reshape(len(before), 1)
+        kept = torch.where(rows, self.get_buffer(name), before)
+        self.get_buffer(name).copy_(kept)
+        return after.set(OBSERVATION, kept)
 
 
 def append_frame(
