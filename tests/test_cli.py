@@ -22,7 +22,7 @@ from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.files import folder_name
-from torchrl_nerd.robots import PRESETS, SCENES, load_scene, protocol_of
+from torchrl_nerd.robots import PRESETS, SCENES, load_scene, preset_of, protocol_of
 
 NOTHING_RANDOM = ("doctor", "explain")
 SOON_DONE = ("explain",)
@@ -473,3 +473,14 @@ def test_where_results_cannot_go_is_said_before_any_work(
 def test_results_do_not_replace_a_folder(tmp_path, capsys):
     said = refusal(capsys, "explain", "cartpole", "--json", str(tmp_path))
     assert f"{tmp_path} cannot be written: Is a directory" in said
+
+
+@pytest.mark.parametrize("scene", ["cartpole", "gymnasium/Reacher-v5"])
+@pytest.mark.parametrize("order", ["{0} {1}", "{1} {0}", "--quiet {0} {1}"])
+def test_the_preset_is_that_of_the_scene_and_not_of_a_folder(scene, order, capsys):
+    """``ant`` is a scene with a preset of its own, and the name of a folder here."""
+    argv = order.format(scene, "--out ant").split()
+    assert main(["data", *argv, "--dry-run"]) == 0
+    count = preset_of(scene).data.trajectories
+    assert count != PRESETS["ant"].data.trajectories
+    assert f"draw {count} trajectories" in capsys.readouterr().out

@@ -4,6 +4,7 @@ import io
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import fields
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +23,7 @@ from torchrl_nerd.cli.play import Play
 from torchrl_nerd.cli.stability import Stability
 from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.files import check_writable
 from torchrl_nerd.robots import PRESETS, preset_of
 from torchrl_nerd.scenes import is_import
@@ -100,11 +102,7 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
 
 def _default(kind: type[Command], args: list[str]) -> Any:
     """Defaults of ``data`` and ``train``: the preset of the scene that is named."""
-    known = [arg for arg in args if arg in PRESETS]
-    scene = next(
-        (arg for arg in (*known, *args) if arg in known or is_import(arg)), None
-    )
-    if scene is None or kind not in (Data, Train):
+    if kind not in (Data, Train) or (scene := _scene_in(kind, args)) is None:
         return tyro.MISSING_NONPROP
     preset = preset_of(scene)
     if kind is Data:
@@ -113,6 +111,18 @@ def _default(kind: type[Command], args: list[str]) -> Any:
     if is_hybrid and preset.hybrid is not None:
         return Train(scene=scene, kind="hybrid", config=preset.hybrid)
     return Train(scene=scene, config=preset.train)
+
+
+def _scene_in(kind: type[Data | Train], args: list[str]) -> str | None:
+    """The first word that names a robot and is no option's value."""
+    options = *fields(kind), *fields(DataConfig if kind is Data else TrainConfig)
+    flags = [x.name for x in options if isinstance(x.default, bool)]
+    for before, word in pairwise(["", *args]):
+        name = before.removeprefix("--").replace("-", "_").removeprefix("no_")
+        is_value = before.startswith("--") and "=" not in before and name not in flags
+        if not is_value and (word in PRESETS or is_import(word)):
+            return word
+    return None
 
 
 def _fail(sentence: str, status: int = 2) -> int:
