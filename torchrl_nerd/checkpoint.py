@@ -22,7 +22,7 @@ from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.robots.registry import MODELS
+from torchrl_nerd.robots.registry import MODELS, RESERVED
 from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.selfcheck import PREFIX as CHECK
 from torchrl_nerd.selfcheck import (
@@ -31,6 +31,7 @@ from torchrl_nerd.selfcheck import (
     stored_steps,
     warn_of_differences,
 )
+from torchrl_nerd.settings import did_you_mean
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
@@ -120,7 +121,8 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     asked = scene.name if scene is not None and found in KINDS else found
     if asked != found or is_import(found):
         raise ValueError(_not_shipped(asked, scene if found == "hybrid" else None))
-    raise ValueError(f"unknown dynamics {str(found)!r}, expected {_known()}")
+    meant = did_you_mean(str(found), (*RESERVED, *STEPS, *shipped_models()))
+    raise ValueError(f"unknown dynamics {str(found)!r}{meant}, expected {_known()}")
 
 
 def _not_shipped(name: str, hybrid_of: Scene | None) -> str:

@@ -20,8 +20,8 @@ Result = TypeVar("Result")
 Function = TypeVar("Function", bound=Callable[..., Any])
 PATIENCE = 5.0  # s of silence
 WAIT = (
-    "compiling a step: half a minute to a minute and a half on two cores, seconds once "
-    "torch has it in its cache"
+    "compiling {}: up to a minute and a half on two cores, seconds once torch has it in "
+    "its cache"
 )
 WARM = 2  # calls of one part after the other: an eager one, and one that compiles
 
@@ -53,9 +53,10 @@ def unaffected(method: Function) -> Function:
 
 
 @contextmanager
-def announced() -> Iterator[None]:
-    """Say on the terminal's error stream that it compiles, where that takes a while."""
-    timer = Timer(PATIENCE, print, [WAIT], {"file": sys.stderr, "flush": True})
+def announced(what: str) -> Iterator[None]:
+    """Say on the terminal's error stream what it compiles, where that takes a while."""
+    said = [WAIT.format(what)]
+    timer = Timer(PATIENCE, print, said, {"file": sys.stderr, "flush": True})
     timer.daemon = True
     timer.start()
     try:
@@ -69,13 +70,18 @@ class Compiled(Generic[Given, Result]):
 
     Code does not travel: a copy, or one in another process, compiles its own. Inside what
     is being compiled it is a part of that. In the first ``warmup`` calls, which are eager,
-    the function works out what it keeps. ``options`` are those of `torch.compile`.
+    the function works out what it keeps. ``what`` is its name for people. ``options`` are
+    those of `torch.compile`.
     """
 
     def __init__(
-        self, function: Callable[Given, Result], warmup: int = 1, **options: Any
+        self,
+        function: Callable[Given, Result],
+        warmup: int = 1,
+        what: str = "a step",
+        **options: Any,
     ) -> None:
-        self.function, self.options = function, options
+        self.function, self.what, self.options = function, what, options
         self.is_eager = False  # True: the compiler failed, ``function`` runs as it is
         self._calls_to_go = warmup
         self._run: Callable[Given, Result] | None = None
@@ -90,7 +96,7 @@ class Compiled(Generic[Given, Result]):
         run, waiting = self._run, nullcontext()
         if run is None:
             run = torch.compile(self.function, **compile_options(self.options))
-            self._run, waiting = run, announced()
+            self._run, waiting = run, announced(self.what)
         try:
             with waiting:
                 return run(*args, **kwargs)

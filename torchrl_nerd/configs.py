@@ -67,7 +67,11 @@ StepConfig = UnconstrainedConfig | PenaltyContactConfig | FreeBodyConfig
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Size and seed of a data set; a SettingError for sizes below one."""
+    """Size and seed of a data set.
+
+    Raises:
+        SettingError: a size below one.
+    """
 
     trajectories: int = 10_000  # to draw; those that diverge are dropped and counted
     steps: int = 100  # control steps of each trajectory
@@ -151,7 +155,11 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """Settings of fine-tuning on recordings; a SettingError for a value that cannot be."""
+    """Settings of fine-tuning on recordings.
+
+    Raises:
+        SettingError: a value that cannot be.
+    """
 
     # what changes: physical parameters (physics), all weights, or the last layer (head);
     # default: physics for an analytic step, all for a network

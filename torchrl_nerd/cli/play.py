@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
@@ -35,8 +37,9 @@ class Play(DeviceCommand):
     task: Positional[str]
     """Id of the task, such as cartpole/swingup, dm_control/DOMAIN-TASK or gymnasium/ID; or
     an MJCF file, which has no reward and acts at random."""
-    dynamics: str = "nerd"
-    """Of the left robot: nerd, hybrid, analytic, a shipped model or a checkpoint folder."""
+    dynamics: Annotated[str, tyro.conf.arg(aliases=("--model",))] = "nerd"
+    """What steps the robot on the left: nerd, hybrid, analytic, a shipped model or a
+    checkpoint folder."""
     policy: Path | None = None
     """Folder of a policy, as examples/ppo.py writes it; the shipped one by default."""
     actions: FixedActions | None = None
@@ -47,7 +50,7 @@ class Play(DeviceCommand):
     seed: int = 0
     """Of the start and of random actions."""
     steps: int | None = None
-    """Of the env; 5 s or the task's horizon by default."""
+    """How many actions the video shows; by default 5 s of them, or an episode."""
     out: Path | None = None
     """Video, .gif or .mp4; runs/TASK.gif by default."""
     width: int = 720

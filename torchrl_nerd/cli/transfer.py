@@ -2,7 +2,9 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
@@ -24,7 +26,10 @@ class Transfer(MeasuringCommand):
     """Id of the task, such as cartpole/swingup, dm_control/DOMAIN-TASK or gymnasium/ID."""
     policy: Path | None = None
     """Folder of a policy, as examples/ppo.py writes it; by default the shipped one."""
-    dynamics: tuple[str, ...] = ("nerd", "mujoco")
+    dynamics: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--model",))] = (
+        "nerd",
+        "mujoco",
+    )
     """Any of nerd, hybrid, analytic, mujoco, dm_control, mujoco_warp, names of shipped
     models, checkpoint folders."""
     episodes: int = 2048

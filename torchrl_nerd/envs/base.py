@@ -140,7 +140,7 @@ class SceneEnv(RenderedEnv):
         options = {"warmup": 1 if warmup is None else warmup, **suits, **kwargs}
         is_whole = self.device.type != "cpu"  # as a graph of an accelerator has to be
         self._transit = self._transition.compile(is_whole, **options)
-        self._restart = Compiled(self._transition.restart, **options)
+        self._restart = Compiled(self._transition.restart, what="a reset", **options)
         return self
 
     def eager(self) -> "SceneEnv":
@@ -195,8 +195,7 @@ class SceneEnv(RenderedEnv):
     def _load_from_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> None:
         """What torch calls, of an env inside another module too."""
         if state_dict:
-            # torch writes into these tensors, which an earlier `state_dict` or a graph of
-            # gradients may share
+            # torch writes into these, which a state or a graph of gradients may share
             for name, value in self._buffers.items():
                 self._buffers[name] = cast(Tensor, value).detach().clone()
         super()._load_from_state_dict(state_dict, *args, **kwargs)

@@ -72,7 +72,7 @@ class Transition:
             return Compiled(self.step, **options)
         warmup = self.task.frame_skip * options["warmup"]
         self._advance = Compiled(self._control_step, **options | {"warmup": warmup})
-        self._judge = Compiled(self._outcome, **options)
+        self._judge = Compiled(self._outcome, what="what follows a step", **options)
         return self.step
 
     def step(self, state: Tensors, action: Tensor, age: Tensor) -> Tensors:

@@ -32,7 +32,8 @@ class BenchConfig:
     """What `bench` measures, and how finely."""
 
     models: tuple[str, ...] = ()
-    """As --model of other commands, several of them; all that are shipped by default."""
+    """Names of models or checkpoint folders; by default all that are shipped for the
+    robot."""
     variants: tuple[str, ...] = ("compiled",)
     """Other ways to run each model, see nerd eval: compiled, window, bf16."""
     batches: tuple[int, ...] = (1, 64, 512, 4096)
