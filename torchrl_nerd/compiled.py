@@ -174,3 +174,15 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
         each.result()
     torch.set_num_threads(number)
     return pool
+
+
+def _use_one_thread() -> None:
+    """GNU's OpenMP waits in a forked process for threads that only its parent has.
+
+    What torch's own loaders do in their workers; whoever wants more sets it afterwards.
+    """
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_use_one_thread)

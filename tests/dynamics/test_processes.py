@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -73,6 +74,26 @@ def test_a_child_that_never_steps_ends_by_itself():
     )
     done = subprocess.run([sys.executable, "-c", script], timeout=PATIENCE)
     assert done.returncode == 0
+
+
+@needs_fork
+def test_a_forked_child_steps_a_model_of_many_threads():
+    """Which torch has by default; the tests' own process may have one."""
+    script = (
+        "import os, sys, torch; from torchrl_nerd import make_env; "
+        "env = make_env('cartpole/swingup', 'nerd', 4, seed=0); env.rollout(2); "
+        "child = os.fork(); child or (env.rollout(2), os._exit(0)); "
+        "sys.exit(os.waitpid(child, 0)[1])"
+    )
+    command, threads = [sys.executable, "-c", script], {"OMP_NUM_THREADS": "2"}
+    with subprocess.Popen(
+        command, env={**os.environ, **threads}, start_new_session=True
+    ) as parent:
+        try:
+            assert parent.wait(PATIENCE) == 0
+        finally:
+            if parent.poll() is None:
+                os.killpg(parent.pid, signal.SIGKILL)
 
 
 class Steps(Dataset):
