@@ -165,6 +165,16 @@ def test_torques_stay_within_the_limits(rng):
     assert (got.abs() == limit).any() and (got.abs() < limit).any()
 
 
+def test_numbers_may_come_as_arrays(rng):
+    qpos, qvel = random_state(rng)
+    names = {"kp": (50.0,) * 3, "kd": (9.0,) * 3, "home": HOME, "limit": GAIN}
+    names |= {"scale": (0.1,) * 3, "center": (0.4, 0.0, 0.4)}
+    arrays = {name: np.array(value) for name, value in names.items()}
+    one, other = (controller(relative_to="absolute", **x) for x in (names, arrays))
+    action = torch.from_numpy(rng.normal(size=(ROWS, 3)))
+    assert torch.equal(one(action, qpos, qvel), other(action, qpos, qvel))
+
+
 def test_leading_dimensions_and_the_dtype_are_kept(rng):
     qpos, qvel = random_state(rng)
     action, law = torch.from_numpy(rng.normal(size=(ROWS, 3))), controller(limit=GAIN)
@@ -214,8 +224,9 @@ BAD = {
     "limit of at least 0.0, got -2": {"limit": (-2.0,) * 7},
     "home_kp of at least 0.0, got -1": {"home_kp": -1.0},
     "home_kd of at least 0.0, got nan": {"home_kd": nan},
-    "finite numbers as scale, home and center": {"scale": (nan,) * 3},
-    "finite numbers as scale, home and center, ": {"home": (inf,) * 7},
+    "finite numbers as kp, kd, home_kp, home_kd, scale": {"scale": (nan,) * 3},
+    "finite numbers as kp, kd, home_kp, home_kd, scale, home": {"home": (inf,) * 7},
+    "finite numbers as kp, kd": {"kp": (1.0, inf, 1.0)},
 }
 
 

@@ -75,8 +75,10 @@ class OperationalSpaceController:
         home_kd: float = 6.0,
         max_mass: float = 200.0,
     ) -> None:
-        self.kp, self.kd, self.scale, self.home = kp, kd, scale, home
-        self.limit, self.center, self.relative_to = limit, center, relative_to
+        self.kp, self.kd, self.scale, self.home = map(_row, (kp, kd, scale, home))
+        self.limit = None if limit is None else _row(limit)
+        self.center = None if center is None else _row(center)
+        self.relative_to = relative_to
         self.home_kp, self.home_kd, self.max_mass = home_kp, home_kd, max_mass
         self.actuated, base = driven_dofs(model), Base.from_model(model)
         self._check(model)
@@ -122,10 +124,12 @@ class OperationalSpaceController:
             value = getattr(self, name)
             if value is not None:
                 expect_at_least(0.0, **{name: float(np.min(value))})  # NaN is not
-        if not np.isfinite((*self.scale, *self.home, *(self.center or ()))).all():
+        gains = (*self.kp, *self.kd, self.home_kp, self.home_kd)
+        places = (*self.scale, *self.home, *(self.center or ()))
+        if not np.isfinite((*gains, *places)).all():
             raise ValueError(
-                "expected finite numbers as scale, home and center, got "
-                f"{self.scale}, {self.home}, {self.center}"
+                "expected finite numbers as kp, kd, home_kp, home_kd, scale, home and "
+                f"center, got {gains} and {places}"
             )
         if not self.max_mass > 0.0:
             raise ValueError(f"expected max_mass above 0, got {self.max_mass}")
@@ -183,6 +187,11 @@ class OperationalSpaceController:
         shape = *qpos.shape[:-1], *force.shape[:1]
         matrix = matrix.movedim(-1, 0).reshape(*shape, len(force))
         return matrix, -force.movedim(-1, 0).reshape(shape)
+
+
+def _row(numbers: Row) -> Row:
+    """Numbers as a tuple of floats; they may come as an array."""
+    return tuple(float(x) for x in numbers)
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
