@@ -1,6 +1,7 @@
 """Robots that a user registers: found by name everywhere, and refused in a sentence."""
 
 import copy
+import importlib
 import os
 import sys
 from collections.abc import Iterator
@@ -85,6 +86,35 @@ def test_a_name_is_given_once_and_a_refused_robot_leaves_nothing():
         register(Robot(**other))
     with pytest.raises(ValueError, match="unknown scene 'one'"):
         load_scene("one")
+
+
+SOURCE = """from dataclasses import replace
+from torchrl_nerd import load_scene
+from torchrl_nerd.robots import make_task, register
+from torchrl_nerd.robots.robot import Robot
+
+def cart():
+    return replace(load_scene("cartpole"), name="cart")
+
+class Stay(type(make_task("cartpole/swingup"))):
+    horizon = {horizon}
+    def build_scene(self):
+        return cart()
+
+register(Robot(scenes={{"cart": cart}}, tasks={{"cart/stay": Stay}}))
+"""
+
+
+def test_a_module_that_is_loaded_again_replaces_its_robot(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "my_cart_again.py"
+    path.write_text(SOURCE.format(horizon=100))
+    module = importlib.import_module(path.stem)
+    path.write_text(SOURCE.format(horizon=1000))
+    importlib.reload(module)
+    assert make_task("cart/stay").horizon == 1000
+    with pytest.raises(ValueError, match="'cart' is among the scenes of another robot"):
+        register(ROBOT)
 
 
 BAD = [

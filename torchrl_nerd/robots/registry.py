@@ -43,7 +43,8 @@ def register(robot: Robot) -> None:
     """Make a robot known by its names: to `make_env`, Gymnasium and every command.
 
     Nothing is built yet: a scene or task is, when its name is first asked for. Commands
-    and worker processes find a robot whose module ``NERD_ROBOTS`` names.
+    and worker processes find a robot whose module ``NERD_ROBOTS`` names. A module that is
+    loaded again replaces its robot, as a cell of a notebook does that runs again.
 
     Raises:
         TypeError: no robot, or a field that holds something else than it should.
@@ -53,15 +54,18 @@ def register(robot: Robot) -> None:
         raise TypeError(f"expected a Robot to register, got {type(robot).__name__}")
     _check_types(robot)
     _check_names(robot)
+    is_again = all(_is_again(scene, SCENES.get(s)) for s, scene in robot.scenes.items())
     for field, table in TABLES.items():
-        if taken := [name for name in getattr(robot, field) if name in table]:
+        taken = [name for name in getattr(robot, field) if name in table]
+        if taken and not is_again:
             raise ValueError(
                 f"'{taken[0]}' is among the {field} of another robot: expected a new name"
             )
+    new = [task for task in robot.tasks if task not in TASKS]
     for field, table in TABLES.items():
         table.update(getattr(robot, field))
     for listener in _LISTENERS:
-        for task in robot.tasks:
+        for task in new:
             listener(task)
 
 
@@ -88,6 +92,15 @@ def load_named_robots() -> None:
         except Exception as error:  # whatever a user's file may raise
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             NOT_LOADED.append(f"{VARIABLE} names '{entry}', which fails with {reason}")
+
+
+def _is_again(scene: Callable, known: Callable | None) -> bool:
+    """Whether a function is the known one of the same module and name, loaded again."""
+    one, other = (
+        (getattr(x, "__module__", None), getattr(x, "__qualname__", "<"))
+        for x in (scene, known)
+    )
+    return one == other and "<" not in one[1]  # neither local nor a lambda
 
 
 def _check_types(robot: Robot) -> None:
