@@ -8,7 +8,7 @@ A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stabili
 import json
 import re
 from collections.abc import Iterable
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -365,8 +365,9 @@ def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
     places = [f"{case}, {steps} steps, rad" for steps in (20, 100)]
     if not names:
         return "-"
+    # None: the rollout diverges
     means = ([errors[name][where]["mean"] for name in names] for where in places)
-    best = (min((x for x in found if isfinite(x)), default=inf) for found in means)
+    best = (min((x for x in found if x is not None), default=inf) for found in means)
     return " / ".join(map(number, best))
 
 
