@@ -109,7 +109,7 @@ model-cartpole-adaptive model-double_pendulum-adaptive model-franka-adaptive: mo
 	$(NERD) train $* $(ADAPTIVE) --data datasets/$*_varied --init-from runs/$*_varied/last \
 		--steps 3500 --lr 0.005 --adamw-lr 0.0015 --rollout-steps 700 --rollout-length 20 \
 		--rollout-batch-size 48 --validate-every 9000 --save-every 250 --out runs/$*_adaptive
-	cp runs/$*_adaptive/last/* $(PRETRAINED)/$*-adaptive/
+	mkdir -p $(PRETRAINED)/$*-adaptive && cp runs/$*_adaptive/last/* $(PRETRAINED)/$*-adaptive/
 
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 30000 --out datasets/ant
