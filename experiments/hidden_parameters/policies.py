@@ -8,6 +8,7 @@ policy is not. Its rivals learn in the nominal model, and in varied MuJoCo. All 
 same PPO, the same frames and the same test episodes, in MuJoCo, of robots drawn anew.
 """
 
+import shlex
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -112,8 +113,9 @@ def main(options: Options) -> None:
     if options.json is not None:
         how = asdict(replace(options, json=None)) | {"told": told}
         found = {"configuration": how, "ranges": variation.ranges, "policies": rows}
-        words = ["python -m experiments.hidden_parameters.policies", options.task]
-        write_results(options.json, found, options.test_seed, command=" ".join(words))
+        words = shlex.join(sys.argv[1:]).partition(" --json")[0]
+        about = {"command": f"python -m experiments.hidden_parameters.policies {words}"}
+        write_results(options.json, found, options.test_seed, **about)
 
 
 if __name__ == "__main__":
