@@ -55,6 +55,11 @@ def made_by(record: dict[str, Any]) -> str:
     )
 
 
+def with_sources(cells: list[list[str]], records: Iterable[dict[str, Any]]) -> str:
+    """A table, and how each of its records was made; nothing without a line."""
+    return "\n\n".join((rows(cells), *map(made_by, records))) if cells[1:] else ""
+
+
 def error_table(entries: list[dict[str, Any]], rates: dict[str, float]) -> str:
     """Rows of one case and horizon: mean of up to three quantities, and the rate."""
     names = dict.fromkeys((entry["name"], entry["kind"]) for entry in entries)
@@ -330,8 +335,7 @@ def policies_table(folder: Path = RESULTS) -> str:
                 about = how["name"], way, f"{frames:,}"
                 line = [*about, minutes, spread(returns), in_model]
                 lines.setdefault(about, line)
-    table = rows([[*head, "in the model"], *lines.values()]) if lines else ""
-    return "\n\n".join(filter(None, (table, *map(made_by, records))))
+    return with_sources([[*head, "in the model"], *lines.values()], records)
 
 
 def open_loop_table(folder: Path = RESULTS) -> str:
@@ -356,8 +360,7 @@ def open_loop_table(folder: Path = RESULTS) -> str:
             front = [v for k, v in found["on_the_front"].items() if k.startswith(case)]
             place = f"{sum(front)} of {len(front)}"
             lines.append([robot, case, *cells, *shown, place])
-    table = rows([head, *lines]) if lines else ""
-    return "\n\n".join(filter(None, (table, *map(made_by, records.values()))))
+    return with_sources([head, *lines], records.values())
 
 
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:

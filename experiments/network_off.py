@@ -20,7 +20,7 @@ from torchrl_nerd import from_pretrained
 from torchrl_nerd.checkpoint import shipped_card, shipped_models
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import passive_errors, scene_of
-from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import protocol_of
 
 
@@ -36,8 +36,8 @@ class Options:
     """Write the results to this file."""
 
 
-def without_network(model: HybridNeRD) -> HybridNeRD:
-    """A copy whose network's last layer is zero: its analytic step alone."""
+def without_network(model: NeRD) -> NeRD:
+    """A copy whose network's last layer is zero: of a hybrid its analytic step alone."""
     copied = copy.deepcopy(model)
     last = [m for m in copied.network.head.modules() if isinstance(m, nn.Linear)][-1]
     for weight in last.parameters():
@@ -47,7 +47,7 @@ def without_network(model: HybridNeRD) -> HybridNeRD:
 
 def measure(name: str, num_trajectories: int, seed: int) -> list[dict[str, Any]]:
     """Error with and without the network, a row per case, drive and quantity."""
-    model = cast(HybridNeRD, from_pretrained(name))
+    model = cast(NeRD, from_pretrained(name))
     protocol, rows = protocol_of(model.scene), []
     steps = max(protocol.horizons)
     for case, source in protocol.cases.items():

@@ -15,15 +15,17 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import tyro
+from network_off import without_network
 from tyro.conf import Positional
 
+from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
-from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import Candidate, models, simulators
 from torchrl_nerd.evaluation.bench.errors import (
     GROUND_TRUTH,
@@ -36,6 +38,7 @@ from torchrl_nerd.evaluation.bench.errors import (
 from torchrl_nerd.evaluation.bench.rates import rate_rows
 from torchrl_nerd.evaluation.bench.report import pareto_front
 from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
@@ -43,6 +46,7 @@ from torchrl_nerd.training.trainer import Trainer
 
 STEPS = 100  # control steps of a training trajectory
 HORIZONS = (20, 100)  # of the errors, control steps
+ZEROED = "learned, its last layer zero"
 Errors = dict[str, dict[str, dict[str, float]]]
 """Name -> case, horizon and unit -> mean, final and 95th percentile of the error."""
 
@@ -122,7 +126,9 @@ def compare(scene: Scene, model: Path, cfg: Config) -> dict[str, Any]:
     """Errors, rates, and where nothing is both faster and more exact than the model."""
     engines = simulators(scene, threads=1)
     learned = models(scene, [str(model)], variants=("compiled",))
-    rows = errors_of(scene, [*engines, learned[0]], cfg)
+    zeroed = without_network(cast(NeRD, load_checkpoint(model, scene)))
+    off = Candidate(ZEROED, "learned", lambda _: NeRDDynamics(zeroed))
+    rows = errors_of(scene, [*engines, learned[0], off], cfg)
     moving = [c for c in (*engines, *learned) if c.kind != "baseline"]
     about = scene, cfg.batch, cfg.rounds, cfg.test_seed
     rates = {row.name: row.steps_per_s for row in rate_rows(moving, *about)}

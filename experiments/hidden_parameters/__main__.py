@@ -9,8 +9,6 @@ they have seen its last steps, none to a hundred. Beside the models: MuJoCo with
 parameters (the middle of each range), and with parameters fitted to the same history.
 """
 
-import shlex
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -178,10 +176,7 @@ def main(options: Options) -> None:
         "rates": rates(load_scene(options.scene)),
     }
     if options.json is not None:
-        words = ["python -m experiments.hidden_parameters", *sys.argv[1:]]
-        command = shlex.join(words[1:]).partition(" --json")[0]
-        about = {"command": f"{words[0]} {command}"}
-        write_results(options.json, results, options.seed, **about)
+        write_results(options.json, results, options.seed)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ policy is not. Its rivals learn in the nominal model, and in varied MuJoCo. All 
 same PPO, the same frames and the same test episodes, in MuJoCo, of robots drawn anew.
 """
 
-import shlex
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -113,9 +112,7 @@ def main(options: Options) -> None:
     if options.json is not None:
         how = asdict(replace(options, json=None)) | {"told": told}
         found = {"configuration": how, "ranges": variation.ranges, "policies": rows}
-        words = shlex.join(sys.argv[1:]).partition(" --json")[0]
-        about = {"command": f"python -m experiments.hidden_parameters.policies {words}"}
-        write_results(options.json, found, options.test_seed, **about)
+        write_results(options.json, found, options.test_seed)
 
 
 if __name__ == "__main__":

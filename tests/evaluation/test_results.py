@@ -1,6 +1,9 @@
 """Files of results: one schema, kept by every file that is committed."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,6 +54,18 @@ def test_a_script_names_its_own_command(monkeypatch):
     ]
     monkeypatch.setattr("sys.argv", words)
     assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
+
+
+@pytest.mark.parametrize("name", ["study", "study.part"])
+def test_a_module_names_its_own_command(name, tmp_path):
+    (tmp_path / "study").mkdir()
+    code = "from torchrl_nerd.evaluation.results import script_command as x; print(x())"
+    for file in ("__main__", "part"):
+        (tmp_path / "study" / f"{file}.py").write_text(code)
+    words = [sys.executable, "-m", name, "ant", "--json", "x.json", "--rows", "3"]
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.stdout == f"python -m {name} ant --rows 3\n", done.stderr
 
 
 @pytest.mark.parametrize("key", KEYS)

@@ -63,12 +63,17 @@ def write_results(
 
 
 def script_command() -> str:
-    """The command line of the running script, from the repository's root."""
+    """The command line of the running script or module, from the repository's root."""
     script, words = Path(sys.argv[0]), sys.argv[1:]
     if "--json" in words:
         at = words.index("--json")
         del words[at : at + 2]
-    return shlex.join(["python", f"{script.parent.name}/{script.name}", *words])
+    module = getattr(sys.modules["__main__"], "__spec__", None)  # of python -m
+    if module is not None and module.origin == sys.argv[0]:
+        what = ["-m", module.name.removesuffix(".__main__")]
+    else:
+        what = [f"{script.parent.name}/{script.name}"]
+    return shlex.join(["python", *what, *words])
 
 
 def read_results(path: Path) -> dict[str, Any]:
