@@ -250,6 +250,7 @@ def gymnasium_id(task: str) -> str:
 
 
 def _register(env_id: str, horizon: int | None = None, **kwargs: str) -> None:
+    gymnasium.registry.pop(env_id, None)  # of a robot whose module was loaded before
     gymnasium.register(
         env_id,
         max_episode_steps=horizon,

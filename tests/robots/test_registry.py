@@ -113,6 +113,7 @@ def test_a_module_that_is_loaded_again_replaces_its_robot(tmp_path, monkeypatch)
     path.write_text(SOURCE.format(horizon=1000))
     importlib.reload(module)
     assert make_task("cart/stay").horizon == 1000
+    assert gymnasium.registry[gymnasium_id("cart/stay")].max_episode_steps == 1000
     with pytest.raises(ValueError, match="'cart' is among the scenes of another robot"):
         register(ROBOT)
 

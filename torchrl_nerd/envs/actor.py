@@ -14,4 +14,4 @@ Actor = Callable[[TensorDictBase], TensorDictBase]
 
 def as_action(array: ArrayLike) -> Tensor:
     """An action as float32, a copy: arrays may be read-only, as JAX's are, or reversed."""
-    return torch.as_tensor(np.array(np.asarray(array), order="C"), dtype=torch.float32)
+    return torch.as_tensor(np.array(array, order="C"), dtype=torch.float32)

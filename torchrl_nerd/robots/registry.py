@@ -61,11 +61,10 @@ def register(robot: Robot) -> None:
             raise ValueError(
                 f"'{taken[0]}' is among the {field} of another robot: expected a new name"
             )
-    new = [task for task in robot.tasks if task not in TASKS]
     for field, table in TABLES.items():
         table.update(getattr(robot, field))
     for listener in _LISTENERS:
-        for task in new:
+        for task in robot.tasks:
             listener(task)
 
 
