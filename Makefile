@@ -99,7 +99,7 @@ PRETRAINED := torchrl_nerd/pretrained
 ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rollout-restarts 1 \
 	--save-every 500 --threads 1
 
-ADAPTIVE := --vary preset --network transformer-2x64@32 --single-step-fraction 0 \
+ADAPTIVE := --vary preset --network adaptive-4x64 --single-step-fraction 0 \
 	--sequence-length 64 --batch-size 32 --rollout-history 20 --threads 1
 
 model-cartpole-adaptive model-double_pendulum-adaptive model-franka-adaptive: model-%-adaptive: $(STAMP) ## a robot that finds its hidden parameters

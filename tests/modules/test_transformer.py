@@ -17,6 +17,7 @@ CONFIGS = {
     "transformer-2x64": TRANSFORMERS["transformer-2x64"],
     "long band": network_config("transformer-2x64@64"),
     "narrow band": TransformerConfig(layers=1, width=8, heads=1, band=2),
+    "pairs": TransformerConfig(layers=2, width=16, heads=2, band=4, pairs=True),
     "deep": TransformerConfig(layers=3, width=24, heads=3, band=4),
 }
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
@@ -34,7 +35,7 @@ def randn(generator: Generator, *shape: int, dtype=torch.float64) -> Tensor:
 
 
 def view(config: TransformerConfig) -> int:
-    return config.layers * (config.band - 1) + 1
+    return config.layers * (config.band - 1) + 1 + config.pairs
 
 
 def stream(network: nn.Module, tokens: Tensor, resets: Tensor | None = None) -> Tensor:

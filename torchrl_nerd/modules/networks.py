@@ -137,6 +137,7 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 TRANSFORMERS = {
     "transformer-2x64": TransformerConfig(2, 64, 4),
     "transformer-2x96": TransformerConfig(2, 96, 4),
+    "adaptive-4x64": TransformerConfig(4, 64, 4, band=64, pairs=True),
     "transformer-4x128": TransformerConfig(4, 128, 4),
     "paper": TransformerConfig(6, 192, 12),
     "paper-large": TransformerConfig(6, 384, 12),
@@ -153,7 +154,7 @@ NETWORKS: dict[str, NetworkConfig] = {
     "mlp-4x160": MLPConfig(depth=4, width=160),
     "gru": GRUConfig(),
 }
-"""Kind, then depth x width."""
+"""Kind, then depth x width; ``adaptive``: a transformer for hidden parameters."""
 
 
 def network_config(name: str) -> NetworkConfig:

@@ -5,6 +5,10 @@ Here each layer sees a token and the ``band - 1`` before it, and positions are r
 learned bias per head and offset). A token is written in its own base frame and never
 changes as time moves on, so its keys and values are kept in a ring. The output depends on
 ``layers * (band - 1) + 1`` tokens. `modules.window` is the paper's way.
+
+With ``pairs`` a token is embedded together with the one before it, which adds one token to
+those. What a torque did shows in the next token alone, so a pair is the least that tells
+something of hidden parameters; without it a layer is spent on finding neighbours.
 """
 
 from dataclasses import asdict, dataclass
@@ -26,6 +30,7 @@ class TransformerConfig:
     width: int = 64
     heads: int = 4  # divides width
     band: int = 10  # tokens each layer sees, the current one included (paper: h = 10)
+    pairs: bool = False  # embed a token together with the one before it
 
     def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
         """A freshly initialised network."""
@@ -42,7 +47,11 @@ def stored(old: Tensor, new: Tensor) -> Tensor:
 
 @dataclass
 class KeyValueCache:
-    """Keys and values of the last ``band - 1`` tokens of every layer."""
+    """Keys and values of the last ``band - 1`` tokens of every layer.
+
+    ``last`` is what the last token adds to the embedding of the next one, of width zero
+    without ``pairs``.
+    """
 
     keys: list[Tensor]  # per layer (rows, heads, band - 1, head width)
     values: list[Tensor]  # the same
@@ -50,11 +59,13 @@ class KeyValueCache:
     # (1,): where the oldest token lies, which the next one overwrites; a tensor, so that
     # compiled code is the same for all of them
     slot: Tensor
+    last: Tensor  # (rows, width)
 
     def clear(self, rows: Tensor) -> None:
         """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
         self.age.masked_fill_(rows, 0)
         self.slot.masked_fill_(rows.all(), 0)  # as in a new one
+        self.last = stored(self.last, self.last.masked_fill(rows[:, None], 0.0))
         mask = rows[:, None, None, None]
         # whatever stood there, a masked NaN would still spread
         for ring in (self.keys, self.values):
@@ -64,7 +75,8 @@ class KeyValueCache:
     def __copy__(self) -> "KeyValueCache":
         """Apart from the original, which is written to in place."""
         keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
-        return KeyValueCache(keys, values, self.age.clone(), self.slot.clone())
+        rest = (x.clone() for x in (self.age, self.slot, self.last))
+        return KeyValueCache(keys, values, *rest)
 
     def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
         """See `History.restore`: its rings turned to where the oldest token lies now."""
@@ -76,6 +88,8 @@ class KeyValueCache:
                 ring = ring.index_select(2, turned)
                 now[layer] = stored(now[layer], torch.where(mask, ring, now[layer]))
         self.age.copy_(torch.where(rows, past.age, self.age))
+        last = torch.where(rows[:, None], past.last, self.last)
+        self.last = stored(self.last, last)
 
     def write(self, layer: int, key: Tensor, value: Tensor) -> None:
         """Store one token ``(rows, heads, head width)``; with gradients, out of place."""
@@ -220,7 +234,8 @@ class CausalTransformer(nn.Module):
         self, config: TransformerConfig, num_inputs: int, num_outputs: int
     ) -> None:
         super().__init__()
-        for name, size in asdict(config).items():
+        sizes = {k: x for k, x in asdict(config).items() if k != "pairs"}
+        for name, size in sizes.items():
             if size < (2 if name == "band" else 1):
                 raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
@@ -229,6 +244,9 @@ class CausalTransformer(nn.Module):
             )
         self.config = config
         self.embed = FullLinear(num_inputs, config.width)
+        self.embed_last = None
+        if config.pairs:
+            self.embed_last = FullLinear(num_inputs, config.width, bias=False)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.head = make_head(config.width, num_outputs)
         initialize(self.blocks)
@@ -236,6 +254,8 @@ class CausalTransformer(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
         x = self.embed(tokens)
+        if self.embed_last is not None:
+            x = x + F.pad(self.embed_last(tokens[:, :-1]), (0, 0, 1, 0))
         for block in self.blocks:
             x = block(x)
         return self.head(x)
@@ -247,11 +267,15 @@ class CausalTransformer(nn.Module):
         keys = [weight.new_zeros(shape) for _ in range(c.layers)]
         values = [torch.zeros_like(key) for key in keys]
         age = torch.zeros(rows, dtype=torch.long, device=weight.device)
-        return KeyValueCache(keys, values, age, slot=age.new_zeros(1))
+        last = weight.new_zeros(rows, c.width if c.pairs else 0)
+        return KeyValueCache(keys, values, age, age.new_zeros(1), last)
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
         """The next token of every row, ``(rows, F) -> (rows, D)``; advances ``memory``."""
         x = self.embed(token)
+        if self.embed_last is not None:
+            x = x + memory.last
+            memory.last = stored(memory.last, self.embed_last(token))
         for layer, block in enumerate(self.blocks):
             x = cast(Block, block).step(x, memory, layer)
         memory.advance()
