@@ -65,6 +65,7 @@ def test_a_forked_child_goes_on_as_its_parent(task, dynamics, how):
 
 
 @needs_fork
+@pytest.mark.slow
 def test_a_child_that_never_steps_ends_by_itself():
     script = (
         "import os, sys; from torchrl_nerd import make_env; "

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import slow_but
 
 from torchrl_nerd.evaluation.results import (
     KEYS,
@@ -56,7 +57,7 @@ def test_a_script_names_its_own_command(monkeypatch):
     assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
 
 
-@pytest.mark.parametrize("name", ["study", "study.part"])
+@pytest.mark.parametrize("name", slow_but(["study.part"], ["study", "study.part"]))
 def test_a_module_names_its_own_command(name, tmp_path):
     (tmp_path / "study").mkdir()
     code = "from torchrl_nerd.evaluation.results import script_command as x; print(x())"

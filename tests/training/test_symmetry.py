@@ -148,6 +148,7 @@ def test_what_is_no_symmetry_is_refused():
     assert images.signs.tolist() == [[1, 1, 1], [1, -1, 1]]
 
 
+@pytest.mark.slow
 def test_training_with_symmetry_resumes_to_the_same_bits(tmp_path):
     scene = load_scene("ant")
     data = simulate(scene, 60, 12, Generator().manual_seed(1))

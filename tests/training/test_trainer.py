@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import slow_but
 from tensordict import TensorDict
 from torch import Generator, nn
 
@@ -92,7 +93,10 @@ def test_the_loss_falls_and_checkpoints_load(name, network, tmp_path, seed):
 
 @pytest.mark.parametrize(
     ("name", "step"),
-    [("cartpole", "unconstrained"), ("double_pendulum", "penalty-contact-1-stage")],
+    slow_but(
+        [("cartpole", "unconstrained")],
+        [("cartpole", "unconstrained"), ("double_pendulum", "penalty-contact-1-stage")],
+    ),
 )
 def test_a_hybrid_learns_too(name, step, tmp_path, seed):
     scene = load_scene(name)
