@@ -6,7 +6,8 @@
 
 All predict the same motion from the same state, under the recorded commands. Before it
 they have seen its last steps, none to a hundred. Beside the models: MuJoCo with nominal
-parameters (the middle of each range), and with parameters fitted to the same history.
+parameters (the middle of each range), and with parameters fitted to the same history, by
+the package and, with `--sysid`, by `mujoco.sysid`, which is slow: after 20 steps alone.
 """
 
 import time
@@ -33,16 +34,19 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import command_of, drive
 
 from .adaptation import changes, probe, rates
-from .identify import identify
+from .identify import identify, identify_by_mujoco
 from .motions import Region, draw_parameters, motions
 
 HISTORIES = (0, 1, 2, 5, 10, 20, 50, 100)  # steps
 HORIZONS = (1, 20, 100)  # steps
 REGIONS: tuple[Region, ...] = ("inside", "corners", "outside")
 PAST = max(HISTORIES)
+SYSID, SEEN_BY_SYSID = "mujoco.sysid", (20,)  # steps
 
 Candidate = Callable[[TensorDict, TensorDict], Tensor]
 """``(history [rows, T], future [rows, K]) -> qpos (rows, K, nq)`` in open loop."""
+Fit = Callable[[Scene, TensorDict], Tensor]
+"""``(scene, history [rows, T]) -> parameters (rows, size)``."""
 
 
 @dataclass
@@ -57,6 +61,7 @@ class Options:
     seed: int = 900
     """Of motions and parameters; no training uses it."""
     fit: Annotated[bool, tyro.conf.arg(help="also fit MuJoCo to each history")] = True
+    sysid: Annotated[bool, tyro.conf.arg(help="and by mujoco.sysid")] = False
     json: Path | None = None
     """Write the results to this file."""
 
@@ -103,11 +108,11 @@ def nominal(scene: Scene, history: TensorDict, future: TensorDict) -> Tensor:
     return scene.variation.values(u)
 
 
-def fitted(scene: Scene, history: TensorDict, future: TensorDict) -> Tensor:
+def fitted(scene: Scene, fit: Fit, history: TensorDict, future: TensorDict) -> Tensor:
     """Least squares; without a history nominal."""
     if not history.batch_size[1]:
         return nominal(scene, history, future)
-    return identify(scene, history)
+    return fit(scene, history)
 
 
 def errors_of(scene: Scene, path: Tensor, future: TensorDict) -> dict[str, Any]:
@@ -136,7 +141,8 @@ def measure(
         data = motions(scene, [own], [PAST + max(HORIZONS)], generator)
         future = cast(TensorDict, data[:, PAST:])
         for name, candidate in candidates.items():
-            for length in HISTORIES:
+            lengths = SEEN_BY_SYSID if name == SYSID else HISTORIES
+            for length in lengths:
                 history = cast(TensorDict, data[:, PAST - length : PAST])
                 began = time.perf_counter()
                 path = candidate(history, future)
@@ -144,8 +150,9 @@ def measure(
                 row = {"region": region, "name": name, "history": length}
                 row |= {"seconds": seconds, "errors": errors_of(scene, path, future)}
                 rows.append(row)
-            shown = {r["history"]: r["errors"]["100"] for r in rows[-len(HISTORIES) :]}
-            print(region, name, *(_brief(shown[n]) for n in (0, 20, 100)), flush=True)
+            shown = {r["history"]: r["errors"]["100"] for r in rows[-len(lengths) :]}
+            brief = (_brief(shown[n]) for n in (0, 20, 100) if n in shown)
+            print(region, name, *brief, flush=True)
     return rows
 
 
@@ -165,7 +172,11 @@ def main(options: Options) -> None:
         **{name: partial(of_model, model, scene) for name, model in models.items()},
     }
     if options.fit:
-        candidates["MuJoCo, fitted"] = partial(of_mujoco, scene, partial(fitted, scene))
+        fit = partial(fitted, scene, identify)
+        candidates["MuJoCo, fitted"] = partial(of_mujoco, scene, fit)
+    if options.sysid:
+        fit = partial(fitted, scene, identify_by_mujoco)
+        candidates[SYSID] = partial(of_mujoco, scene, fit)
     results: dict[str, Any] = {
         "scene": scene.name,
         "variation": preset.variation,

@@ -7,7 +7,7 @@ import torch
 from dynamics_helpers import random_model
 from hidden_parameters.__main__ import HISTORIES, Options, main
 from hidden_parameters.adaptation import one_step_errors
-from hidden_parameters.identify import identify
+from hidden_parameters.identify import identify, identify_by_mujoco
 from hidden_parameters.motions import draw_parameters, motions
 from hidden_parameters.policies import Options as PolicyOptions
 from hidden_parameters.policies import by_part
@@ -35,6 +35,16 @@ def test_a_fit_finds_the_parameters_of_a_motion_without_noise(generator):
     error = (state["qpos"] - data[:, -1]["next", "qpos"]).abs().amax(1)
     assert error.median() < 1e-3
     assert ((found - own).abs() <= (middle - own).abs() + 1e-6).double().mean() > 0.7
+
+
+@pytest.mark.slow
+def test_mujocos_own_fit_finds_them_too(generator):
+    """As exactly as ours, one row after the other."""
+    pytest.importorskip("plotly", reason="mujoco.sysid has packages of its own")
+    own = draw_parameters(SCENE, "inside", ROWS, generator)
+    data = motions(SCENE, [own], [30], generator)
+    found = SCENE.variation.shares(identify_by_mujoco(SCENE, data))
+    assert (found - SCENE.variation.shares(own)).abs().median() < 1e-3
 
 
 def test_a_parameter_changes_where_it_should(generator):
