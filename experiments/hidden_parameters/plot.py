@@ -22,7 +22,8 @@ def curves(axes: Any, found: dict[str, Any], steps: str) -> None:
     for name in dict.fromkeys(row["name"] for row in rows):
         own = [row for row in rows if row["name"] == name]
         errors = [row["errors"][steps][quantity]["mean"] for row in own]
-        axes.plot(lengths, errors, marker="o", markersize=3, label=name)
+        seen = [row["history"] for row in own]
+        axes.plot(seen, errors, marker="o", markersize=3, label=name)
     axes.set_xscale("symlog", linthresh=1)
     axes.set_xticks(lengths, lengths)
     axes.set_yscale("log")
