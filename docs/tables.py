@@ -230,6 +230,9 @@ def state_dtype_table(folder: Path = RESULTS) -> str:
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
+UNTRUSTED = "untrusted_before", "untrusted_after"
+
+
 def hidden_parameters_tables(folder: Path = RESULTS) -> str:
     """Error of every robot against the length of the history, and by region."""
     parts = []
@@ -267,12 +270,14 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
         )
         parts += [about, rows(table)]
         head = ["what changes", "model", "before", "after", "steps until it is back"]
+        head += ["untrusted before", "after"]
         table = [["times", *head]]
         for row in record["results"]["changes"]:
             errors = number(row["before"]), number(row["first"])
             back = row["steps_until_back"]
             times = f"{row['factor']:.2f}", row["parameter"], row["name"]
-            table.append([*times, *errors, "-" if back is None else str(back)])
+            lost = (f"{row[key]:.1%}" for key in UNTRUSTED if key in row)
+            table.append([*times, *errors, "-" if back is None else str(back), *lost])
         parts += ["Median error of one step when a parameter changes:", rows(table)]
         table = [["band", "control steps per second", "ring (KiB per env)"]]
         for row in record["results"]["rates"]:

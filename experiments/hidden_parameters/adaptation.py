@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict
@@ -39,14 +39,22 @@ CHANGES = {  # kind of parameter -> what it is multiplied by
 }
 
 
-def one_step_errors(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
-    """Errors ``(rows, T)`` of the next velocity, and hidden states ``(rows, T, w)``.
+class Watched(NamedTuple):
+    """A model that sees recorded motions ``[rows, T]`` step by step."""
+
+    errors: Tensor  # (rows, T): of the next velocity
+    hidden: Tensor  # (rows, T, w): hidden states
+    unlike: Tensor  # (rows, T): out-of-distribution score, see `OODScore`
+
+
+def watch(model: NeRD, data: TensorDict) -> Watched:
+    """Errors, hidden states and scores along recorded motions.
 
     Errors are root mean squares over dofs, in standard deviations of one step's change, of
     a model that sees the recorded motion step by step. Hidden is what each layer's
     attention brings from the past; of a network without attention, what its head gets.
     """
-    dynamics, errors, hidden = NeRDDynamics(model), [], []
+    dynamics, errors, hidden, unlike = NeRDDynamics(model), [], [], []
     scale = model.normalize.std(TARGET)[: model.scene.layout.nv]
     layers = [m.output for m in model.network.modules() if isinstance(m, Attention)]
     watched, seen = layers or [model.network.head], []
@@ -58,20 +66,22 @@ def one_step_errors(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
     for now in data.unbind(1):
         state = now.select(QPOS, QVEL, PARAMETERS)
         given = (now.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
-        after = dynamics.step(state, *given)
+        after, distance = dynamics.scored_step(state, *given)
+        unlike.append(distance)
         miss = (after[QVEL] - now[NEXT_QVEL]) / scale
         errors.append(miss.square().mean(-1).sqrt())
         hidden.append(torch.cat(seen, -1))
         seen.clear()
     for handle in handles:
         handle.remove()
-    return torch.stack(errors, 1), torch.stack(hidden, 1)
+    return Watched(*(torch.stack(x, 1) for x in (errors, hidden, unlike)))
 
 
 def changes(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, Any]]:
     """Median one-step error before and after a parameter changes, a row per change.
 
     ``steps_until_back``: steps until the median stays below `BACK` times its level before.
+    ``untrusted``: share of motions that the trust gate does not trust, 20 steps each.
     """
     variation, rows = scene.variation, []
     assert variation is not None
@@ -86,7 +96,9 @@ def changes(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, 
         after[:, column] *= factor
         data = motions(scene, [before, after], [CHANGE, AFTER], generator)
         for name, model in models.items():
-            median = one_step_errors(model, data)[0].median(0).values
+            seen = watch(model, data)
+            median = seen.errors.median(0).values
+            lost = (seen.unlike > 1.0).double().mean(0)  # whose trust is below 1
             level = float(median[CHANGE - 20 : CHANGE].mean())
             late = (median[CHANGE:] > BACK * level).nonzero()
             back = int(late.max()) + 1 if len(late) else 0
@@ -98,10 +110,12 @@ def changes(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, 
                     "before": level,
                     "first": float(median[CHANGE : CHANGE + 3].max()),
                     "steps_until_back": back if back < AFTER else None,
+                    "untrusted_before": float(lost[CHANGE - 20 : CHANGE].mean()),
+                    "untrusted_after": float(lost[CHANGE : CHANGE + 20].mean()),
                     "median": median[CHANGE - 20 :].tolist(),
                 }
             )
-            print("change", kind, name, *list(rows[-1].values())[3:6], flush=True)
+            print("change", kind, name, *list(rows[-1].values())[3:8], flush=True)
     return rows
 
 
@@ -123,7 +137,7 @@ def probe(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, An
         actual = torch.cat((actual, (ratio / ratio.abs().max())[:, None]), 1)
         told.append(f"motor / {told[0]}")
     for name, model in models.items():
-        state = one_step_errors(model, data)[1][:, -LAST:].mean(1).double()
+        state = watch(model, data).hidden[:, -LAST:].mean(1).double()
         state = (state - state[:half].mean(0)) / state[:half].std(0).clamp_min(1e-9)
         state = torch.cat((state, torch.ones(len(state), 1)), 1)
         a, b = state[:half], actual[:half]

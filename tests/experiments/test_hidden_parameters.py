@@ -6,7 +6,7 @@ import pytest
 import torch
 from dynamics_helpers import random_model
 from hidden_parameters.__main__ import HISTORIES, Options, main
-from hidden_parameters.adaptation import one_step_errors
+from hidden_parameters.adaptation import watch
 from hidden_parameters.identify import identify, identify_by_mujoco
 from hidden_parameters.motions import draw_parameters, motions
 from hidden_parameters.policies import Options as PolicyOptions
@@ -71,9 +71,9 @@ def test_errors_and_hidden_states_are_those_of_the_model(generator):
     model = random_model(load_scene("cartpole"), generator)
     own = draw_parameters(SCENE, "inside", ROWS, generator)
     data = motions(SCENE, [own], [9], generator)
-    errors, hidden = one_step_errors(model, data)
+    errors, hidden, unlike = watch(model, data)
     assert errors.shape == (ROWS, 9) and (errors > 0).all()
-    assert hidden.shape == (ROWS, 9, 2 * 64)
+    assert hidden.shape == (ROWS, 9, 2 * 64) and unlike.shape == errors.shape
 
 
 def test_returns_are_averaged_in_equal_parts_of_a_parameter(generator):
