@@ -44,7 +44,7 @@ class Cost:
     | field | meaning |
     |---|---|
     | ``flop`` | of its matrix products: two for a multiplication and its addition; not of
-      a transformer's attention to its past, 4 (band - 1) width in each layer |
+      a transformer's attention to its past, 4 band width in each layer |
     | ``state_bytes`` | of ``qpos`` and ``qvel`` |
     | ``memory_bytes`` | of the history: keys and values, tokens or a hidden state |
     """

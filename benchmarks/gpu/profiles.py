@@ -73,7 +73,7 @@ def needs(model: NeRD, config: TransformerConfig, size: int) -> dict[str, float]
     read once, and one token of it is written.
     """
     weights = sum(x.numel() for x in model.network.parameters())
-    past = 2 * config.layers * config.width * (config.band - 1)  # numbers of one env
+    past = 2 * config.layers * config.width * config.band  # numbers of one env
     token = 2 * config.layers * config.width
     return {
         "flop": float(size * (2 * weights + 2 * past)),

@@ -176,7 +176,7 @@ def rates(scene: Scene) -> list[dict[str, Any]]:
                 found[band].append(10 * ENVS / (time.perf_counter() - began))
     rows = []
     for band, values in found.items():
-        kilobytes = 2 * 2 * (band - 1) * 64 * 4 / 1024
+        kilobytes = 2 * 2 * band * 64 * 4 / 1024
         rate = statistics.median(values)
         rows.append({"band": band, "steps_per_s": rate, "ring_kib_per_env": kilobytes})
     print("rates", {row["band"]: round(row["steps_per_s"]) for row in rows}, flush=True)

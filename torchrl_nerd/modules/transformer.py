@@ -47,13 +47,13 @@ def stored(old: Tensor, new: Tensor) -> Tensor:
 
 @dataclass
 class KeyValueCache:
-    """Keys and values of the last ``band - 1`` tokens of every layer.
+    """Keys and values of the last ``band`` tokens of every layer.
 
     ``last`` is what the last token adds to the embedding of the next one, of width zero
     without ``pairs``.
     """
 
-    keys: list[Tensor]  # per layer (rows, heads, band - 1, head width)
+    keys: list[Tensor]  # per layer (rows, heads, band, head width)
     values: list[Tensor]  # the same
     age: Tensor  # (rows,): tokens seen since the row's reset, at most band - 1
     # (1,): where the oldest token lies, which the next one overwrites; a tensor, so that
@@ -91,16 +91,22 @@ class KeyValueCache:
         last = torch.where(rows[:, None], past.last, self.last)
         self.last = stored(self.last, last)
 
-    def write(self, layer: int, key: Tensor, value: Tensor) -> None:
-        """Store one token ``(rows, heads, head width)``; with gradients, out of place."""
+    def write(self, layer: int, key: Tensor, value: Tensor) -> Tensor:
+        """Store one token ``(rows, heads, head width)``; with gradients, out of place.
+
+        Returns how long ago the token of every slot was, ``(band,)``.
+        """
+        size, device = self.keys[layer].shape[2], key.device
+        slots = torch.arange(size, device=device)
         for past, new in ((self.keys, key), (self.values, value)):
             if torch.is_grad_enabled():
-                size = past[layer].shape[2]
-                later = torch.arange(1, size, device=new.device) + self.slot
-                kept = past[layer].index_select(2, later % size)
+                later = (slots[1:] + self.slot) % size
+                kept = past[layer].index_select(2, later)
                 past[layer] = torch.cat((kept, new[:, :, None]), 2)
             else:
                 past[layer].index_copy_(2, self.slot, new[:, :, None])
+        newest = size - 1 if torch.is_grad_enabled() else self.slot
+        return (newest - slots) % size
 
     def advance(self) -> None:
         """Count one token."""
@@ -109,7 +115,7 @@ class KeyValueCache:
             self.slot.zero_()
         else:
             self.slot.add_(1).remainder_(size)
-        self.age.add_(1).clamp_(max=size)
+        self.age.add_(1).clamp_(max=size - 1)
 
 
 class Attention(nn.Module):
@@ -140,22 +146,17 @@ class Attention(nn.Module):
         return self.output((weights @ value).transpose(1, 2).flatten(2))
 
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
-        """One token per row, ``(rows, width)``, against the cached ones."""
+        """One token per row, ``(rows, width)``, against itself and the cached ones."""
         query, key, value = self._split(x)
-        past_keys, past_values = cache.keys[layer], cache.values[layer]
-        size = self.band - 1
-        slots = torch.arange(size, device=x.device)
-        offset = (cache.slot - 1 - slots) % size + 1  # (band - 1,): how long ago
-        is_seen = offset <= cache.age[:, None]  # (rows, band - 1)
+        offset = cache.write(
+            layer, key, value
+        )  # first: compiled code then copies nothing
+        is_seen = offset <= cache.age[:, None]  # (rows, band)
         # sums of products: a product of matrices of one row is slower, GPUs included
-        past = (query[:, :, None] * past_keys).sum(-1) * self.scale
-        past = past + self.offset_bias[:, offset]  # (rows, heads, band - 1)
-        past = past.masked_fill(~is_seen[:, None], MASKED)
-        own = (query * key).sum(-1, keepdim=True) * self.scale + self.offset_bias[:, :1]
-        weights = torch.cat((past, own), -1).softmax(-1)
-        mixed = (weights[..., :-1, None] * past_values).sum(-2)
-        mixed = mixed + weights[..., -1:] * value
-        cache.write(layer, key, value)
+        scores = (query[:, :, None] * cache.keys[layer]).sum(-1) * self.scale
+        scores = scores + self.offset_bias[:, offset]  # (rows, heads, band)
+        weights = scores.masked_fill(~is_seen[:, None], MASKED).softmax(-1)
+        mixed = (weights[..., None] * cache.values[layer]).sum(-2)
         return self.output(mixed.flatten(1))
 
 
@@ -263,7 +264,7 @@ class CausalTransformer(nn.Module):
     def empty_memory(self, rows: int) -> KeyValueCache:
         """A history of nothing for ``rows`` rows."""
         c, weight = self.config, self.embed.weight
-        shape = (rows, c.heads, c.band - 1, c.width // c.heads)
+        shape = (rows, c.heads, c.band, c.width // c.heads)
         keys = [weight.new_zeros(shape) for _ in range(c.layers)]
         values = [torch.zeros_like(key) for key in keys]
         age = torch.zeros(rows, dtype=torch.long, device=weight.device)
