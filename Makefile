@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results model-cartpole-adaptive model-double_pendulum-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -100,23 +100,35 @@ ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rol
 	--save-every 500 --threads 1
 
 ADAPTIVE := --vary preset --network adaptive-4x64 --single-step-fraction 0 \
-	--sequence-length 64 --batch-size 32 --rollout-history 20 --threads 1
+	--rollout-history 20 --threads 1
+SHORT = --data datasets/$*_varied --sequence-length 64 --batch-size 32
+
+SHIP_ADAPTIVE = mkdir -p $(PRETRAINED)/$(1)-adaptive && cp runs/$(1)_$(2)/last/* $(PRETRAINED)/$(1)-adaptive/
 
 LAST_ROLLOUTS := 300
-model-double_pendulum-adaptive: LAST_ROLLOUTS := 100
+varied-double_pendulum: LAST_ROLLOUTS := 100
 
-model-cartpole-adaptive model-double_pendulum-adaptive: model-%-adaptive: $(STAMP) ## a robot that finds its hidden parameters, an hour on one core
+varied-cartpole varied-double_pendulum: varied-%: $(STAMP)
 	$(NERD) data $* --vary preset --trajectories 7000 --steps 200 --out datasets/$*_varied
-	$(NERD) train $* $(ADAPTIVE) --data datasets/$*_varied --steps 6000 --rollout-steps 500 \
+	$(NERD) train $* $(ADAPTIVE) $(SHORT) --steps 6000 --rollout-steps 500 \
 		--rollout-length 10 --rollout-batch-size 64 --validate-every 7000 --out runs/$*_varied
-	$(NERD) train $* $(ADAPTIVE) --data datasets/$*_varied --init-from runs/$*_varied/last \
+	$(NERD) train $* $(ADAPTIVE) $(SHORT) --init-from runs/$*_varied/last \
 		--steps 3500 --lr 0.005 --adamw-lr 0.0015 --rollout-steps 700 --rollout-length 20 \
 		--rollout-batch-size 48 --validate-every 9000 --save-every 250 --out runs/$*_second
-	$(NERD) train $* $(ADAPTIVE) --data datasets/$*_varied --init-from runs/$*_second/last \
+	$(NERD) train $* $(ADAPTIVE) $(SHORT) --init-from runs/$*_second/last \
 		--steps 3000 --lr 0.004 --adamw-lr 0.0012 --rollout-steps $(LAST_ROLLOUTS) \
 		--rollout-length 40 --rollout-batch-size 128 --validate-every 9000 --save-every 100 \
-		--out runs/$*_adaptive
-	mkdir -p $(PRETRAINED)/$*-adaptive && cp runs/$*_adaptive/last/* $(PRETRAINED)/$*-adaptive/
+		--out runs/$*_third
+
+model-double_pendulum-adaptive: varied-double_pendulum ## pendulums that find their hidden parameters
+	$(call SHIP_ADAPTIVE,double_pendulum,third)
+
+model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, with longer sequences at last
+	$(NERD) train cartpole $(ADAPTIVE) --data datasets/cartpole_varied \
+		--init-from runs/cartpole_third/last --sequence-length 160 --batch-size 12 \
+		--steps 2000 --lr 0.003 --adamw-lr 0.001 --rollout-steps 0 --validate-every 9000 \
+		--save-every 100 --out runs/cartpole_adaptive
+	$(call SHIP_ADAPTIVE,cartpole,adaptive)
 
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 30000 --out datasets/ant
