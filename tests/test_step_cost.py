@@ -82,7 +82,7 @@ def test_memory_is_what_a_row_holds(name, generator):
             "mlp-4x64": 0,
             "gru": 4 * 128,
             "transformer-4x128": age
-            + 4 * (4 * 2 * 9 * 128),  # layers, keys and values, tokens
+            + 4 * (4 * 2 * 10 * 128),  # layers, keys and values, tokens
         }[network]
         streaming = step_cost(NeRDDynamics(model), state)
         recomputing = NeRDDynamics(model, inference="window", window=window)

@@ -30,7 +30,7 @@ Residuals = Callable[[Tensor], Tensor]
 def scale_of(history: TensorDict) -> Tensor:
     """Standard deviation ``(nv,)`` of a step's change of velocity."""
     gain = history[NEXT_QVEL] - history[QVEL]
-    return gain.flatten(0, 1).std(0).clamp_min(1e-9)
+    return gain.reshape(-1, gain.shape[-1]).std(0).clamp_min(1e-9)
 
 
 def residuals_of(scene: Scene, history: TensorDict, scale: Tensor) -> Residuals:
