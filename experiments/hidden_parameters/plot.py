@@ -17,6 +17,7 @@ SHOWN = 200  # points of a probe
 def curves(axes: Any, found: dict[str, Any], steps: str) -> None:
     """Mean error over so many steps, inside the ranges, a line per candidate."""
     rows = [row for row in found["errors"] if row["region"] == "inside"]
+    rows = [row for row in rows if row["name"] != "mujoco.sysid"]  # of one length alone
     quantity = list(rows[0]["errors"][steps])[-1]
     lengths = sorted({row["history"] for row in rows})
     for name in dict.fromkeys(row["name"] for row in rows):
@@ -24,9 +25,13 @@ def curves(axes: Any, found: dict[str, Any], steps: str) -> None:
         errors = [row["errors"][steps][quantity]["mean"] for row in own]
         seen = [row["history"] for row in own]
         axes.plot(seen, errors, marker="o", markersize=3, label=name)
+    learned = [row for row in rows if "fitted" not in row["name"]]
+    lowest = min(row["errors"][steps][quantity]["mean"] for row in learned)
+    axes.set_title("smaller is better", fontsize=9)
     axes.set_xscale("symlog", linthresh=1)
     axes.set_xticks(lengths, lengths)
     axes.set_yscale("log")
+    axes.set_ylim(bottom=lowest / 3)  # a fit of the right engine goes to zero
     axes.set_xlabel("steps of history")
     axes.set_ylabel(f"error of {quantity} over {steps} steps (rad)")
 
@@ -52,7 +57,7 @@ def main(results: tyro.conf.Positional[Path], path: tyro.conf.Positional[Path]) 
     panels = figure.subplots(1, 3)
     for axes, steps in zip(panels, ("20", "100"), strict=False):
         curves(axes, found, steps)
-    panels[0].legend(fontsize=7)
+    panels[0].legend(fontsize=7, loc="upper right", ncols=3)
     points(panels[2], found, best)
     figure.savefig(path)
 
