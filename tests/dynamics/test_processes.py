@@ -149,6 +149,7 @@ def test_threads_are_as_many_as_processors_are_allowed(monkeypatch):
         os.sched_setaffinity(0, allowed)
 
 
+@pytest.mark.slow
 def test_no_warning_becomes_an_error():
     """Imports of others are excepted; what this package does afterwards is not."""
     script = (
