@@ -45,6 +45,7 @@ def residuals_of(scene: Scene, history: TensorDict, scale: Tensor) -> Residuals:
         flat = cast(TensorDict, data.flatten(0, 1))
         state = flat.select(QPOS, QVEL, PARAMETERS)
         torque, ctrl = drive(scene, command_of(scene, flat), flat[QPOS], flat[QVEL])
+        dynamics.reset(state)  # no warm start from the last guess
         after = dynamics.step(state, torque, flat.get(TERRAIN, None), ctrl)
         error = (after[QVEL] - flat[NEXT_QVEL]) / scale
         return error.reshape(len(u), -1)

@@ -154,7 +154,7 @@ def test_the_global_generators_are_left_alone(task_id, dynamics, generator, tmp_
 
 
 FIRST = [next(iter(robot.tasks)) for robot in ROBOTS.values()][::2]
-"""One task of every robot."""
+"""One task of every second robot; all tasks are slow."""
 
 
 def fingerprint(folder: Path, seed: int, tasks: Iterable[str]) -> str:

@@ -151,19 +151,16 @@ class Attention(nn.Module):
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
         """One token per row, ``(rows, width)``, against itself and the cached ones."""
         query, key, value = self._split(x)
-        offset = cache.write(
-            layer, key, value
-        )  # first: compiled code then copies nothing
+        # written before it is read: compiled code then copies no ring
+        offset = cache.write(layer, key, value)
         is_seen = offset <= cache.age[:, None]  # (rows, band)
         keys, values = cache.keys[layer], cache.values[layer]
         is_narrow = self.band <= NARROW
         if is_narrow:
-            scores = (query[:, :, None] * keys).sum(-1)
+            scores = (query[:, :, None] * keys).sum(-1)  # (rows, heads, band)
         else:
             scores = (keys @ query[..., None])[..., 0]
-        scores = (
-            scores * self.scale + self.offset_bias[:, offset]
-        )  # (rows, heads, band)
+        scores = scores * self.scale + self.offset_bias[:, offset]
         weights = scores.masked_fill(~is_seen[:, None], MASKED).softmax(-1)
         if is_narrow:
             mixed = (weights[..., None] * values).sum(-2)
@@ -247,9 +244,8 @@ class CausalTransformer(nn.Module):
         self, config: TransformerConfig, num_inputs: int, num_outputs: int
     ) -> None:
         super().__init__()
-        sizes = {k: x for k, x in asdict(config).items() if k != "pairs"}
-        for name, size in sizes.items():
-            if size < (2 if name == "band" else 1):
+        for name, size in asdict(config).items():
+            if size < {"band": 2, "pairs": 0}.get(name, 1):
                 raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
             raise ValueError(
