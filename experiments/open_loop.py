@@ -1,11 +1,13 @@
 """A network that learns a third-party robot, beside MuJoCo at few substeps: error and rate.
 
-    python experiments/open_loop.py gymnasium/Hopper-v5 --json FILE
+    python experiments/open_loop.py gymnasium/Hopper-v5 --policy FOLDER --json FILE
 
-1. Random trajectories of the robot in MuJoCo, as `nerd data` makes them.
+1. Random trajectories of the robot in MuJoCo, as `nerd data` makes them, and trajectories
+   along a policy, such as `python examples/ppo.py --dynamics mujoco --out FOLDER` learns.
 2. A network that learns from them: updates on single steps, then on rollouts.
-3. Its error on test starts, passive and under random actions, against MuJoCo with the
-   robot's own integrator and substeps; MuJoCo with other ones is measured by the same.
+3. Its error on test starts, passive, under random actions and under the policy's, against
+   MuJoCo with the robot's own integrator and substeps; MuJoCo with other ones is measured
+   by the same. The policy's actions are those it took in the ground truth.
 4. Control steps per second of all of them, in turns on one thread.
 
 A run that is stopped goes on where it was.
@@ -20,16 +22,25 @@ from typing import Any, cast
 import torch
 import tyro
 from network_off import without_network
+from policies_in_the_model import SEGMENT, pieces_along
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.bench.candidates import Candidate, models, simulators
+from torchrl_nerd.evaluation.bench.candidates import (
+    Candidate,
+    models,
+    mujoco_name,
+    simulators,
+)
 from torchrl_nerd.evaluation.bench.errors import (
     GROUND_TRUTH,
     ErrorRow,
+    EvaluationSet,
     cases_of,
     error_rows,
     evaluation_set,
@@ -37,14 +48,20 @@ from torchrl_nerd.evaluation.bench.errors import (
 )
 from torchrl_nerd.evaluation.bench.rates import rate_rows
 from torchrl_nerd.evaluation.bench.report import pareto_front
+from torchrl_nerd.evaluation.policy import load_policy, make_actor, policy_task
 from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.evaluation.rollout_error import open_loop
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import drive
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.training.trainer import Trainer
 
-STEPS = 100  # control steps of a training trajectory
+STEPS = SEGMENT  # control steps of a training trajectory
+LENGTH = 1000  # control steps along a policy
+ALONG = "along a policy"  # the case
 HORIZONS = (20, 100)  # of the errors, control steps
 ZEROED = "learned, its last layer zero"
 Errors = dict[str, dict[str, dict[str, float]]]
@@ -60,6 +77,9 @@ class Config:
     network: str = "mlp-4x128"
     updates: int = 5000  # on 1,024 single steps
     rollout_updates: int = 500  # on 128 rollouts of 8 steps
+    policy: Path | None = None  # of a task of this robot; None: random motion alone
+    along: int = 200  # trajectories along it for the data, of up to 1,000 control steps
+    noise: float = 0.3  # of actions there, largest standard deviation
     seed: int = 0  # of data and weights
     test_seed: int = 500  # of the starts and actions of the report
     test_trajectories: int = 256  # of each case
@@ -75,9 +95,27 @@ class Config:
         return self.out / Path(self.robot).stem
 
 
+def along_policy(
+    scene: Scene, cfg: Config, rows: int, seed: int, noise: float
+) -> TensorDict:
+    """Pieces ``[n, STEPS]`` of trajectories along the policy, until the robot falls."""
+    assert cfg.policy is not None
+    task = policy_task(cfg.policy)
+    if task.scene.hash != scene.hash:
+        raise SystemExit(
+            f"{cfg.policy} acts in {task.scene.name}, expected {scene.name}"
+        )
+    actor = make_actor(load_policy(cfg.policy, task))
+    return pieces_along(task, actor, rows, LENGTH, fold_in(seed, 1), noise)
+
+
 def train(scene: Scene, cfg: Config) -> Path:
-    """Where the model is that has learned from random trajectories."""
+    """Where the model is that has learned from all trajectories."""
     data = simulate(scene, cfg.trajectories, STEPS, fold_in(cfg.seed, 0))
+    data = cast(TensorDict, data[is_sound(data)])
+    if cfg.policy is not None:
+        along = along_policy(scene, cfg, cfg.along, cfg.seed, cfg.noise)
+        data = cast(TensorDict, TensorDict.cat((data, along)))
     how = TrainConfig(
         network=cfg.network,
         steps=cfg.updates,
@@ -88,9 +126,23 @@ def train(scene: Scene, cfg: Config) -> Path:
         save_every=500,
         seed=cfg.seed,
     )
-    about = scene, data[is_sound(data)], scene, how, cfg.folder
-    Trainer(*about, horizons=HORIZONS, logger="csv").run()
+    Trainer(scene, data, scene, how, cfg.folder, horizons=HORIZONS, logger="csv").run()
     return cfg.folder / "last"
+
+
+def policy_set(scene: Scene, cfg: Config) -> EvaluationSet:
+    """The case along the policy: states that it reaches, and what it does from there."""
+    pieces = along_policy(scene, cfg, cfg.test_trajectories, cfg.test_seed, noise=0.0)
+    chosen = torch.randperm(len(pieces), generator=fold_in(cfg.test_seed, 2))
+    pieces = cast(TensorDict, pieces[chosen[: cfg.test_trajectories]])
+    command = pieces[JOINT_TORQUE] if scene.servos is None else pieces[CTRL]
+
+    def act(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        return drive(scene, command[:, step], state[QPOS], state[QVEL])
+
+    start, exact = pieces.select(QPOS, QVEL)[:, 0], MujocoDynamics(scene)
+    path = open_loop(exact, cast(TensorDict, start), STEPS, act)
+    return EvaluationSet(ALONG, scene, start, act, mujoco_name(scene), path)
 
 
 def errors_of(
@@ -98,11 +150,16 @@ def errors_of(
 ) -> list[ErrorRow]:
     """Of all candidates, in every case and over every horizon."""
     rows, about = [], (cfg.test_trajectories, max(HORIZONS), cfg.test_seed)
-    for case, source, is_driven in cases_of(protocol_of(scene)):
-        chosen = evaluation_set(case, source, is_driven, MujocoDynamics, *about)
+    sets = [
+        evaluation_set(*case, MujocoDynamics, *about)
+        for case in cases_of(protocol_of(scene))
+    ]
+    if cfg.policy is not None:
+        sets.append(policy_set(scene, cfg))
+    for chosen in sets:
         errors = measure([chosen], candidates)
         for horizon in HORIZONS:
-            rows += error_rows(scene, case, horizon, errors, {})
+            rows += error_rows(scene, chosen.case, horizon, errors, {})
     return rows
 
 
@@ -164,6 +221,7 @@ def main(cfg: Config) -> None:
     print(results["on_the_front"], f"compiled {results['rates']['compiled']:,.0f}")
     if cfg.json is not None:
         how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
+        how["policy"] = None if cfg.policy is None else cfg.policy.name
         results = {"robot": cfg.robot, "configuration": how} | results
         write_results(cfg.json, results, cfg.test_seed)
 

@@ -25,7 +25,7 @@ from typing import cast
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Generator, Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 from tyro.conf import Positional
 
@@ -182,11 +182,12 @@ def watched(cfg: Config, actor: Actor) -> float:
     return float(returns_of(cfg, actor, WATCHED, cfg.seed + 100).mean())
 
 
-def along_the_policy(task: Task, actor: Actor, cfg: Config, number: int) -> TensorDict:
+def pieces_along(
+    task: Task, actor: Actor, rows: int, length: int, draw: Generator, noise: float
+) -> TensorDict:
     """Pieces ``[n, SEGMENT]`` of trajectories in MuJoCo, begun before the robot fell."""
-    draw, noise = fold_in(cfg.seed, 1 + number), cfg.noise
-    length = cfg.length // SEGMENT * SEGMENT
-    data = policy_data(task, actor, cfg.along, length, draw, noise=noise)
+    length = length // SEGMENT * SEGMENT
+    data = policy_data(task, actor, rows, length, draw, noise=noise)
     data = cast(TensorDict, data[is_sound(data)])
     fell = task.terminated({QPOS: data[NEXT_QPOS], QVEL: data[NEXT_QVEL]})  # (rows, T)
     late = fell.long().cumsum(1)[:, SEGMENT - 1 :: SEGMENT] > 0  # by the end of a piece
@@ -223,7 +224,8 @@ def in_the_model(cfg: Config) -> dict:
     data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
     learner = Learner(cfg, make_env(task, "mujoco", 8, cfg.seed))
     for number in range(cfg.rounds):
-        more = along_the_policy(task, learner.actor, cfg, number)
+        draw, about = fold_in(cfg.seed, 1 + number), (cfg.along, cfg.length)
+        more = pieces_along(task, learner.actor, *about, draw, cfg.noise)
         data = cast(TensorDict, TensorDict.cat((data, more)))
         clock.note("data")
         model = train_model(task, data, cfg, number, model)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -85,10 +87,16 @@ def test_summary_of_known_returns() -> None:
     assert summary.difference_interval == pytest.approx(1.96 * spread / 2**0.5 / 200.0)
 
 
-@pytest.mark.parametrize("ground_truth", [torch.zeros(5), torch.ones(1)])
-def test_summary_says_what_it_cannot_measure(ground_truth: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        summarize(torch.ones(len(ground_truth)), ground_truth)
+def test_an_interval_needs_two_episodes() -> None:
+    with pytest.raises(ValueError, match="expected at least 2 episodes"):
+        summarize(torch.ones(1), torch.ones(1))
+
+
+def test_a_policy_without_reward_has_no_difference() -> None:
+    """A sparse task at the beginning of learning: a table all the same."""
+    summary = summarize(torch.ones(5), torch.zeros(5))
+    assert summary.mean == 1.0 and math.isnan(summary.difference)
+    assert "nan" not in transfer_table({"nerd": summary})
 
 
 def test_mujoco_engines_agree_and_ground_truth_is_added(policy: Policy) -> None:

@@ -5,7 +5,7 @@ import json
 import pytest
 import tables
 import torch
-from policies_in_the_model import SEGMENT, Config, Trusted, along_the_policy, main
+from policies_in_the_model import SEGMENT, Config, Trusted, main, pieces_along
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
@@ -14,6 +14,7 @@ from torchrl_nerd.dynamics import GuardedDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.policy import Policy, make_actor
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import make_task
+from torchrl_nerd.seeds import fold_in
 
 
 def test_an_episode_fails_where_the_model_has_no_data():
@@ -42,10 +43,10 @@ def test_the_same_rule_ends_episodes_in_mujoco():
 def test_pieces_begin_before_the_robot_fell():
     task = make_task("gymnasium/Hopper-v5")
     actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
-    cfg = Config(task.name, along=6, length=3 * SEGMENT, noise=1.0)
-    found = along_the_policy(task, actor, cfg, 0)
+    rows = 6
+    found = pieces_along(task, actor, rows, 3 * SEGMENT, fold_in(0, 1), noise=1.0)
     assert found.batch_size[1] == SEGMENT
-    assert cfg.along <= len(found) < 3 * cfg.along  # it falls within seconds
+    assert rows <= len(found) < 3 * rows  # it falls within seconds
     start = found[:, 0]
     assert not task.terminated({key: start[key] for key in (QPOS, QVEL)}).any()
     assert isinstance(found, TensorDict)

@@ -7,6 +7,7 @@ policy's mean action, the undiscounted sum of rewards. The return difference is
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import isfinite, nan
 from pathlib import Path
 
 import torch
@@ -75,18 +76,17 @@ def summarize(
     """Mean, spread and return difference of ``returns (episodes,)``.
 
     Entry i of them and of those in the ``ground_truth`` began in the same state. The
-    difference is over the entries that both have.
+    difference is over the entries that both have, and NaN where those of the ground truth
+    have a mean of zero, as with a policy that has not found any reward yet.
 
     Raises:
-        ValueError: fewer than two episodes, or returns of zero, which have no difference.
+        ValueError: fewer than two episodes.
     """
     both = min(len(returns), len(ground_truth))
     if both < 2:
         raise ValueError(f"expected at least 2 episodes for an interval, got {both}")
     difference = returns[:both] - ground_truth[:both]
-    scale = abs(float(ground_truth[:both].mean()))
-    if scale == 0.0:
-        raise ValueError("expected a task with rewards: the mean return is zero")
+    scale = abs(float(ground_truth[:both].mean())) or nan
     return ReturnSummary(
         kind=kind,
         model=model,
@@ -151,6 +151,7 @@ def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     for name, s in summaries.items():
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
         difference = f"{s.difference:+.3%} ± {s.difference_interval:.3%}"
+        difference = difference if isfinite(s.difference) else "-"
         about = [name, s.kind, s.model, str(s.episodes)]
         body.append([*about, mean, f"{s.std:.1f}", difference])
     return f"{text_table(head, body)}\n{NOTE}"
