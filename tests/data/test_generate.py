@@ -9,7 +9,14 @@ from tensordict import TensorDict
 
 from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import expect_few_dropped, generate, load_data
-from torchrl_nerd.data.simulate import LARGEST, first_beyond, is_sound, simulate
+from torchrl_nerd.data.simulate import (
+    LARGEST,
+    SEGMENT,
+    first_beyond,
+    is_sound,
+    simulate,
+)
+from torchrl_nerd.data.strategies import strategy
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
 from torchrl_nerd.geometry.manifold import joint_label
@@ -226,6 +233,27 @@ def test_varied_data_are_steps_of_each_rows_own_robot(tmp_path, seed):
     dynamics, state = MujocoDynamics(scene), data[:, 0].select(*STATE, "parameters")
     dynamics.reset(state)
     for t in range(20):
+        state = dynamics.step(state, data[:, t]["next", "joint_torque"])
+        for key in STATE:
+            assert torch.equal(state[key], data[:, t]["next", key])
+
+
+def test_hidden_parameters_change_once_between_two_segments(seed):
+    """Every step is one of MuJoCo with the parameters that the data give it."""
+    scene, rows, steps = SCENE.vary(RANGES), 40, 3 * SEGMENT
+    data = strategy(scene, "changing")(rows, steps, fold_in(seed, 0))
+    own, dynamics = data["parameters"], MujocoDynamics(scene)
+    is_new = (own[:, 1:] != own[:, :-1]).any(-1)  # (rows, steps - 1)
+    assert not is_new[: rows // 2].any() and is_new.sum(1).max() == 1
+    assert set((is_new.nonzero()[:, 1] + 1).tolist()) == {SEGMENT, 2 * SEGMENT}
+    is_kept = own[rows // 2 :, 0] == own[rows // 2 :, -1]
+    assert (0.2 < is_kept.double().mean(0)).all() and (
+        is_kept.double().mean(0) < 0.8
+    ).all()
+    state = data[:, 0].select(*STATE)
+    dynamics.reset(state)
+    for t in range(steps):
+        state["parameters"] = own[:, t]
         state = dynamics.step(state, data[:, t]["next", "joint_torque"])
         for key in STATE:
             assert torch.equal(state[key], data[:, t]["next", key])

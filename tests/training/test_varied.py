@@ -2,19 +2,23 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.cli import main
 from torchrl_nerd.configs import FeatureConfig, TrainConfig
 from torchrl_nerd.data.generate import is_sound
 from torchrl_nerd.data.simulate import simulate
-from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.data.strategies import strategy
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.files import read_json
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.losses import rollout_loss
 from torchrl_nerd.training.samples import data_stats
+from torchrl_nerd.training.sequences import Sequences, change_times
 from torchrl_nerd.training.trainer import Trainer
 
 SCENE = load_scene("cartpole").vary({"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4)})
@@ -98,6 +102,24 @@ def test_a_trained_model_comes_back_with_its_variation(is_told, data, tmp_path):
         assert load_checkpoint(tmp_path / "last", load_scene("cartpole"))
 
 
+@pytest.mark.parametrize("length", [5, 24])
+def test_rollouts_are_of_one_robot_where_robots_change(length, generator):
+    data = strategy(SCENE, "changing")(24, 48, generator)
+    data = data[is_sound(data)]
+    sequences = Sequences(model_of(data), data, torch.device("cpu"))
+    for batch in (sequences.rollout(200, length, generator) for _ in range(3)):
+        qpos, qvel, torques, _, own = batch
+        state = TensorDict({QPOS: qpos[:, 0], QVEL: qvel[:, 0], PARAMETERS: own}, [200])
+        dynamics = MujocoDynamics(SCENE)
+        dynamics.reset(state)
+        for step, torque in enumerate(torques.unbind(1), 1):
+            state = dynamics.step(state, torque)
+            torch.testing.assert_close(state[QPOS], qpos[:, step], rtol=0.0, atol=1e-9)
+    assert sequences.change is not None
+    none = change_times(data[: len(data) // 3])
+    assert none is None and change_times(data.exclude(PARAMETERS)) is None
+
+
 def test_symmetry_images_of_varied_robots_are_refused(data, tmp_path):
     config = TrainConfig(use_symmetry=True)
     with pytest.raises(ValueError, match="varied scene without use_symmetry"):
@@ -115,7 +137,19 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     assert main(["train", "cartpole", *vary, *how]) == 0
     card = load_checkpoint(tmp_path / "run" / "last").scene.variation.ranges
     assert card["mass:pole"] == [1.0, 1.0] and card["motor"] == [0.6, 1.4]
+    changing = (
+        "--changes",
+        "--out",
+        str(tmp_path / "changing"),
+        *made[:3],
+        "20",
+        "--quiet",
+    )
+    assert main(["data", "cartpole", *vary, *changing]) == 0
+    assert read_json(tmp_path / "changing" / "data.json")["strategy"] == "changing"
     capsys.readouterr()
+    assert main(["data", "cartpole", *changing]) == 2
+    assert "expected parameters that vary" in capsys.readouterr().err
     for bad in ("mass:pole", "mass:pole=1", "mass:pole=a:b", "mass:rod=1:2"):
         assert (
             main(["data", "cartpole", "--vary", bad, "--out", str(tmp_path / "x")]) == 2

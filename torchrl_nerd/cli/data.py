@@ -20,7 +20,7 @@ from torchrl_nerd.data.generate import (
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
 from torchrl_nerd.data.simulate import simulate
-from torchrl_nerd.data.strategies import preset_strategy
+from torchrl_nerd.data.strategies import preset_strategy, strategy
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.policy_data import along_policy
@@ -38,6 +38,8 @@ class Data(SceneOptions, Command):
 
     Example: nerd data cartpole --vary mass:pole=0.3:3.0 motor=0.6:1.4
 
+    Example: nerd data cartpole --vary preset --changes --steps 200
+
     Example: nerd data ant --trajectories 1000000 --ray auto
 
     Example: nerd data ant --policy runs/ppo_ant --out datasets/ant_policy
@@ -52,6 +54,8 @@ class Data(SceneOptions, Command):
     """Folder of a policy (see examples/ppo.py) that acts, from the resets of its task."""
     noise: float = 0.5
     """Largest standard deviation of the noise on a policy's actions, in [-1, 1]."""
+    changes: bool = False
+    """Let hidden parameters change once, in half of the trajectories; see --vary."""
     ray: str | None = None
     """Ray cluster that generates the same data: HOST:PORT, auto, or local."""
     quiet: bool = False
@@ -63,9 +67,17 @@ class Data(SceneOptions, Command):
         return self.out or Path("datasets") / self.run_name
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
-        """Name and function that draw: the policy's, or the preset's."""
+        """Name and function that draw: the policy's, or the preset's.
+
+        Raises:
+            ValueError: a policy while hidden parameters change.
+        """
         if self.policy is not None:
+            if self.changes:
+                raise ValueError("expected --changes without --policy")
             return along_policy(scene, self.policy, self.noise)
+        if self.changes:
+            return "changing", strategy(scene, "changing")
         return preset_strategy(scene)
 
     def plan(self) -> list[str]:

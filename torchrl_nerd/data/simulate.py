@@ -18,23 +18,36 @@ SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of t
 LARGEST = 1e5  # reference code: a trajectory beyond this has diverged
 
 
-def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> TensorDict:
-    """Trajectories ``[rows, steps]`` from the scene's ranges, diverged ones included."""
+def simulate(
+    scene: Scene,
+    rows: int,
+    steps: int,
+    generator: Generator,
+    is_changing: bool = False,
+) -> TensorDict:
+    """Trajectories ``[rows, steps]`` from the scene's ranges, diverged ones included.
+
+    ``is_changing``: hidden parameters change once in every trajectory, see `change_once`.
+    """
     dynamics = MujocoDynamics(scene)
     start, scale = scene.sample_initial(rows, generator)
-    terrain, varied = start.pop(TERRAIN, None), scene.variation
-    parameters = None if varied is None else varied.draw(rows, generator)
+    terrain, varied, own = start.pop(TERRAIN, None), scene.variation, None
+    if varied is not None:
+        first = varied.draw(rows, generator)
+        own = first[:, None].repeat(1, steps, 1)  # (rows, steps, size)
+        if is_changing:
+            change_once(own, varied.draw(rows, generator), generator)
     state = TensorDict(start, batch_size=[rows])
     dynamics.reset(state)
-    states, commands = [state[:, None]], []
+    states, commands, done = [state[:, None]], [], 0
     sampling, drawn = scene.sampling, ()
     if sampling.drive is None:
         how = steps, scene.control_step, generator
         drawn = sample_correlated_commands(sampling, scale, *how).split(SEGMENT, 1)
     for segment in range(steps if sampling.drive else len(drawn)):
         last = cast(TensorDict, states[-1][:, -1])
-        if parameters is not None:
-            last = last.set(PARAMETERS, parameters)
+        if own is not None:
+            last = last.set(PARAMETERS, own[:, done])
         if sampling.drive is None:
             command = drawn[segment]  # (rows, SEGMENT, m)
         else:  # depends on the state: one step at a time
@@ -42,7 +55,23 @@ def simulate(scene: Scene, rows: int, steps: int, generator: Generator) -> Tenso
         torque, ctrl = held(scene, command)
         commands.append(command)
         states.append(dynamics.rollout(last, torque, terrain, ctrl))
-    return as_transitions(scene, states, commands, terrain, parameters)
+        done += command.shape[1]
+    data = as_transitions(scene, states, commands, terrain)
+    return data if own is None else data.set(PARAMETERS, own)
+
+
+def change_once(own: Tensor, other: Tensor, generator: Generator) -> None:
+    """Let parameters ``(rows, steps, size)`` change, in place, to ``other (rows, size)``.
+
+    Each row does so at a random time, after a whole number of segments. It takes over each
+    of its parameters with a chance of a half.
+    """
+    rows, steps, size = own.shape
+    last = max(1, (steps - 1) // SEGMENT)
+    begin = SEGMENT * torch.randint(1, last + 1, (rows, 1), generator=generator)
+    is_late = torch.arange(steps) >= begin  # (rows, steps)
+    is_other = torch.rand(rows, size, generator=generator) < 0.5
+    own.copy_(torch.where(is_late[..., None] & is_other[:, None], other[:, None], own))
 
 
 def as_transitions(

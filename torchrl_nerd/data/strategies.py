@@ -19,6 +19,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import held, idle
 from torchrl_nerd.scenes.sampling import log_uniform
 
+STRATEGIES = "correlated", "level", "resting", "changing"
 MAX_CORRELATION_TIME = 1.0  # s; the shortest is one control step
 
 
@@ -104,6 +105,7 @@ def strategy(scene: Scene, name: str) -> Draw:
     | ``correlated`` | correlated torques, from one control step to a second |
     | ``level`` | two parts of the scene's own, one over ground that is hit vertically |
     | ``resting`` | two parts of the scene's own, one of perturbed rest states |
+    | ``changing`` | two parts of the scene's own, one whose hidden parameters change |
 
     Raises:
         ValueError: no such strategy, or one that does not fit the scene.
@@ -117,9 +119,12 @@ def strategy(scene: Scene, name: str) -> Draw:
     if name == "resting":
         starts = PerturbedRestStates(SettledStates(scene))
         return mix(own, own, along(scene, starts=starts))
+    if name == "changing":
+        if scene.variation is None:
+            raise ValueError(f"expected parameters that vary, '{scene.name}' has none")
+        return mix(own, partial(simulate, scene, is_changing=True))
     raise ValueError(
-        f"expected a strategy of correlated, level or resting for '{scene.name}', got "
-        f"{name}"
+        f"expected a strategy of {', '.join(STRATEGIES)} for '{scene.name}', got {name}"
     )
 
 

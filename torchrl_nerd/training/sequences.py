@@ -72,6 +72,8 @@ class Sequences:
         self.data = data.to(device)
         self.symmetry = symmetry.to(device) if symmetry else None
         self.scene, self.steps = model.scene, data.batch_size[1]
+        change = change_times(data)
+        self.change = None if change is None else change.to(device)
 
     def pick(
         self, rows: int, length: int, generator: Generator
@@ -101,11 +103,22 @@ class Sequences:
         token = self.symmetry.tokens(inputs.token, choice)
         return inputs._replace(token=token), self.symmetry.targets(targets, choice)
 
+    def _of_one_robot(self, row: Tensor, time_index: Tensor) -> Tensor:
+        """Windows ``(rows, length)`` moved behind their robot's change, or before it."""
+        assert self.change is not None
+        change, first, length = self.change[row], time_index[:, :1], time_index.shape[1]
+        is_mixed = (first < change) & (change < first + length)  # (rows, 1)
+        is_early = change + length > self.steps
+        moved = torch.where(is_early, (change - length).clamp_min(0), change)
+        return time_index - first + torch.where(is_mixed, moved, first)
+
     def rollout(
         self, rows: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
         """True ``qpos``, ``qvel (rows, length + 1, ...)``, commands, ground, parameters."""
         row, time_index = self.pick(rows, length, generator)
+        if self.change is not None:
+            time_index = self._of_one_robot(row, time_index)
         batch = cast(TensorDict, self.data[row, time_index])
         if self.symmetry is not None:  # the rows are in no order: a part for each
             isometries = self.symmetry.isometries
@@ -117,3 +130,16 @@ class Sequences:
         first = cast(TensorDict, batch[:, 0])  # these are the same at all times
         own = first.get(TERRAIN, None), first.get(PARAMETERS, None)  # (rows, size)
         return qpos, qvel, command_of(self.scene, batch), *own
+
+
+def change_times(data: TensorDict) -> Tensor | None:
+    """The step from which a trajectory's robot is another, ``(rows,)``; 0: it stays.
+
+    None where no robot of the data ``[rows, steps]`` changes.
+    """
+    parameters = data.get(PARAMETERS, None)
+    if parameters is None:
+        return None
+    is_new = (parameters[:, 1:] != parameters[:, :-1]).any(-1)  # (rows, steps - 1)
+    when = torch.where(is_new.any(1), is_new.int().argmax(1) + 1, 0)
+    return when if bool(is_new.any()) else None
