@@ -103,8 +103,6 @@ ADAPTIVE := --vary preset --network adaptive-4x64 --single-step-fraction 0 \
 	--rollout-history 20 --threads 1
 SHORT = --data datasets/$*_varied --sequence-length 64 --batch-size 32
 
-SHIP_ADAPTIVE = mkdir -p $(PRETRAINED)/$(1)-adaptive && cp runs/$(1)_$(2)/last/* $(PRETRAINED)/$(1)-adaptive/
-
 LAST_ROLLOUTS := 300
 varied-double_pendulum: LAST_ROLLOUTS := 100
 
@@ -120,15 +118,31 @@ varied-cartpole varied-double_pendulum: varied-%: $(STAMP)
 		--rollout-length 40 --rollout-batch-size 128 --validate-every 9000 --save-every 100 \
 		--out runs/$*_third
 
-model-double_pendulum-adaptive: varied-double_pendulum ## pendulums that find their hidden parameters
-	$(call SHIP_ADAPTIVE,double_pendulum,third)
+LONG := --sequence-length 160 --batch-size 12 --validate-every 9000
 
-model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, with longer sequences at last
-	$(NERD) train cartpole $(ADAPTIVE) --data datasets/cartpole_varied \
-		--init-from runs/cartpole_third/last --sequence-length 160 --batch-size 12 \
-		--steps 2000 --lr 0.003 --adamw-lr 0.001 --rollout-steps 0 --validate-every 9000 \
-		--save-every 100 --out runs/cartpole_adaptive
-	$(call SHIP_ADAPTIVE,cartpole,adaptive)
+# At last robots that change within a trajectory: single steps, then rollouts as well.
+define LEARN_CHANGES
+	$(NERD) data $(1) --vary preset --changes --trajectories 7000 --steps 200 --seed 3 \
+		--out datasets/$(1)_changing
+	$(NERD) train $(1) $(ADAPTIVE) $(LONG) --data datasets/$(1)_changing \
+		--init-from runs/$(1)_$(2)/last --steps 3000 --lr 0.004 --adamw-lr 0.0012 \
+		--rollout-steps 0 --save-every 250 --out runs/$(1)_changing
+	$(NERD) train $(1) $(ADAPTIVE) $(LONG) --data datasets/$(1)_changing \
+		--init-from runs/$(1)_changing/last --steps $(3) --lr 0.004 --adamw-lr 0.0012 \
+		--rollout-steps $(4) --rollout-length 40 --rollout-batch-size 128 \
+		--save-every 50 --out runs/$(1)_adaptive
+	mkdir -p $(PRETRAINED)/$(1)-adaptive
+	cp runs/$(1)_adaptive/last/* $(PRETRAINED)/$(1)-adaptive/
+endef
+
+model-double_pendulum-adaptive: varied-double_pendulum ## pendulums that find their hidden parameters
+	$(call LEARN_CHANGES,double_pendulum,third,2000,200)
+
+model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, with one stage more
+	$(NERD) train cartpole $(ADAPTIVE) $(LONG) --data datasets/cartpole_varied \
+		--init-from runs/cartpole_third/last --steps 2000 --lr 0.003 --adamw-lr 0.001 \
+		--rollout-steps 0 --save-every 100 --out runs/cartpole_long
+	$(call LEARN_CHANGES,cartpole,long,1000,250)
 
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 30000 --out datasets/ant

@@ -125,6 +125,18 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     raise ValueError(f"unknown dynamics {str(found)!r}{meant}, expected {_known()}")
 
 
+def expect_varied(name: str | Path, scene: Scene) -> None:
+    """Raise ValueError where a model of that name steps one robot, and the scene's vary."""
+    found = model_name(name, scene)
+    folder = model_folder(found) if found in shipped_models() else Path(found)
+    is_analytic = found == "analytic" or found in STEPS
+    if is_analytic or not read_json(folder / CARD).get("variation"):
+        raise ValueError(
+            f"expected a model that learned on varied robots for the varied scene "
+            f"'{scene.name}', got '{name}', which steps one robot"
+        )
+
+
 def _not_shipped(name: str, hybrid_of: Scene | None) -> str:
     """That no model has this name, and how to make one; a hybrid where a scene is given."""
     how, folder = f"nerd train {name}", f"runs/{folder_name(name)}"

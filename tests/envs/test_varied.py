@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_nerd import GroundTruthEnv, NeRDEnv
+from torchrl_nerd import GroundTruthEnv, NeRDEnv, make_env
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.robots import load_scene, make_task
@@ -169,7 +169,16 @@ def test_parameters_that_no_robot_has_are_refused(name, value):
 def test_late_torques_and_a_fallback_do_not_go_together():
     task = make_task("cartpole/swingup").vary(RANGES)
     with pytest.raises(ValueError, match="without delay for the guard 'fallback'"):
-        NeRDEnv(task, "cartpole", guard="fallback")
+        NeRDEnv(task, "cartpole-adaptive", guard="fallback")
+
+
+def test_what_steps_one_robot_is_refused_for_many():
+    """It would hand out parameters and step the nominal robot."""
+    task = make_task("cartpole/swingup").vary(RANGES)
+    for name in ("nerd", "analytic", "unconstrained", "cartpole-mlp"):
+        with pytest.raises(ValueError, match=f"got '{name}', which steps one robot"):
+            make_env(task, name)
+    assert PARAMETERS in make_env(task, "cartpole-adaptive").reset()
 
 
 def test_a_history_that_shows_nothing_is_refused():

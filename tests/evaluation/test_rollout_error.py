@@ -9,10 +9,12 @@ import torch
 from helpers import HANDMADE, make_scene, random_quats, random_states
 from tensordict import TensorDict
 
-from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
+    motion_before,
     open_loop,
     passive_errors,
     position_errors,
@@ -261,3 +263,34 @@ def test_joints_without_a_name_count_one_by_one(base, rng):
     apart = (paths[0] - paths[1]).abs().numpy()[..., 7:]  # hinge, slide, hinge, slide
     apart[..., ::2] = wrapped(apart[..., ::2])
     assert found["joints"].mean == pytest.approx(apart.mean())
+
+
+VARIED = make_task("cartpole/swingup").vary(
+    {"motor": (0.6, 1.4), "mass:pole": (0.3, 3.0)}
+)
+
+
+def test_a_rollout_goes_on_where_its_history_ends(seed):
+    """In the ground truth it is the rest of one long motion; nothing else moves so."""
+    history, exact = 4, MujocoDynamics(VARIED.scene)
+    start = initial_states(VARIED, ROWS, seed)
+    drive = action_drive(VARIED, ROWS, history + STEPS, seed, random_actions=True)
+    whole = open_loop(exact, start, history + STEPS, drive)
+    end, seen, later = motion_before(exact, start, history, drive)
+    assert seen is not None and seen.batch_size == (ROWS, history)
+    torch.testing.assert_close(seen[:, 1:]["qpos"], whole[:, : history - 1])
+    rest = open_loop(exact, end, STEPS, later, history=seen)
+    torch.testing.assert_close(rest, whole[:, history:], rtol=0.0, atol=1e-9)
+    same = motion_before(exact, start, 0, drive)
+    assert same[0] is start and same[1] is None and same[2] is drive
+
+
+def test_a_model_that_adapts_is_measured_after_a_history(seed):
+    dynamics = from_pretrained("cartpole-adaptive", VARIED.scene)
+    both = NeRDDynamics(dynamics), MujocoDynamics(VARIED.scene)
+    how = {"random_actions": True, "seed": seed}
+    blind, adapted = (
+        passive_errors(VARIED, *both, [20], 64, **how, history=n)[20]["hinge"].mean
+        for n in (0, 30)
+    )
+    assert adapted < 0.6 * blind

@@ -11,6 +11,8 @@ from torchrl_nerd.data.generate import is_sound
 from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.data.strategies import strategy
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.bench.candidates import mujoco_name
+from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.files import read_json
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
@@ -126,6 +128,28 @@ def test_symmetry_images_of_varied_robots_are_refused(data, tmp_path):
         Trainer(SCENE, data, SCENE, config, tmp_path)
 
 
+def test_the_command_line_measures_after_a_history(tmp_path, capsys):
+    """Beside MuJoCo, which knows every robot, and one that is nominal for all."""
+    path = tmp_path / "eval.json"
+    how = ("--model", "cartpole-adaptive", "--num-trajectories", "16", "--quiet")
+    seen = ("--vary", "preset", "--history", "20", "--json", str(path))
+    assert main(["eval", "cartpole", *how, *seen]) == 0
+    found = {
+        (row["name"], row["quantity"]): row["mean"]
+        for row in read_results(path)["results"]["errors"]
+        if (row["case"], row["steps"]) == ("driven", 100)
+    }
+    exact = mujoco_name(SCENE)
+    assert found[exact, "hinge"] == 0.0
+    nominal, adapted = found[f"{exact}, nominal", "hinge"], found[how[1], "hinge"]
+    assert 0.0 < adapted < 0.8 * nominal
+    assert found["analytic", "hinge"] == pytest.approx(nominal, rel=0.2)
+    capsys.readouterr()
+    for more in (("--vary", "preset"), ("--history", "2")):
+        assert main(["eval", "cartpole", "--data", "log.npz", *more]) == 2
+        assert "without --data" in capsys.readouterr().err
+
+
 def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     where = tmp_path / "data"
     vary = ("--vary", "preset", "mass:pole=1:1")
@@ -150,6 +174,12 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     capsys.readouterr()
     assert main(["data", "cartpole", *changing]) == 2
     assert "expected parameters that vary" in capsys.readouterr().err
+    short = ("--steps", "16", "--changes", "--out", str(tmp_path / "short"))
+    assert main(["data", "cartpole", *vary, *short]) == 2
+    assert "expected steps of at least 17, got 16" in capsys.readouterr().err
+    for more in (("--changes",), ("--vary", "preset")):
+        assert main(["data", "cartpole", "--from", "log.npz", *more]) == 2
+        assert "without --from" in capsys.readouterr().err
     for bad in ("mass:pole", "mass:pole=1", "mass:pole=a:b", "mass:rod=1:2"):
         assert (
             main(["data", "cartpole", "--vary", bad, "--out", str(tmp_path / "x")]) == 2

@@ -19,10 +19,11 @@ from torchrl_nerd.data.generate import (
     generate,
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
-from torchrl_nerd.data.simulate import simulate
+from torchrl_nerd.data.simulate import SEGMENT, simulate
 from torchrl_nerd.data.strategies import preset_strategy, strategy
 from torchrl_nerd.files import read_json
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.training.policy_data import along_policy
 
 
@@ -55,7 +56,9 @@ class Data(SceneOptions, Command):
     noise: float = 0.5
     """Largest standard deviation of the noise on a policy's actions, in [-1, 1]."""
     changes: bool = False
-    """Let hidden parameters change once, in half of the trajectories; see --vary."""
+    """Let each hidden parameter change with a chance of a half, once in half of the
+    trajectories, after a multiple of 16 steps; see --vary. Starts and torques are those of
+    the robot's ranges, not of its preset's strategy."""
     ray: str | None = None
     """Ray cluster that generates the same data: HOST:PORT, auto, or local."""
     quiet: bool = False
@@ -64,19 +67,21 @@ class Data(SceneOptions, Command):
     @property
     def folder(self) -> Path:
         """Of the data set that is generated."""
-        return self.out or Path("datasets") / self.run_name
+        name = f"{self.run_name}-changing" if self.changes else self.run_name
+        return self.out or Path("datasets") / name
 
     def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
         """Name and function that draw: the policy's, or the preset's.
 
         Raises:
-            ValueError: a policy while hidden parameters change.
+            ValueError: hidden parameters change along a policy, or in too few steps.
         """
         if self.policy is not None:
             if self.changes:
                 raise ValueError("expected --changes without --policy")
             return along_policy(scene, self.policy, self.noise)
         if self.changes:
+            expect_at_least(SEGMENT + 1, steps=self.config.steps)
             return "changing", strategy(scene, "changing")
         return preset_strategy(scene)
 
@@ -104,8 +109,10 @@ class Data(SceneOptions, Command):
                 to be dropped; see `generate`, `load_recording`.
         """
         if self.recorded is not None:
-            if self.policy is not None:
-                raise ValueError("expected --policy without --from: it draws data")
+            if self.policy is not None or self.vary or self.changes:
+                raise ValueError(
+                    "expected --policy, --vary and --changes without --from: they draw data"
+                )
             scene = recorded_scene(self.scene)
             out = self.out or Path("datasets") / f"{scene.name}_recorded"
             card = write_recording(self.recorded, scene, out)

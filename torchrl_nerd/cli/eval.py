@@ -1,15 +1,22 @@
 """``nerd eval``: open-loop error against MuJoCo or recorded trajectories."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
-from torchrl_nerd.cli.options import ModelName, Positional, SceneName, recorded_scene
+from torchrl_nerd.cli.options import (
+    ModelName,
+    Positional,
+    SceneName,
+    Vary,
+    ranges_of,
+    recorded_scene,
+)
 from torchrl_nerd.data.log_files import load_recording
-from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
+from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.bench.candidates import (
     Candidate,
     models,
@@ -42,6 +49,15 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 
 
+def nominal(solver: str) -> Candidate:
+    """MuJoCo with the robot as its file has it, whatever varies."""
+
+    def make(scene: Scene) -> Dynamics:
+        return MujocoDynamics(replace(scene, variation=None))
+
+    return Candidate(f"{solver}, nominal", "simulator", make)
+
+
 @dataclass(frozen=True)
 class Eval(MeasuringCommand):
     """Open-loop error of MuJoCo at coarser settings and of every model, beside the paper.
@@ -51,6 +67,8 @@ class Eval(MeasuringCommand):
     the reference solver. Passive, and driven by random actions where there are actuators.
 
     Example: nerd eval cartpole --json results/eval_cartpole.json
+
+    Example: nerd eval cartpole --vary preset --history 20
 
     Example: nerd eval cube --data cube_tosses.npz --split test --baselines
     """
@@ -64,6 +82,10 @@ class Eval(MeasuringCommand):
     variants: tuple[str, ...] = ()
     """Other ways to run each model: compiled, bf16 (the network in bfloat16), or window
     (a transformer that recomputes its history at every step, as in the paper)."""
+    vary: Vary = ()
+    history: int = 0
+    """Steps of the ground truth's motion that every row has seen before: what a model
+    adapts to."""
     reference: Literal["rk4"] | None = None
     """Measure against the reference solver in place of the scene's own: MuJoCo's RK4 at
     four times its substeps."""
@@ -84,11 +106,19 @@ class Eval(MeasuringCommand):
             ValueError: fewer than 2 trajectories, or no such robot or model.
         """
         if self.data is not None:
+            if self.vary or self.history:
+                raise ValueError("expected --vary and --history without --data")
             return self.run_recorded(self.data)
         if self.baselines or self.split != "all" or self.states != STATES:
             raise ValueError("expected --data with --baselines, --split or --states")
         expect_at_least(2, num_trajectories=self.num_trajectories)
-        scene = load_scene(self.scene)
+        expect_at_least(0, history=self.history)
+        scene, ranges = load_scene(self.scene), ranges_of(self.scene, self.vary)
+        protocol = protocol_of(scene)
+        if ranges:
+            cases = {k: source.vary(ranges) for k, source in protocol.cases.items()}
+            scene = scene.vary(ranges)
+            protocol = replace(protocol, cases=cases, published={})
         solver_name = mujoco_name(self.ground_truth(scene).scene)
         solver = "the reference solver" if self.reference else "the scene's own solver"
         print(
@@ -96,10 +126,16 @@ class Eval(MeasuringCommand):
             f"{solver_name}, {solver}. "
             "Every row, coarse MuJoCo included, is measured against it."
         )
+        if ranges:
+            print(
+                f"Every trajectory is of another robot: {', '.join(ranges)}. MuJoCo's rows "
+                "know each, but for the nominal one. So do models told their parameters."
+            )
         names = [] if self.model is None else [self.model]
         learned = models(scene, names, self.device, self.variants)
+        engines = [*simulators(scene), *([nominal(solver_name)] if ranges else [])]
         rows = []
-        for part in self.measure(protocol_of(scene), [*simulators(scene), *learned]):
+        for part in self.measure(protocol, [*engines, *learned]):
             rows += part
         print(f"\n{summary_table(scene, rows)}\n")
         for sentence in warnings(scene, rows):
@@ -120,6 +156,7 @@ class Eval(MeasuringCommand):
     ) -> Iterator[list[ErrorRow]]:
         """Rows of one case and horizon after the other."""
         about = self.num_trajectories, max(protocol.horizons), self.seed, self.device
+        about = *about, self.history
         for case, source, is_driven in cases_of(protocol):
             chosen = evaluation_set(case, source, is_driven, self.ground_truth, *about)
             errors = measure([chosen], candidates, f"{self.scene}: {case}", self.quiet)

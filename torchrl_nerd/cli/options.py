@@ -26,6 +26,39 @@ ModelName = Annotated[
         "by default what is shipped for the robot."
     ),
 ]
+Vary = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        help="Hidden parameters that differ from trajectory to trajectory, as "
+        "mass:pole=0.3:3.0 (KIND:TARGET=LOW:HIGH), or preset: those of the robot's preset."
+    ),
+]
+
+
+def ranges_of(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
+    """Parameters and ranges of a robot by what ``--vary`` says.
+
+    Raises:
+        ValueError: not ``NAME=LOW:HIGH``, a name that is given twice, or no preset.
+    """
+    ranges = dict[str, Sequence[float]]()
+    for given in vary:
+        if given == "preset":
+            if not preset_of(name).variation:
+                raise ValueError(
+                    f"expected NAME=LOW:HIGH for '{name}', which has no preset to vary"
+                )
+            ranges |= preset_of(name).variation
+            continue
+        parameter, _, ends = given.partition("=")
+        try:
+            low, high = map(float, ends.split(":"))
+        except ValueError:
+            raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
+        if parameter in {x.partition("=")[0] for x in vary if x != given}:
+            raise ValueError(f"expected '{parameter}' once, got it several times")
+        ranges[parameter] = low, high
+    return ranges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +69,7 @@ class SceneOptions:
     reference: Literal["rk4"] | None = None
     """Reference solver in place of the scene's own: MuJoCo's RK4 at four times its
     substeps."""
-    vary: tuple[str, ...] = ()
-    """Hidden parameters that differ from trajectory to trajectory, as mass:pole=0.3:3.0
-    (KIND:TARGET=LOW:HIGH), or preset: those of the robot's preset."""
+    vary: Vary = ()
 
     def load(self) -> Scene:
         """The scene with its own or the reference solver, and with what varies.
@@ -46,24 +77,7 @@ class SceneOptions:
         Raises:
             ValueError: no such scene, parameter or range.
         """
-        scene, ranges = load_scene(self.scene), dict[str, Sequence[float]]()
-        for given in self.vary:
-            if given == "preset":
-                if not preset_of(self.scene).variation:
-                    raise ValueError(
-                        f"expected NAME=LOW:HIGH for '{self.scene}', which has no preset "
-                        "to vary"
-                    )
-                ranges |= preset_of(self.scene).variation
-                continue
-            parameter, _, ends = given.partition("=")
-            try:
-                low, high = map(float, ends.split(":"))
-            except ValueError:
-                raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
-            if parameter in {x.partition("=")[0] for x in self.vary if x != given}:
-                raise ValueError(f"expected '{parameter}' once, got it several times")
-            ranges[parameter] = low, high
+        scene, ranges = load_scene(self.scene), ranges_of(self.scene, self.vary)
         scene = scene.reference if self.reference else scene
         return scene.vary(ranges) if ranges else scene
 

@@ -129,7 +129,8 @@ class Train(SceneOptions, DeviceCommand):
             out,
             self.device,
             horizons=protocol.horizons[:2],
-            random_actions=bool(protocol.random_actions),
+            # passive motion tells nothing of motors
+            random_actions=bool(protocol.random_actions or scene.variation),
             quiet=self.quiet,
             logger=self.logger,
             init_from=initial,

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from torchrl_nerd.checkpoint import from_pretrained, model_name
+from torchrl_nerd.checkpoint import expect_varied, from_pretrained, model_name
 from torchrl_nerd.dynamics import (
     ENGINES,
     Guard,
@@ -81,7 +81,8 @@ class NeRDEnv(SceneEnv):
             the weights where they ask for them.
 
     Raises:
-        ValueError: no such task or model, or an option of networks for an analytic step.
+        ValueError: no such task or model, one of a single robot for a task that varies, or
+            an option of networks for an analytic step.
 
     Examples:
         >>> env = NeRDEnv("cartpole/swingup", num_envs=3)
@@ -107,6 +108,8 @@ class NeRDEnv(SceneEnv):
         name = type(model).__name__
         if not isinstance(model, Model):
             given, model = model, from_pretrained(model, task.scene)
+            if task.scene.variation is not None:
+                expect_varied(given, task.scene)
             name = model_name(given, task.scene)
         if state_dtype == torch.float32:
             kept = {id(model.scene): model.scene}

@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
-from torchrl_nerd.dynamics.base import Dynamics
+from torchrl_nerd.dynamics.base import Dynamics, warm_up
 from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE, joint_label
 from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
-from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate, drive, idle
@@ -89,6 +89,7 @@ def states_of(
     start: TensorDict,
     steps: int,
     command: Tensor | Drive | None = None,
+    history: TensorDict | None = None,
 ) -> Iterator[TensorDictBase]:
     """The state ``[n]`` after each step of a rollout.
 
@@ -99,12 +100,15 @@ def states_of(
         command: ``(n, T, m)``, torques or servos' controls, repeated after T steps; or a
             function of step and state; None for no torque (passive motion), or servos in
             mid range.
+        history: motion ``[n, T]`` that ends in the start, see `warm_up`; None: no past.
     """
     terrain = start.get(TERRAIN, None)
     state: TensorDictBase = start.select(QPOS, QVEL, PARAMETERS, strict=False)
     if command is None:
         command = idle(dynamics.scene, len(start), 1).to(start[QPOS])
     dynamics.reset(state)
+    if history is not None:
+        warm_up(dynamics, history, len(start))
     for step in range(steps):
         if callable(command):
             torque, ctrl = command(step, state)
@@ -115,12 +119,42 @@ def states_of(
         yield state
 
 
+def motion_before(
+    ground_truth: Dynamics, start: TensorDict, steps: int, drive: Drive
+) -> tuple[TensorDict, TensorDict | None, Drive]:
+    """What is seen before a rollout, by the ground truth from the ``start [n]``.
+
+    Returns:
+        Where the motion ends, ``[n]``; its transitions ``[n, steps]``, None of no steps;
+        and the drive from there on.
+    """
+    seen: list[TensorDictBase] = []
+
+    def act(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        torque, ctrl = drive(step, state)
+        given = {JOINT_TORQUE: torque, CTRL: ctrl, TERRAIN: start.get(TERRAIN, None)}
+        given = {key: x for key, x in given.items() if x is not None}
+        seen.append(state.select(QPOS, QVEL, PARAMETERS, strict=False).update(given))
+        return torque, ctrl
+
+    if not steps:
+        return start, None, drive
+    *_, last = states_of(ground_truth, start, steps, act)
+    end = start.clone().update(last.select(QPOS, QVEL))
+    return (
+        end,
+        cast(TensorDict, TensorDict.stack(seen, 1)),
+        lambda step, state: drive(steps + step, state),
+    )
+
+
 def open_loop(
     dynamics: Dynamics,
     start: TensorDict,
     steps: int,
     command: Tensor | Drive | None = None,
     stop_at_nan: bool = False,
+    history: TensorDict | None = None,
 ) -> Tensor:
     """Positions after each step, ``(n, steps, nq)``; see `states_of`.
 
@@ -129,7 +163,8 @@ def open_loop(
     """
     shape = (len(start), steps, start[QPOS].shape[1])
     positions = torch.full(shape, torch.nan).to(start[QPOS])
-    for step, state in enumerate(states_of(dynamics, start, steps, command)):
+    states = states_of(dynamics, start, steps, command, history)
+    for step, state in enumerate(states):
         positions[:, step] = state[QPOS]
         if stop_at_nan and not state[QPOS].isfinite().all():
             break
@@ -235,17 +270,22 @@ def passive_errors(
     seed: int,
     device: torch.device | str = "cpu",
     random_actions: bool = False,
+    history: int = 0,
 ) -> dict[int, dict[str, ErrorSummary]]:
     """Open-loop errors at every horizon, from one rollout of the longest.
 
     Passive where the source's controller makes no torque of a zero action; see
-    `action_drive`.
+    `action_drive`. Both have seen the ground truth's ``history`` steps before it.
     """
     start, scene = initial_states(source, num_trajectories, seed), scene_of(source)
     steps = max(horizons)
-    drive = action_drive(source, num_trajectories, steps, seed, random_actions)
-    both = ground_truth, other
-    paths = (open_loop(one, start.to(device), steps, drive) for one in both)
+    how = num_trajectories, history + steps, seed, random_actions
+    before = ground_truth, start.to(device), history, action_drive(source, *how)
+    start, seen, drive = motion_before(*before)
+    paths = (
+        open_loop(one, start, steps, drive, history=seen)
+        for one in (ground_truth, other)
+    )
     errors = position_errors(scene, *paths)
     return {
         horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})

@@ -56,7 +56,8 @@ class Trainer:
         folder: of the run.
         device: of model and data.
         horizons: control steps of the validation rollouts.
-        random_actions: validate under random actions in place of zero ones.
+        random_actions: validate under random actions in place of zero ones. A model that
+            learns after a history is validated after one.
         quiet: no progress bar.
         logger: see `open_logger`.
         init_from: a model whose weights and statistics the training continues, see
@@ -89,7 +90,7 @@ class Trainer:
             )
         self.scene, self.source, self.config = scene, source, config
         self.folder, self.device = writable_folder(folder), torch.device(device)
-        self.validation = source, horizons, random_actions
+        self.validation = source, horizons, random_actions, config.rollout_history
         self.quiet = quiet
         self.logger: LoggerName = logger
         torch.manual_seed(config.seed)

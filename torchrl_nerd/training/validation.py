@@ -16,12 +16,16 @@ Errors = dict[int, dict[str, ErrorSummary]]
 
 
 def validate(
-    model: NeRD, source: Source, horizons: tuple[int, ...], random_actions: bool
+    model: NeRD,
+    source: Source,
+    horizons: tuple[int, ...],
+    random_actions: bool,
+    history: int = 0,
 ) -> Errors:
     """Errors of a model on the device that it is on; see `passive_errors`."""
     both = NeRDDynamics(model), MujocoDynamics(model.scene)
-    how = {"device": model.device, "random_actions": random_actions}
-    return passive_errors(source, *both, list(horizons), ROLLOUTS, SEED, **how)
+    about = list(horizons), ROLLOUTS, SEED, model.device, random_actions, history
+    return passive_errors(source, *both, *about)
 
 
 def score(errors: Errors) -> float:

@@ -16,6 +16,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     Errors,
     action_drive,
     initial_states,
+    motion_before,
     open_loop,
     position_errors,
     scene_of,
@@ -46,6 +47,7 @@ class EvaluationSet:
     drive: Drive
     solver: str  # of the ground truth, see `mujoco_name`
     ground_truth: Tensor  # positions after each step, (n, steps, nq)
+    history: TensorDict | None = None  # what every candidate has seen before, [n, T]
 
     @property
     def scene(self) -> Scene:
@@ -56,7 +58,7 @@ class EvaluationSet:
         """Error at every step from these initial states or the set's; NaN: it diverges."""
         start = self.start if start is None else start
         steps = self.ground_truth.shape[1]
-        path = open_loop(dynamics, start, steps, self.drive, stop_at_nan=True)
+        path = open_loop(dynamics, start, steps, self.drive, True, self.history)
         return position_errors(self.scene, self.ground_truth, path)
 
     def candidate_errors(self, candidate: Candidate) -> Errors:
@@ -96,13 +98,19 @@ def evaluation_set(
     steps: int,
     seed: int,
     device: torch.device | str = "cpu",
+    history: int = 0,
 ) -> EvaluationSet:
-    """The set of one case, of which the ground truth makes the trajectories."""
+    """The set of one case, of which the ground truth makes the trajectories.
+
+    They begin after ``history`` steps of it, which all candidates see.
+    """
     start = initial_states(source, num_trajectories, seed).to(device)
-    drive = action_drive(source, num_trajectories, steps, seed, is_driven)
+    drive = action_drive(source, num_trajectories, history + steps, seed, is_driven)
     exact = ground_truth(scene_of(source))
-    path = open_loop(exact, start, steps, drive)
-    return EvaluationSet(case, source, start, drive, mujoco_name(exact.scene), path)
+    start, seen, drive = motion_before(exact, start, history, drive)
+    path = open_loop(exact, start, steps, drive, history=seen)
+    about = case, source, start, drive, mujoco_name(exact.scene)
+    return EvaluationSet(*about, path, seen)
 
 
 def measure(
