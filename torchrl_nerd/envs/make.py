@@ -20,6 +20,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.pixels import image_size
 from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.robots import make_task
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
 
@@ -28,7 +29,7 @@ class GroundTruthEnv(SceneEnv):
     """A `SceneEnv` on MuJoCo's batched rollout, dm_control's `Physics` or MuJoCo Warp.
 
     Args:
-        task: id of a registered task, or a task.
+        task: id of a registered task, a scene, or a task.
         engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``).
         num_envs, seed, dump_dir, state_dtype: see `SceneEnv`.
         device: where all tensors live, and MuJoCo Warp runs; the others use the CPU.
@@ -45,7 +46,7 @@ class GroundTruthEnv(SceneEnv):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         engine: str = "mujoco",
         num_envs: int = 1,
         seed: int | None = None,
@@ -68,7 +69,7 @@ class NeRDEnv(SceneEnv):
     TorchRL's ``compile=True`` makes each step one compiled piece, see `SceneEnv.compile`.
 
     Args:
-        task: id of a registered task, or a task.
+        task: id of a registered task, a scene, or a task.
         model: a model, or the name of one, see `from_pretrained`.
         num_envs, seed, dump_dir: see `SceneEnv`.
         state_dtype: of state and features; float32 for GPUs without a fast float64, or
@@ -92,7 +93,7 @@ class NeRDEnv(SceneEnv):
     @torch.inference_mode(False)
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         model: Model | str | Path = "nerd",
         num_envs: int = 1,
         seed: int | None = None,
@@ -124,7 +125,7 @@ class NeRDEnv(SceneEnv):
 
 
 def make_env(
-    task: str | Path | Task,
+    task: str | Path | Scene | Task,
     dynamics: str | Path = "nerd",
     num_envs: int = 1,
     seed: int | None = None,
@@ -143,7 +144,7 @@ def make_env(
 
     Args:
         task: id of a registered task, ``dm_control/DOMAIN-TASK``, ``gymnasium/ID``, a
-            task, or an MJCF file, which becomes a `SceneTask`; see `make_task`.
+            task, or a scene or MJCF file, which becomes a `SceneTask`; see `make_task`.
         dynamics: ``"nerd"`` (learned), ``"hybrid"``, ``"analytic"``, ``"mujoco"``,
             ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
             analytic step's name, or a checkpoint folder.
