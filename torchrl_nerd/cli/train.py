@@ -12,7 +12,7 @@ from torchrl_nerd.cli.options import Flat, SceneOptions
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.generate import CARD, expect_few_dropped, generate, load_data
 from torchrl_nerd.data.strategies import preset_strategy
-from torchrl_nerd.files import read_json, writable_folder
+from torchrl_nerd.files import check_writable, read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
@@ -114,7 +114,7 @@ class Train(SceneOptions, DeviceCommand):
         preset, (out, folders) = preset_of(self.scene), self.folders
         initial = self.initial(scene)
         for folder in filter(None, (out, self.export)):
-            writable_folder(folder)
+            check_writable(folder / "card.json")
         if _is_missing(folders):
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
             expect_few_dropped(read_json(folders[0] / CARD))
