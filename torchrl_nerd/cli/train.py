@@ -10,7 +10,13 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, SceneOptions
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import CARD, expect_few_dropped, generate, load_data
+from torchrl_nerd.data.generate import (
+    CARD,
+    expect_few_dropped,
+    generate,
+    load_data,
+    read_card,
+)
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import check_writable, read_json
 from torchrl_nerd.modules.nerd import NeRD
@@ -90,6 +96,8 @@ class Train(SceneOptions, DeviceCommand):
         """Which model would be trained on which data, and what exists already."""
         scene = self.load()
         out, folders = self.folders
+        for folder in () if _is_missing(folders) else folders:
+            read_card(scene, folder)
         initial = self.initial(scene)
         if initial is None:
             model = make_model(scene, self.config)
