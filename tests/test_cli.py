@@ -268,6 +268,25 @@ def test_a_folder_that_cannot_be_written_is_refused(command, tmp_path, capsys):
     assert sorted(tmp_path.iterdir()) == [place]
 
 
+@pytest.mark.parametrize(
+    "argv",
+    [
+        "train cartpole --data nowhere else",
+        "train cartpole --data d --steps 1 --sequence-length 30",
+        "train cartpole --data d --export e --init-from cartpole-mlp --network gru",
+        "finetune cartpole --from nowhere.npz",
+        "finetune cube --from {log} --update all",
+    ],
+)
+def test_a_refused_run_leaves_no_folder(argv, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    draw = "data cartpole --trajectories 8 --steps 20 --out d --quiet"
+    assert main(draw.split()) == 0
+    capsys.readouterr()
+    refusal(capsys, *argv.format(log=EXCERPT).split())
+    assert [x.name for x in tmp_path.iterdir()] == ["d"]
+
+
 def test_control_c_is_one_sentence(monkeypatch, capsys):
     def stop(command) -> None:
         raise KeyboardInterrupt

@@ -128,3 +128,21 @@ def test_other_robots_and_splits_are_refused(network, tmp_path, capsys):
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", out]
     argv += ["--model", network, "--update", "physics"]
     assert "analytic" in refusal(capsys, *argv)
+
+
+def test_training_on_recorded_trajectories_is_told_of_finetune(
+    generator, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    log = simulated(load_scene("cartpole"), generator, trajectories=6, states=12)
+    names = ("qpos", "qvel", "joint_torque")
+    arrays = {name: getattr(log, name).numpy() for name in names}
+    np.savez("log.npz", trajectory_offsets=log.offsets, **arrays)
+    assert main("data cartpole --from log.npz --out set".split()) == 0
+    capsys.readouterr()
+    for more in ([], ["--vary", "preset"]):
+        text = refusal(capsys, *"train cartpole --data set --quiet".split(), *more)
+        assert text == (
+            "nerd: expected simulated trajectories in set, got recorded ones, which "
+            "`nerd finetune --from log.npz` learns from\n"
+        )

@@ -7,6 +7,7 @@ in one sentence, of what differs.
 
 import os
 import warnings
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -121,20 +122,21 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     asked = scene.name if scene is not None and found in KINDS else found
     if asked != found or is_import(found):
         raise ValueError(_not_shipped(asked, scene if found == "hybrid" else None))
+    if Path(found).name != found:
+        raise ValueError(_no_folder(Path(found)))
     meant = did_you_mean(str(found), (*RESERVED, *STEPS, *shipped_models()))
     raise ValueError(f"unknown dynamics {str(found)!r}{meant}, expected {_known()}")
 
 
-def expect_varied(name: str | Path, scene: Scene) -> None:
-    """Raise ValueError where a model of that name steps one robot, and the scene's vary."""
-    found = model_name(name, scene)
-    folder = model_folder(found) if found in shipped_models() else Path(found)
-    is_analytic = found == "analytic" or found in STEPS
-    if is_analytic or not read_json(folder / CARD).get("variation"):
-        raise ValueError(
-            f"expected a model that learned on varied robots for the varied scene "
-            f"'{scene.name}', got '{name}', which steps one robot"
-        )
+def _no_folder(folder: Path) -> str:
+    """That a checkpoint's folder does not exist, and which there are in its place."""
+    place, cards = folder.parent.parent, list[str]()
+    if os.path.isdir(place):  # False, too, for what no path can be
+        for pattern in (f"*/{CARD}", f"*/*/{CARD}"):
+            cards += sorted(glob(pattern, root_dir=place))
+    there = ", ".join(str((place / card).parent) for card in cards[:5])
+    found = f", but checkpoints in {there}" if there else ""
+    return f"expected a checkpoint folder, found no folder {folder}{found}"
 
 
 def _not_shipped(name: str, hybrid_of: Scene | None) -> str:

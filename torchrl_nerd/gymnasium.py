@@ -27,6 +27,7 @@ from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
 from torchrl_nerd.robots import TASKS, make_task
 from torchrl_nerd.robots.registry import for_each_task
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_count
 from torchrl_nerd.tasks import Task
 
@@ -41,7 +42,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     is, with a reward of zero: Gymnasium's mode ``NEXT_STEP``.
 
     Args:
-        task: id of a task, or a task.
+        task: id of a task, a scene, or a task.
         dynamics: as for `make_env`.
         num_envs: how many envs.
         seed: of the resets, until `reset` is given another; None for a fresh one.
@@ -63,7 +64,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         dynamics: str | Path = "nerd",
         num_envs: int = 1,
         seed: int | None = None,
@@ -175,7 +176,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
     Args:
-        task: id of a task, or a task.
+        task: id of a task, a scene, or a task.
         dynamics: as for `make_env`.
         render_mode: ``"rgb_array"`` or None.
         settings: other arguments of `GymnasiumVectorEnv`, but ``num_envs``.
@@ -189,7 +190,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         dynamics: str | Path = "nerd",
         render_mode: str | None = None,
         **settings: Any,
@@ -227,7 +228,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.vector.close()
 
 
-def _shortened(task: str | Path | Task, steps: int | None) -> Task:
+def _shortened(task: str | Path | Scene | Task, steps: int | None) -> Task:
     """The task, or a copy of it with that horizon where its own is longer."""
     task = task if isinstance(task, Task) else make_task(task)
     if steps is not None:

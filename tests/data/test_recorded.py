@@ -10,6 +10,7 @@ from helpers import EXCERPT, simulated
 from torchrl_nerd import load_scene
 from torchrl_nerd.data.log_files import load_recording, read_log, write_recording
 from torchrl_nerd.data.recorded import (
+    FEWEST,
     complete,
     estimate_velocities,
     free_fall,
@@ -150,6 +151,23 @@ def test_the_split_is_the_published_one():
     assert torch.equal(torch.cat(list(split.values())).sort().values, torch.arange(510))
     order = np.random.default_rng(0).permutation(510)
     assert split["test"].tolist() == order[445:].tolist()
+
+
+@pytest.mark.parametrize(
+    ("count", "empty"), [(1, "validation and test"), (2, "validation"), (5, "test")]
+)
+def test_an_empty_split_is_named(count, empty, generator):
+    log = simulated(load_scene("cartpole"), generator, trajectories=count)
+    said = f"got a log of {count} with none for {empty}: cut it into at least 6 "
+    with pytest.raises(ValueError, match=said):
+        for members in split_trajectories(count).values():
+            log.starts(2, members)
+
+
+def test_six_trajectories_leave_no_split_empty():
+    for count in range(FEWEST - 1, 100):
+        sizes = [len(members) for members in split_trajectories(count).values()]
+        assert all(sizes) == (count >= FEWEST)
 
 
 def test_a_data_set_holds_what_was_recorded(real_cube, recording, tmp_path):

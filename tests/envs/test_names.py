@@ -42,6 +42,21 @@ def test_a_refusal_lists_all_that_there_is():
     assert "unconstrained" in said and "ant-mlp" in said
 
 
+def test_a_folder_that_is_not_there_is_told_apart_from_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = refusal(lambda: make_env(TASK, "runs/ant/best"))
+    assert said == "expected a checkpoint folder, found no folder runs/ant/best"
+    for name in ("ant", "bar", "cube", "door", "eye", "fan"):
+        folder = Path("runs", name, "last")
+        folder.mkdir(parents=True)
+        (folder / "card.json").write_text("{}")
+    said = refusal(lambda: make_env(TASK, Path("runs/ant/best")))
+    listed = ", ".join(f"runs/{x}/last" for x in ("ant", "bar", "cube", "door", "eye"))
+    assert said.endswith(f"found no folder runs/ant/best, but checkpoints in {listed}")
+    for odd in ("runs/a\0/b", f"{'x' * 300}/best/b", "\0/x/y"):
+        assert "found no folder" in refusal(lambda odd=odd: make_env(TASK, odd))
+
+
 def test_a_scene_stands_for_its_learned_model_as_it_does_in_from_pretrained():
     task, scene = "cube_slope/toss", "cube_slope"
     env, expected = make_env(task, scene), from_pretrained(scene).state_dict()

@@ -7,6 +7,8 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.envs.dm_environment import DmEnvironment
+from torchrl_nerd.gymnasium import GymnasiumEnv
 from torchrl_nerd.robots import SCENES, task_id
 from torchrl_nerd.tasks import SceneTask
 
@@ -33,6 +35,20 @@ def test_a_robots_file_is_an_env_in_every_dynamics(path, tmp_path, generator):
         state = torch.cat((found["qpos"], found["qvel"]), -1)
         assert torch.equal(found["observation"], state.float())
         assert not found["reward"].any() and not found["terminated"].any()
+
+
+@pytest.mark.parametrize("dynamics", ["mujoco", "cartpole-adaptive"])
+def test_a_scene_is_the_env_of_its_scene_task(dynamics):
+    scene = load_scene("cartpole").vary({"mass:pole": (0.5, 2.0)})
+    env = make_env(scene, dynamics, num_envs=2, seed=0)
+    assert type(env.task) is SceneTask and env.scene is scene
+    assert env.rollout(3)["next", "qpos"].isfinite().all()
+
+
+def test_a_scene_is_an_env_of_gymnasium_and_dm_env():
+    scene = load_scene("cartpole")
+    assert GymnasiumEnv(scene, "mujoco").reset(seed=0)[0].shape == (4,)
+    assert DmEnvironment(scene, "mujoco").reset().observation.shape == (4,)
 
 
 def test_a_subclass_gives_the_robot_a_reward(path):

@@ -133,6 +133,7 @@ def test_where_a_library_is_missing_the_extra_is_named(tmp_path, monkeypatch, ca
     assert said.startswith("nerd: --logger wandb needs the package wandb")
     assert said.endswith("pip install 'torchrl-nerd[wandb]'\n")
     assert said.count("\n") == 1
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_table_alone(run, results):

@@ -161,6 +161,11 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     assert main(["train", "cartpole", *vary, *how]) == 0
     card = load_checkpoint(tmp_path / "run" / "last").scene.variation.ranges
     assert card["mass:pole"] == [1.0, 1.0] and card["motor"] == [0.6, 1.4]
+    capsys.readouterr()
+    for dry in ((), ("--dry-run",)):
+        assert main(["train", "cartpole", "--vary", "preset", *run, *dry]) == 2
+        assert "expected data that vary" in capsys.readouterr().err
+    assert main(["train", "cartpole", *vary, *run, "--dry-run"]) == 0
     changing = (
         "--changes",
         "--out",

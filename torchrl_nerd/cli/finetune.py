@@ -14,7 +14,7 @@ from torchrl_nerd.cli.options import Flat, Positional, SceneName, recorded_scene
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import Model
-from torchrl_nerd.files import read_json, writable_folder, write_json
+from torchrl_nerd.files import check_writable, read_json, write_json
 from torchrl_nerd.training.finetune import ANALYTIC, FineTuner, start_model
 
 
@@ -50,7 +50,8 @@ class Finetune(DeviceCommand):
         The folder gets its checkpoint and the validation errors, ``curve.json``.
         """
         scene = recorded_scene(self.scene)
-        out = writable_folder(self.out or Path("runs") / f"{scene.name}_finetuned")
+        out = self.out or Path("runs") / f"{scene.name}_finetuned"
+        check_writable(out / CARD)
         recording, split = load_recording(self.recorded, scene)
         model = start_model(scene, self.model).to(self.device)
         made = {

@@ -10,9 +10,15 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, SceneOptions
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.data.generate import CARD, expect_few_dropped, generate, load_data
+from torchrl_nerd.data.generate import (
+    CARD,
+    expect_few_dropped,
+    generate,
+    load_data,
+    read_card,
+)
 from torchrl_nerd.data.strategies import preset_strategy
-from torchrl_nerd.files import read_json, writable_folder
+from torchrl_nerd.files import check_writable, read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
@@ -90,6 +96,8 @@ class Train(SceneOptions, DeviceCommand):
         """Which model would be trained on which data, and what exists already."""
         scene = self.load()
         out, folders = self.folders
+        for folder in () if _is_missing(folders) else folders:
+            read_card(scene, folder)
         initial = self.initial(scene)
         if initial is None:
             model = make_model(scene, self.config)
@@ -114,7 +122,7 @@ class Train(SceneOptions, DeviceCommand):
         preset, (out, folders) = preset_of(self.scene), self.folders
         initial = self.initial(scene)
         for folder in filter(None, (out, self.export)):
-            writable_folder(folder)
+            check_writable(folder / "card.json")
         if _is_missing(folders):
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
             expect_few_dropped(read_json(folders[0] / CARD))

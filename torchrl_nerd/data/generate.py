@@ -120,8 +120,8 @@ def load_data(scene: Scene, *folders: Path) -> TensorDict:
     A single chunk stays memory-mapped; several are copied to memory.
 
     Raises:
-        ValueError: a data set is missing, unfinished, corrupted, of another scene, or has
-            trajectories of another length than the first one.
+        ValueError: a data set is missing, unfinished, corrupted, recorded, of another
+            scene, or has trajectories of another length than the first one.
     """
     chunks: list[TensorDict] = []
     for folder in folders:
@@ -135,10 +135,20 @@ def load_data(scene: Scene, *folders: Path) -> TensorDict:
     return chunks[0] if len(chunks) == 1 else cast(TensorDict, TensorDict.cat(chunks))
 
 
-def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
+def read_card(scene: Scene, folder: Path) -> tuple[dict[str, Any], DataConfig]:
+    """The card of a finished data set of a scene, and its configuration.
+
+    Raises:
+        ValueError: it is missing, unfinished, recorded, or of another scene or ranges.
+    """
     if not (folder / CARD).is_file():
         raise ValueError(f"expected a data set in {folder}, found no {CARD}")
     card = read_json(folder / CARD)
+    if "source" in card:
+        raise ValueError(
+            f"expected simulated trajectories in {folder}, got recorded ones, which "
+            f"`nerd finetune --from {card['source']}` learns from"
+        )
     if card.get("scene_hash") != scene.hash:
         raise ValueError(
             f"the data in {folder} are of scene '{card.get('scene')}' "
@@ -155,6 +165,11 @@ def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
         raise ValueError(
             f"the data in {folder} are not finished: run the command again"
         )
+    return card, config
+
+
+def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
+    card, config = read_card(scene, folder)
     chunks = []
     for number in range(card["chunks_done"]):
         path = chunk_path(folder, number)

@@ -22,6 +22,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes import Scene
 
 SPLIT_SEED, TRAIN_SHARE, VALIDATION_SHARE = 0, 380 / 510, 65 / 510
+FEWEST = 6  # trajectories of which no split is empty
 CLEAR = 0.005  # m between the lowest contact point and the ground: free flight
 FLIGHT = 8  # frames at the start of a trajectory in which free fall is measured
 
@@ -73,8 +74,15 @@ class Recording:
         Of the trajectories with these ``numbers (n,)``, or of all.
 
         Raises:
-            ValueError: none is long enough.
+            ValueError: none is long enough, or a split of the log is empty.
         """
+        if numbers is not None and not len(numbers) and len(self) < FEWEST:
+            splits = split_trajectories(len(self)).items()
+            empty = " and ".join(name for name, members in splits if not len(members))
+            raise ValueError(
+                f"expected a trajectory in every split, got a log of {len(self)} with none "
+                f"for {empty}: cut it into at least {FEWEST} trajectories"
+            )
         found, bounds = [torch.zeros(0, dtype=torch.long)], self.trajectories
         for i in range(len(self)) if numbers is None else numbers.tolist():
             first, end = bounds[i].start, bounds[i].stop

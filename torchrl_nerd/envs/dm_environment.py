@@ -12,6 +12,7 @@ from torchrl_nerd.envs.actor import as_action
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.make import make_env
 from torchrl_nerd.keys import ACTION, OBSERVATION
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
 
@@ -22,7 +23,7 @@ class DmEnvironment(dm_env.Environment):
     episode that failed ends with discount 0, one that ran out of time with discount 1.
 
     Args:
-        task: id of a task, or a task.
+        task: id of a task, a scene, or a task.
         dynamics: as for `make_env`.
         seed: of the resets; drawn where none is given.
         device: where the env computes.
@@ -35,7 +36,7 @@ class DmEnvironment(dm_env.Environment):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         dynamics: str | Path = "nerd",
         seed: int | None = None,
         device: torch.device | str = "cpu",

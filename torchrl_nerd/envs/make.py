@@ -6,7 +6,14 @@ from typing import Any
 
 import torch
 
-from torchrl_nerd.checkpoint import expect_varied, from_pretrained, model_name
+from torchrl_nerd.analytic import STEPS
+from torchrl_nerd.checkpoint import (
+    CARD,
+    from_pretrained,
+    model_folder,
+    model_name,
+    shipped_models,
+)
 from torchrl_nerd.dynamics import (
     ENGINES,
     Guard,
@@ -18,8 +25,10 @@ from torchrl_nerd.dynamics import (
 )
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.pixels import image_size
+from torchrl_nerd.files import read_json
 from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.robots import make_task
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_device
 from torchrl_nerd.tasks import Task
 
@@ -28,7 +37,7 @@ class GroundTruthEnv(SceneEnv):
     """A `SceneEnv` on MuJoCo's batched rollout, dm_control's `Physics` or MuJoCo Warp.
 
     Args:
-        task: id of a registered task, or a task.
+        task: id of a registered task, a scene, or a task.
         engine: ``"mujoco"``, ``"dm_control"`` or ``"mujoco_warp"`` (extra ``warp``).
         num_envs, seed, dump_dir, state_dtype: see `SceneEnv`.
         device: where all tensors live, and MuJoCo Warp runs; the others use the CPU.
@@ -45,7 +54,7 @@ class GroundTruthEnv(SceneEnv):
 
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         engine: str = "mujoco",
         num_envs: int = 1,
         seed: int | None = None,
@@ -68,7 +77,7 @@ class NeRDEnv(SceneEnv):
     TorchRL's ``compile=True`` makes each step one compiled piece, see `SceneEnv.compile`.
 
     Args:
-        task: id of a registered task, or a task.
+        task: id of a registered task, a scene, or a task.
         model: a model, or the name of one, see `from_pretrained`.
         num_envs, seed, dump_dir: see `SceneEnv`.
         state_dtype: of state and features; float32 for GPUs without a fast float64, or
@@ -93,7 +102,7 @@ class NeRDEnv(SceneEnv):
     @torch.inference_mode(False)
     def __init__(
         self,
-        task: str | Path | Task,
+        task: str | Path | Scene | Task,
         model: Model | str | Path = "nerd",
         num_envs: int = 1,
         seed: int | None = None,
@@ -109,7 +118,7 @@ class NeRDEnv(SceneEnv):
         if not isinstance(model, Model):
             given, model = model, from_pretrained(model, task.scene)
             if task.scene.variation is not None:
-                expect_varied(given, task.scene)
+                _expect_varied(given, task.scene)
             name = model_name(given, task.scene)
         if state_dtype == torch.float32:
             kept = {id(model.scene): model.scene}
@@ -127,7 +136,7 @@ class NeRDEnv(SceneEnv):
 
 
 def make_env(
-    task: str | Path | Task,
+    task: str | Path | Scene | Task,
     dynamics: str | Path = "nerd",
     num_envs: int = 1,
     seed: int | None = None,
@@ -146,7 +155,7 @@ def make_env(
 
     Args:
         task: id of a registered task, ``dm_control/DOMAIN-TASK``, ``gymnasium/ID``, a
-            task, or an MJCF file, which becomes a `SceneTask`; see `make_task`.
+            task, or a scene or MJCF file, which becomes a `SceneTask`; see `make_task`.
         dynamics: ``"nerd"`` (learned), ``"hybrid"``, ``"analytic"``, ``"mujoco"``,
             ``"dm_control"``, ``"mujoco_warp"`` (extra ``warp``), a shipped model's name, an
             analytic step's name, or a checkpoint folder.
@@ -195,3 +204,15 @@ def _refuse_network_options(
         option = f"inference '{inference}'" if guard is None else f"guard '{guard}'"
         wanted = f"learned or hybrid dynamics for {option}"
         raise ValueError(f"expected {wanted}, got '{dynamics}'")
+
+
+def _expect_varied(name: str | Path, scene: Scene) -> None:
+    """Raise ValueError where a model of that name steps one robot, and the scene's vary."""
+    found = model_name(name, scene)
+    folder = model_folder(found) if found in shipped_models() else Path(found)
+    is_analytic = found == "analytic" or found in STEPS
+    if is_analytic or not read_json(folder / CARD).get("variation"):
+        raise ValueError(
+            f"expected a model that learned on varied robots for the varied scene "
+            f"'{scene.name}', got '{name}', which steps one robot"
+        )

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from torchrl.record.loggers import TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
-from torchrl_nerd.files import write_atomically
+from torchrl_nerd.files import writable_folder, write_atomically
 
 LoggerName = Literal["tensorboard", "wandb", "csv"]
 PROJECT = "torchrl_nerd"
@@ -93,6 +93,7 @@ def open_logger(
     Raises:
         ModuleNotFoundError: Weights & Biases is not installed.
         RuntimeError: Weights & Biases has no key.
+        ValueError: the folder cannot be written.
     """
     is_missing = find_spec(name) is None
     if name == "csv" or (name == "tensorboard" and is_missing):
@@ -106,9 +107,10 @@ def open_logger(
         )
     from wandb.errors import UsageError
 
+    save_dir = str(writable_folder(folder).resolve())
     how = {"project": PROJECT, "config": settings, "log_env_packages": False}
     try:
-        return WandbLogger(folder.name, save_dir=str(folder.resolve()), **how)
+        return WandbLogger(folder.name, save_dir=save_dir, **how)
     except UsageError as error:
         raise RuntimeError(
             f"Weights & Biases: {error} WANDB_MODE=offline needs no key."

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.configs import TrainConfig
-from torchrl_nerd.files import read_json, writable_folder, write_json
+from torchrl_nerd.files import check_writable, read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
@@ -65,7 +65,8 @@ class Trainer:
         compile: compile network and loss of one step.
 
     Raises:
-        ValueError: a folder of another run, short trajectories, or a misfit ``init_from``.
+        ValueError: a folder of another run or that cannot be written, short trajectories,
+            or a misfit ``init_from``.
     """
 
     def __init__(
@@ -89,7 +90,8 @@ class Trainer:
                 f"got {data.batch_size[1]}"
             )
         self.scene, self.source, self.config = scene, source, config
-        self.folder, self.device = writable_folder(folder), torch.device(device)
+        check_writable(folder / STATE)
+        self.folder, self.device = folder, torch.device(device)
         self.validation = source, horizons, random_actions, config.rollout_history
         self.quiet = quiet
         self.logger: LoggerName = logger
