@@ -64,6 +64,7 @@ LENGTH = 1000  # control steps along a policy
 ALONG = "along a policy"  # the case
 HORIZONS = (20, 100)  # of the errors, control steps
 ZEROED = "learned, its last layer zero"
+BF16 = "learned, bf16"
 Errors = dict[str, dict[str, dict[str, float]]]
 """Name -> case, horizon and unit -> mean, final and 95th percentile of the error."""
 
@@ -180,30 +181,44 @@ def by_unit(rows: Sequence[ErrorRow]) -> Errors:
 
 
 def compare(scene: Scene, model: Path, cfg: Config) -> dict[str, Any]:
-    """Errors, rates, and where nothing is both faster and more exact than the model."""
+    """Errors, rates, and where nothing is both faster and more exact than the model.
+
+    In float32, and with the matrices of its blocks in bfloat16.
+    """
     engines = simulators(scene, threads=1)
-    learned = models(scene, [str(model)], variants=("compiled",))
+    learned = models(scene, [str(model)], variants=("compiled", "bf16"))
     zeroed = without_network(cast(NeRD, load_checkpoint(model, scene)))
     off = Candidate(ZEROED, "learned", lambda _: NeRDDynamics(zeroed))
-    rows = errors_of(scene, [*engines, learned[0], off], cfg)
+    # eager and compiled in float32, then in bfloat16
+    full, full_compiled, half, half_compiled = learned
+    rows = errors_of(scene, [*engines, full, half, off], cfg)
     moving = [c for c in (*engines, *learned) if c.kind != "baseline"]
     about = scene, cfg.batch, cfg.rounds, cfg.test_seed
     rates = {row.name: row.steps_per_s for row in rate_rows(moving, *about)}
-    name, compiled = (c.name for c in learned)
-    errors, own = by_unit(rows), rates.pop(compiled)
-    faster = rates | {name: max(own, rates[name])}
-    places = list(errors[name])
-    front = {
-        where: name
-        in pareto_front({k: (errors[k][where]["mean"], faster[k]) for k in faster})
-        for where in places
+    errors = by_unit(rows)
+    shown = {full.name: "learned", half.name: BF16}
+    compiled = {
+        "learned": rates.pop(full_compiled.name),
+        BF16: rates.pop(half_compiled.name),
     }
-    shown = {name: "learned"}
+    errors = {shown.get(k, k): v for k, v in errors.items()}
+    rates = {shown.get(k, k): v for k, v in rates.items()}
+    theirs = {k: rates[k] for k in rates if k not in compiled}
+    front: dict[str, dict[str, bool]] = {}
+    for name, own in compiled.items():
+        speeds = theirs | {name: max(own, rates[name])}
+        for where in errors[name]:
+            points = {
+                k: (errors[k][where]["mean"], speed) for k, speed in speeds.items()
+            }
+            front.setdefault(name, {})[where] = name in pareto_front(points)
     return {
         "ground_truth": next(r.name for r in rows if r.kind == GROUND_TRUTH),
-        "errors": {shown.get(k, k): v for k, v in errors.items()},
-        "rates": {shown.get(k, k): v for k, v in rates.items()} | {"compiled": own},
-        "on_the_front": front,
+        "errors": errors,
+        "rates": rates
+        | {"compiled": compiled["learned"], "compiled bf16": compiled[BF16]},
+        "on_the_front": front["learned"],
+        "on_the_front_in_bf16": front[BF16],
     }
 
 
@@ -218,7 +233,8 @@ def main(cfg: Config) -> None:
     for name, found in results["errors"].items():
         means = ", ".join(f"{x['mean']:.3g}" for x in found.values())
         print(f"{name}: {means}; {results['rates'].get(name, 0.0):,.0f} steps/s")
-    print(results["on_the_front"], f"compiled {results['rates']['compiled']:,.0f}")
+    print({k: f"{results['rates'][k]:,.0f}" for k in ("compiled", "compiled bf16")})
+    print({k: v for k, v in results.items() if k.startswith("on_the_front")})
     if cfg.json is not None:
         how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
         how["policy"] = None if cfg.policy is None else cfg.policy.name

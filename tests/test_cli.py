@@ -211,7 +211,7 @@ def test_an_unknown_scene_is_refused(command, capsys):
     [
         ("data cartpole --trajectories -5", "trajectories of at least 1, got -5"),
         ("data cartpole --steps 0", "steps of at least 1, got 0"),
-        ("data cube --from a.npz --policy p", "--policy without --from"),
+        ("data cube --from a.npz --policy p", "--changes without --from"),
         ("train cartpole --steps -1", "steps of at least 0, got -1"),
         ("train cartpole --batch-size -8", "batch_size of at least 1, got -8"),
         ("train cartpole --network huge", "unknown network 'huge'"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import tables
 import torch
-from open_loop import Config, along_policy, by_unit, main, policy_set
+from open_loop import BF16, Config, along_policy, by_unit, main, policy_set
 
 from torchrl_nerd import make_env
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -76,7 +76,9 @@ def test_a_robot_of_seconds(tmp_path):
     for where, error in errors["learned"].items():
         assert 0.0 < error["mean"] <= error["p95"], where
         assert found["on_the_front"][where] in (True, False)
-    assert found["rates"]["compiled"] > 0.0
+        assert found["on_the_front_in_bf16"][where] in (True, False)
+        assert found["errors"][BF16][where]["mean"] != error["mean"]
+    assert min(found["rates"]["compiled"], found["rates"]["compiled bf16"]) > 0.0
     table = tables.open_loop_table(tmp_path)
     assert (
         "| Hopper-v5 | passive |" in table

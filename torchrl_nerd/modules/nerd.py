@@ -10,6 +10,7 @@
 The drive is the joint torque and servos' controls. NeRD (CoRL 2025), sections 3.2 to 3.4.
 """
 
+import copy
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -195,13 +196,16 @@ class NeRD(nn.Module):
                 f"expected a ground with the features {dict(sizes)} that the model was "
                 f"trained on, got one with {dict(other)}"
             )
-        model.network.to(self.dtype)
+        model.network = copy.deepcopy(self.network)  # in the precisions that it has
         model.load_state_dict(self.state_dict())
         model.reference_ratio = self.reference_ratio
         return model.to(self.device).train(self.training)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> "NeRD":
-        """Move everything, but cast only the network: constants stay float64."""
+        """Move everything, but cast only the network: constants stay float64.
+
+        bfloat16 is for the inner matrices alone, see `modules.linear`.
+        """
 
         def move(x: Tensor) -> Tensor:
             return x.to(fn(x).device)
@@ -213,7 +217,7 @@ class NeRD(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """What the network computes in."""
+        """What the network is given and gives; its inner matrices may be bfloat16."""
         return next(self.network.parameters()).dtype
 
     @property

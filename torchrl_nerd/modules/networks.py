@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.modules.linear import FullLinear
 from torchrl_nerd.modules.transformer import (
     FeedForward,
-    FullLinear,
     TransformerConfig,
     initialize,
     make_head,
@@ -117,16 +117,18 @@ class GRU(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
-        return self.head(self.gru(self.embed(tokens))[0])
+        inputs = self.embed(tokens).to(next(self.gru.parameters()).dtype)
+        return self.head(self.gru(inputs)[0])
 
     def empty_memory(self, rows: int) -> HiddenState:
         """A hidden state of zeros for ``rows`` rows."""
         shape = (self.config.layers, rows, self.config.width)
-        return HiddenState(self.embed.weight.new_zeros(shape))
+        return HiddenState(next(self.gru.parameters()).new_zeros(shape))
 
     def step(self, token: Tensor, memory: HiddenState) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
-        inputs = self.embed(token)[:, None]  # (rows, 1, width)
+        # (rows, 1, width)
+        inputs = self.embed(token)[:, None].to(next(self.gru.parameters()).dtype)
         output, value = self.gru(inputs, memory.value)
         memory.value = stored(memory.value, value)
         return self.head(output[:, 0])

@@ -18,6 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_nerd.modules.linear import FullLinear, InnerLinear
+
 MASKED = float("-inf")
 HEAD_WIDTH = 64  # paper, appendix A
 # Widest band whose step is made of sums of products: a product of matrices of one row is
@@ -136,8 +138,8 @@ class Attention(nn.Module):
         super().__init__()
         self.heads, self.band = config.heads, config.band
         self.scale = (config.width // config.heads) ** -0.5
-        self.project = nn.Linear(config.width, 3 * config.width, bias=False)
-        self.output = nn.Linear(config.width, config.width, bias=False)
+        self.project = InnerLinear(config.width, 3 * config.width, bias=False)
+        self.output = InnerLinear(config.width, config.width, bias=False)
         self.offset_bias = nn.Parameter(torch.zeros(config.heads, config.band))
 
     def _split(self, x: Tensor) -> tuple[Tensor, ...]:
@@ -187,8 +189,8 @@ class FeedForward(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.expand = nn.Linear(width, 4 * width, bias=False)
-        self.contract = nn.Linear(4 * width, width, bias=False)
+        self.expand = InnerLinear(width, 4 * width, bias=False)
+        self.contract = InnerLinear(4 * width, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """``(*batch, width)``."""
@@ -209,22 +211,6 @@ class Block(FeedForward):
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
         """``(rows, width)``."""
         return super().forward(x + self.attention.step(x, cache, layer))
-
-
-class FullLinear(nn.Linear):
-    """A linear layer that autocast leaves in the weights' own precision.
-
-    For the ends of a network: a gap or a change of speed that is rounded to the 8 bits of
-    bfloat16 is off by up to 0.4%, while roundings inside the network average out.
-    """
-
-    def forward(self, input: Tensor) -> Tensor:
-        """``(*batch, in) -> (*batch, out)``."""
-        device = input.device.type
-        if not torch.is_autocast_enabled(device):
-            return super().forward(input)
-        with torch.autocast(device, enabled=False):
-            return super().forward(input.to(self.weight.dtype))
 
 
 def make_head(width: int, num_outputs: int) -> nn.Sequential:

@@ -127,7 +127,10 @@ def _ways(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidat
         elif not isinstance(model, NeRD):
             continue
         elif variant == "bf16":
-            yield _candidate(label, copy.deepcopy(model).to(torch.bfloat16))
+            rounded = copy.deepcopy(model).to(torch.bfloat16)
+            yield _candidate(label, rounded)
+            if "compiled" in variants:
+                yield _candidate(f"{name}, compiled bf16", rounded, compile=True)
         elif isinstance(model.network, CausalTransformer):
             yield _candidate(label, model, inference="window")
 

@@ -1,0 +1,43 @@
+"""Linear layers of a network whose inner matrices may be bfloat16.
+
+`NeRD.to(torch.bfloat16)` rounds the matrices of its blocks alone. A gap or a change of
+speed that is rounded to the 8 bits of bfloat16 is off by up to 0.4%, while roundings inside
+the network average out. Products are summed in float32 by the processor.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+
+class FullLinear(nn.Linear):
+    """For the ends of a network: at least float32, whatever autocast or ``to`` says."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(*batch, in) -> (*batch, out)``, in the precision of the weights."""
+        input, device = input.to(self.weight.dtype), input.device.type
+        if not torch.is_autocast_enabled(device):
+            return super().forward(input)
+        with torch.autocast(device, enabled=False):
+            return super().forward(input)
+
+    def _apply(
+        self, fn: Callable[[Tensor], Tensor], recurse: bool = True
+    ) -> "FullLinear":
+        def apply(x: Tensor) -> Tensor:
+            moved = fn(x)
+            return moved if moved.dtype.itemsize >= 4 else x.to(moved.device)
+
+        super()._apply(apply, recurse)
+        return self
+
+
+class InnerLinear(nn.Linear):
+    """For blocks: may be bfloat16 where what it multiplies is not."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(*batch, in) -> (*batch, out)``, in the precision of the input."""
+        if self.weight.dtype != torch.bfloat16:
+            return super().forward(input)
+        return super().forward(input.bfloat16()).to(input.dtype)
