@@ -127,22 +127,29 @@ define LEARN_CHANGES
 	$(NERD) train $(1) $(ADAPTIVE) $(LONG) --data datasets/$(1)_changing \
 		--init-from runs/$(1)_$(2)/last --steps 3000 --lr 0.004 --adamw-lr 0.0012 \
 		--rollout-steps 0 --save-every 250 --out runs/$(1)_changing
-	$(NERD) train $(1) $(ADAPTIVE) $(LONG) --data datasets/$(1)_changing \
-		--init-from runs/$(1)_changing/last --steps $(3) --lr 0.004 --adamw-lr 0.0012 \
-		--rollout-steps $(4) --rollout-length 40 --rollout-batch-size 128 \
-		--save-every 50 --out runs/$(1)_adaptive
-	mkdir -p $(PRETRAINED)/$(1)-adaptive
-	cp runs/$(1)_adaptive/last/* $(PRETRAINED)/$(1)-adaptive/
 endef
 
-model-double_pendulum-adaptive: varied-double_pendulum ## pendulums that find their hidden parameters
-	$(call LEARN_CHANGES,double_pendulum,third,2000,200)
+define LEARN_ROLLOUTS
+	$(NERD) train $(1) $(ADAPTIVE) $(LONG) --data datasets/$(1)_changing \
+		--init-from runs/$(1)_changing/last --steps $(2) --lr 0.004 --adamw-lr 0.0012 \
+		--rollout-steps $(3) --rollout-length 40 --rollout-batch-size 128 \
+		--save-every 50 --out runs/$(1)_adaptive
+endef
 
-model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, with one stage more
+SHIP_ADAPTIVE = mkdir -p $(PRETRAINED)/$(1)-adaptive && cp runs/$(1)_adaptive/last/* $(PRETRAINED)/$(1)-adaptive/
+
+model-double_pendulum-adaptive: varied-double_pendulum ## pendulums that find their hidden parameters
+	$(call LEARN_CHANGES,double_pendulum,third)
+	$(call LEARN_ROLLOUTS,double_pendulum,2000,200)
+	$(call SHIP_ADAPTIVE,double_pendulum)
+
+model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequences grow earlier
 	$(NERD) train cartpole $(ADAPTIVE) $(LONG) --data datasets/cartpole_varied \
 		--init-from runs/cartpole_third/last --steps 2000 --lr 0.003 --adamw-lr 0.001 \
 		--rollout-steps 0 --save-every 100 --out runs/cartpole_long
-	$(call LEARN_CHANGES,cartpole,long,1000,250)
+	$(call LEARN_CHANGES,cartpole,long)
+	$(call LEARN_ROLLOUTS,cartpole,1000,250)
+	$(call SHIP_ADAPTIVE,cartpole)
 
 model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
 	$(NERD) data ant --trajectories 30000 --out datasets/ant

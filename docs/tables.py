@@ -243,7 +243,8 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
         }
         names = dict.fromkeys(name for _, name, _ in found)
         lengths = sorted({length for *_, length in found})
-        parts.append(f"### {robot}")
+        title = robot.replace("_changing", ", the shipped model")
+        parts.append(f"### {title}")
         for steps in ("20", "100"):
             first = found["inside", next(iter(names)), lengths[0]]["errors"][steps]
             quantity = list(first)[-1]
