@@ -345,7 +345,7 @@ def policies_table(folder: Path = RESULTS) -> str:
 def open_loop_table(folder: Path = RESULTS) -> str:
     """Third-party robots: a network beside MuJoCo at few substeps, and their rates."""
     head = ["robot", "actions", "network", "no motion", "MuJoCo, 1 substep"]
-    head += ["4 substeps", "network's rate", "1 substep", "its own", "front"]
+    head += ["4 substeps", "network's rate", "1 substep", "its own", "front", "in bf16"]
     lines, records = [], read("open_loop", folder)
     for robot, record in records.items():
         found = record["results"]
@@ -358,12 +358,17 @@ def open_loop_table(folder: Path = RESULTS) -> str:
         fastest = max((rates[k] for k in rivals[0]), default=None)
         speeds = rates["compiled"], fastest, rates[exact]
         shown = [rate(x) for x in speeds]
+        if (half := rates.get("compiled bf16")) is not None:
+            shown[0] += f", bf16 {rate(half)}"
         for case in dict.fromkeys(k.split(", ")[0] for k in errors["learned"]):
             columns = [["learned"], ["no motion"], *rivals]
             cells = (short_and_long(errors, names, case) for names in columns)
-            front = [v for k, v in found["on_the_front"].items() if k.startswith(case)]
-            place = f"{sum(front)} of {len(front)}"
-            lines.append([robot, case, *cells, *shown, place])
+            places = (found.get(k) for k in ("on_the_front", "on_the_front_in_bf16"))
+            fronts = (
+                [v for k, v in (p or {}).items() if k.startswith(case)] for p in places
+            )
+            place = [f"{sum(x)} of {len(x)}" if x else "-" for x in fronts]
+            lines.append([robot, case, *cells, *shown, *place])
     return with_sources([head, *lines], records.values())
 
 
