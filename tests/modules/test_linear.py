@@ -1,4 +1,4 @@
-"""bfloat16 is for the inner matrices of a network alone."""
+"""bfloat16 is for inner matrices, not for the ends of a network."""
 
 import copy
 from dataclasses import replace
