@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.modules.linear import FullLinear
 from torchrl_nerd.modules.networks import NoMemory
 from torchrl_nerd.modules.transformer import (
     CausalTransformer,
-    FullLinear,
     TransformerConfig,
 )
 
