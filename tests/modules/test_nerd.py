@@ -82,7 +82,8 @@ def test_casting_a_model_casts_its_network_only(scene, dtype, generator):
     model = random_model(scene, generator).to(dtype)
     state, torques, terrain = random_drive(scene, ROWS, 1, generator)
     token = model.encode(state["qpos"], state["qvel"], torques[0], terrain).token
-    assert token.dtype == dtype
+    # the ends of a network stay float32
+    assert token.dtype == (torch.float32 if dtype == torch.bfloat16 else dtype)
     for buffer in model.normalize.buffers():
         assert buffer.dtype == torch.float64
 

@@ -37,7 +37,8 @@ class InnerLinear(nn.Linear):
     """For blocks: may be bfloat16 where what it multiplies is not."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """``(*batch, in) -> (*batch, out)``, in the precision of the input."""
-        if self.weight.dtype != torch.bfloat16:
+        """``(*batch, in) -> (*batch, out)``, in autocast's precision or the input's."""
+        is_cast = torch.is_autocast_enabled(input.device.type)
+        if is_cast or self.weight.dtype != torch.bfloat16:
             return super().forward(input)
         return super().forward(input.bfloat16()).to(input.dtype)
