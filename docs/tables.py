@@ -7,7 +7,7 @@ A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stabili
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -344,9 +344,17 @@ def policies_table(folder: Path = RESULTS) -> str:
 
 def open_loop_table(folder: Path = RESULTS) -> str:
     """Third-party robots: a network beside MuJoCo at few substeps, and their rates."""
-    head = ["robot", "actions", "network", "no motion", "MuJoCo, 1 substep"]
-    head += ["4 substeps", "network's rate", "1 substep", "its own", "front", "in bf16"]
+    head = [
+        "robot",
+        "motion",
+        "network",
+        "no motion",
+        "MuJoCo, 1 substep",
+        "4 substeps",
+    ]
     lines, records = [], read("open_loop", folder)
+    rated = [["robot", "network", "in bf16", "MuJoCo, 1 substep", "its own substeps"]]
+    rated[0] += ["front", "front, bf16"]
     for robot, record in records.items():
         found = record["results"]
         errors, rates, exact = (found[k] for k in ("errors", "rates", "ground_truth"))
@@ -356,20 +364,23 @@ def open_loop_table(folder: Path = RESULTS) -> str:
         ]
         rivals = [[k for k in same if k != exact] for same in coarse]
         fastest = max((rates[k] for k in rivals[0]), default=None)
-        speeds = rates["compiled"], fastest, rates[exact]
-        shown = [rate(x) for x in speeds]
-        if (half := rates.get("compiled bf16")) is not None:
-            shown[0] += f", bf16 {rate(half)}"
-        for case in dict.fromkeys(k.split(", ")[0] for k in errors["learned"]):
+        speeds = rates["compiled"], rates.get("compiled bf16"), fastest, rates[exact]
+        cases = list(dict.fromkeys(k.split(", ")[0] for k in errors["learned"]))
+        for case in cases:
             columns = [["learned"], ["no motion"], *rivals]
             cells = (short_and_long(errors, names, case) for names in columns)
-            places = (found.get(k) for k in ("on_the_front", "on_the_front_in_bf16"))
-            fronts = (
-                [v for k, v in (p or {}).items() if k.startswith(case)] for p in places
-            )
-            place = [f"{sum(x)} of {len(x)}" if x else "-" for x in fronts]
-            lines.append([robot, case, *cells, *shown, *place])
-    return with_sources([head, *lines], records.values())
+            lines.append([robot, case, *cells])
+        fronts = (found.get(k) for k in ("on_the_front", "on_the_front_in_bf16"))
+        places = (", ".join(places_of(x, cases)) if x else "-" for x in fronts)
+        rated.append([robot, *map(rate, speeds), *places])
+    return "\n\n".join((rows([head, *lines]), with_sources(rated, records.values())))
+
+
+def places_of(front: dict[str, bool], cases: list[str]) -> Iterator[str]:
+    """In how many horizons and units a network is on the front, case by case."""
+    for case in cases:
+        own = [is_on for place, is_on in front.items() if place.startswith(case)]
+        yield f"{sum(own)}/{len(own)}"
 
 
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
