@@ -353,7 +353,7 @@ def open_loop_table(folder: Path = RESULTS) -> str:
         "4 substeps",
     ]
     lines, records = [], read("open_loop", folder)
-    rated = [["robot", "network", "in bf16", "MuJoCo, 1 substep", "its own substeps"]]
+    rated = [["robot", "network / in bf16", "MuJoCo, 1 substep", "its own"]]
     rated[0] += ["front", "front, bf16"]
     for robot, record in records.items():
         found = record["results"]
@@ -364,7 +364,8 @@ def open_loop_table(folder: Path = RESULTS) -> str:
         ]
         rivals = [[k for k in same if k != exact] for same in coarse]
         fastest = max((rates[k] for k in rivals[0]), default=None)
-        speeds = rates["compiled"], rates.get("compiled bf16"), fastest, rates[exact]
+        own = [rate(rates.get(k)) for k in ("compiled", "compiled bf16")]
+        speeds = [" / ".join(own), rate(fastest), rate(rates[exact])]
         cases = list(dict.fromkeys(k.split(", ")[0] for k in errors["learned"]))
         for case in cases:
             columns = [["learned"], ["no motion"], *rivals]
@@ -372,7 +373,7 @@ def open_loop_table(folder: Path = RESULTS) -> str:
             lines.append([robot, case, *cells])
         fronts = (found.get(k) for k in ("on_the_front", "on_the_front_in_bf16"))
         places = (", ".join(places_of(x, cases)) if x else "-" for x in fronts)
-        rated.append([robot, *map(rate, speeds), *places])
+        rated.append([robot, *speeds, *places])
     return "\n\n".join((rows([head, *lines]), with_sources(rated, records.values())))
 
 
