@@ -23,8 +23,7 @@ import torch
 import tyro
 from network_off import without_network
 from policies_in_the_model import SEGMENT, pieces_along
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict
 from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import load_checkpoint
@@ -55,7 +54,6 @@ from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.commands import drive
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.training.trainer import Trainer
 
@@ -137,13 +135,9 @@ def policy_set(scene: Scene, cfg: Config) -> EvaluationSet:
     chosen = torch.randperm(len(pieces), generator=fold_in(cfg.test_seed, 2))
     pieces = cast(TensorDict, pieces[chosen[: cfg.test_trajectories]])
     command = pieces[JOINT_TORQUE] if scene.servos is None else pieces[CTRL]
-
-    def act(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
-        return drive(scene, command[:, step], state[QPOS], state[QVEL])
-
-    start, exact = pieces.select(QPOS, QVEL)[:, 0], MujocoDynamics(scene)
-    path = open_loop(exact, cast(TensorDict, start), STEPS, act)
-    return EvaluationSet(ALONG, scene, start, act, mujoco_name(scene), path)
+    start = cast(TensorDict, pieces.select(QPOS, QVEL)[:, 0])
+    path = open_loop(MujocoDynamics(scene), start, STEPS, command)
+    return EvaluationSet(ALONG, scene, start, command, mujoco_name(scene), path)
 
 
 def errors_of(

@@ -1,10 +1,12 @@
 """``nerd`` on recorded logs: data, finetune, eval, and refusals in one sentence."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import EXCERPT, simulated
+from torch import Generator
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
@@ -90,12 +92,17 @@ def test_what_was_fine_tuned_is_measured(update, network, tmp_path, capsys):
     assert "ContactNets" in capsys.readouterr().out
 
 
-def test_any_robots_log_goes_through_all_commands(generator, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    log = simulated(load_scene("cartpole"), generator, trajectories=12, states=12)
+def write_cartpole_log(path: Path, generator: Generator, trajectories: int) -> None:
+    """Trajectories of 12 states each, under random forces."""
+    log = simulated(load_scene("cartpole"), generator, trajectories, states=12)
     names = ("qpos", "qvel", "joint_torque")
     arrays = {name: getattr(log, name).numpy() for name in names}
-    np.savez("log.npz", trajectory_offsets=log.offsets, **arrays)
+    np.savez(path, trajectory_offsets=log.offsets, **arrays)
+
+
+def test_any_robots_log_goes_through_all_commands(generator, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_cartpole_log(Path("log.npz"), generator, trajectories=12)
     assert main("data cartpole --from log.npz --out set".split()) == 0
     argv = "finetune cartpole --from log.npz --out run --states 10".split()
     assert main([*argv, *TINY]) == 0
@@ -134,10 +141,7 @@ def test_training_on_recorded_trajectories_is_told_of_finetune(
     generator, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    log = simulated(load_scene("cartpole"), generator, trajectories=6, states=12)
-    names = ("qpos", "qvel", "joint_torque")
-    arrays = {name: getattr(log, name).numpy() for name in names}
-    np.savez("log.npz", trajectory_offsets=log.offsets, **arrays)
+    write_cartpole_log(Path("log.npz"), generator, trajectories=6)
     assert main("data cartpole --from log.npz --out set".split()) == 0
     capsys.readouterr()
     for more in ([], ["--vary", "preset"]):

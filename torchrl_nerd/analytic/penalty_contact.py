@@ -62,11 +62,9 @@ class PenaltyContactStep(AnalyticStep):
         config = PenaltyContactConfig(*given)
         super().__init__(scene, config, num_outer_steps * scene.layout.nv)
         if scene.model.opt.integrator != EULER:
-            name = mujoco.mjtIntegrator(scene.model.opt.integrator).name
-            name = name.removeprefix("mjINT_")
-            found = name if name == "RK4" else name.lower()  # as in an MJCF file
             raise ValueError(
-                f"expected substeps of Euler, got {found} in scene '{scene.name}'"
+                f"expected substeps of Euler, got {scene.integrator} in scene "
+                f"'{scene.name}'"
             )
         substeps = max(1, scene.substeps // merged_substeps)
         if num_outer_steps < 1 or substeps % num_outer_steps:

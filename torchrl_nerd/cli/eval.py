@@ -12,8 +12,8 @@ from torchrl_nerd.cli.options import (
     Positional,
     SceneName,
     Vary,
-    ranges_of,
     recorded_scene,
+    varied_ranges,
 )
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
@@ -113,7 +113,7 @@ class Eval(MeasuringCommand):
             raise ValueError("expected --data with --baselines, --split or --states")
         expect_at_least(2, num_trajectories=self.num_trajectories)
         expect_at_least(0, history=self.history)
-        scene, ranges = load_scene(self.scene), ranges_of(self.scene, self.vary)
+        scene, ranges = load_scene(self.scene), varied_ranges(self.scene, self.vary)
         protocol = protocol_of(scene)
         if ranges:
             cases = {k: source.vary(ranges) for k, source in protocol.cases.items()}

@@ -35,7 +35,7 @@ Vary = Annotated[
 ]
 
 
-def ranges_of(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
+def varied_ranges(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
     """Parameters and ranges of a robot by what ``--vary`` says.
 
     Raises:
@@ -77,7 +77,7 @@ class SceneOptions:
         Raises:
             ValueError: no such scene, parameter or range.
         """
-        scene, ranges = load_scene(self.scene), ranges_of(self.scene, self.vary)
+        scene, ranges = load_scene(self.scene), varied_ranges(self.scene, self.vary)
         scene = scene.reference if self.reference else scene
         return scene.vary(ranges) if ranges else scene
 

@@ -106,8 +106,9 @@ def states_of(
     state: TensorDictBase = start.select(QPOS, QVEL, PARAMETERS, strict=False)
     if command is None:
         command = idle(dynamics.scene, len(start), 1).to(start[QPOS])
-    dynamics.reset(state)
-    if history is not None:
+    if history is None:
+        dynamics.reset(state)
+    else:
         warm_up(dynamics, history, len(start))
     for step in range(steps):
         if callable(command):

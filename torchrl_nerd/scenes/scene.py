@@ -145,6 +145,13 @@ class Scene:
         varied = Variation(self.model, self.actuated, ranges) if ranges else None
         return replace(self, variation=varied)
 
+    @property
+    def integrator(self) -> str:
+        """Of its MuJoCo, as in MJCF: ``Euler``, ``RK4``, ``implicitfast``, ..."""
+        name = str(mujoco.mjtIntegrator(self.model.opt.integrator).name)
+        name = name.removeprefix("mjINT_")
+        return {"EULER": "Euler", "RK4": "RK4"}.get(name, name.lower())
+
     @cached_property
     def reference(self) -> "Scene":
         """The reference solver's scene: MuJoCo's RK4, four substeps in one of its own."""

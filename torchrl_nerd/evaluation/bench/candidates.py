@@ -60,9 +60,8 @@ class NoMotion(Memoryless):
 
 def mujoco_name(scene: Scene) -> str:
     """Integrator and substeps of a scene's MuJoCo, as its row is called."""
-    name = mujoco.mjtIntegrator(scene.model.opt.integrator).name.removeprefix("mjINT_")
-    name = {"EULER": "Euler", "RK4": "RK4"}.get(name, name.lower())
-    return f"MuJoCo {name}, {scene.substeps} substep{'s' * (scene.substeps != 1)}"
+    count = f"{scene.substeps} substep{'s' * (scene.substeps != 1)}"
+    return f"MuJoCo {scene.integrator}, {count}"
 
 
 def simulators(scene: Scene, threads: int | None = None) -> list[Candidate]:

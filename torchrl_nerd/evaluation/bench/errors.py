@@ -44,7 +44,7 @@ class EvaluationSet:
     case: str
     source: Source  # whose initial states and controller
     start: TensorDict  # initial states, [n]
-    drive: Drive
+    drive: Tensor | Drive  # see `states_of`
     solver: str  # of the ground truth, see `mujoco_name`
     ground_truth: Tensor  # positions after each step, (n, steps, nq)
     history: TensorDict | None = None  # what every candidate has seen before, [n, T]
