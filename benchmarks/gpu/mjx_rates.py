@@ -17,8 +17,7 @@ from torch import Tensor
 from gpu.rates import states
 from gpu.stages import Item, Setup, rate
 from torchrl_nerd import load_scene, make_env
-from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.dynamics.base import Memoryless
+from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
 from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.keys import QPOS, QVEL
@@ -66,7 +65,7 @@ def compile_all(names: tuple[str, ...], sizes: tuple[int, ...]) -> dict[str, flo
     }
 
 
-class MjxDynamics(Memoryless):
+class MjxDynamics(Dynamics):
     """MJX as dynamics, float32 as on its GPUs; states pass through the host.
 
     Args:

@@ -66,8 +66,8 @@ def watch(model: NeRD, data: TensorDict) -> Watched:
     for now in data.unbind(1):
         state = now.select(QPOS, QVEL, PARAMETERS)
         given = (now.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
-        after, distance = dynamics.scored_step(state, *given)
-        unlike.append(distance)
+        after = dynamics.step(state, *given, is_scored=True)
+        unlike.append(after["ood_score"])
         miss = (after[QVEL] - now[NEXT_QVEL]) / scale
         errors.append(miss.square().mean(-1).sqrt())
         hidden.append(torch.cat(seen, -1))

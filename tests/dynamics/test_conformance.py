@@ -229,6 +229,7 @@ def test_a_model_answers_where_it_was_asked(scene, inference, monkeypatch, gener
     dynamics.reset(after)
     for torque in torques:
         dynamics.reset(after, random_mask(ROWS, generator))
-        after, distance = dynamics.scored_step(after, torque, terrain)
-        assert {x.device.type for x in (*after.values(), distance)} == {"cpu"}
+        after = dynamics.step(after, torque, terrain, is_scored=True)
+        assert set(after.keys()) == {"qpos", "qvel", "ood_score"}
+        assert {x.device.type for x in after.values()} == {"cpu"}
     assert dynamics.model.device.type == "meta"

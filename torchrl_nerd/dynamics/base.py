@@ -1,6 +1,6 @@
 """The interface of all dynamics: state, torque and controls in, next state out."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any, Protocol
 
 import mujoco
@@ -19,23 +19,24 @@ class Dynamics(Protocol):
     """What an env needs of physics. A state holds ``qpos`` and ``qvel``, float64.
 
     The next state is on the device of the state before, wherever the dynamics computes.
-    ``kind`` is ``"ground truth"``, ``"learned"``, ``"hybrid"`` or ``"analytic"``.
+    ``kind`` is ``"ground truth"``, ``"learned"``, ``"hybrid"`` or ``"analytic"``. A
+    subclass that keeps no past has `step` alone to give.
     """
 
     scene: Scene
     kind: str
 
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all envs)."""
-        ...
 
     def history(self) -> Any:
         """A copy of the past that is kept of all envs, for `restore`."""
-        ...
 
     def restore(self, history: Any, rows: Tensor) -> None:
         """Give ``rows`` (bool ``(num_envs,)``) back the past they had at `history`."""
-        ...
 
     def step(
         self,
@@ -59,7 +60,7 @@ class Dynamics(Protocol):
             A new tensordict; envs that the physics could not step are not finite. The
             ground truth of a model that senses forces adds ``sensordata``.
         """
-        ...
+        raise NotImplementedError
 
 
 def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
@@ -89,36 +90,44 @@ def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
         dynamics.step(state, *given)
 
 
-class Memoryless:
-    """`Dynamics` that keeps no past: what is left to give is ``step``."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """See `Dynamics.reset`; there is no past."""
-
-    def history(self) -> None:
-        """See `Dynamics.history`; there is none."""
-
-    def restore(self, history: object, rows: Tensor) -> None:
-        """See `Dynamics.restore`; there is no past."""
-
-
-class Engine(ABC):
-    """`Dynamics` of the ground truth.
+class Engine(Dynamics):
+    """The ground truth.
 
     With ``ctrl`` the robot's own actuators act in every substep. Without it they are off,
-    and the joint torque is held.
+    and the joint torque is held. A copy, such as one in another process, makes what it
+    steps with anew and goes on with the same past.
+
+    Args:
+        scene: robot, ground and substeps.
+        options: what else a copy is made of.
     """
 
     kind = "ground truth"
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, *options: Any) -> None:
+        super().__init__(scene)
+        self._made_of = scene, *options
+        self._count = 0  # envs that there is room for
         self.has_actuators = isinstance(scene.controller, ActuatorController)
         # sensors that need forces, such as touch
         self.feels_forces = mujoco.mjtStage.mjSTAGE_ACC in scene.model.sensor_needstage
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it is made of, and the past."""
+        kept = {"has_actuators": self.has_actuators, "count": self._count}
+        return {"made_of": self._made_of, "past": self.history(), **kept}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["made_of"])
+        self._switch(state["has_actuators"])
+        self._fit(state["count"])
+        self.restore(state["past"], torch.ones(self._count, dtype=torch.bool))
+
+    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+        """See `Dynamics.reset`."""
+        self._fit(len(state[QPOS]))
+        every = torch.ones(self._count, dtype=torch.bool)
+        self.restore(None, every if rows is None else rows)
 
     @torch.no_grad()
     @uncompiled
@@ -138,18 +147,32 @@ class Engine(ABC):
         return TensorDict(values, [len(command)]).to(state[QPOS].device)
 
     def _command(self, joint_torque: Tensor | None, ctrl: Tensor | None) -> Tensor:
-        """What is held; begins anew where actuators have to be switched on or off."""
+        """What is held; there is then room for it, and actuators are on or off."""
         command = joint_torque if ctrl is None else ctrl
         if command is None:
             raise ValueError("expected a joint torque or ctrl, got neither")
-        if self.has_actuators != (ctrl is not None):
-            self.has_actuators = ctrl is not None
-            self._restart()
+        self._switch(ctrl is not None)
+        self._fit(len(command))
         return command
 
-    @abstractmethod
+    def _switch(self, has_actuators: bool) -> None:
+        if self.has_actuators != has_actuators:
+            self.has_actuators = has_actuators
+            self._restart()
+
+    def _fit(self, count: int) -> None:
+        if self._count != count:
+            self._count = count
+            self._allocate(count)
+
     def _restart(self) -> None:
-        """Begin anew with or without actuators."""
+        """Begin anew, with or without actuators."""
+        self._count = 0
+        self._allocate(0)
+
+    @abstractmethod
+    def _allocate(self, count: int) -> None:
+        """Room for so many envs, which have no past."""
 
     @abstractmethod
     def _step(

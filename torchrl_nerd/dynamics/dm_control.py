@@ -51,33 +51,11 @@ class DMControlDynamics(Engine):
     def __init__(self, scene: Scene) -> None:
         refuse_variation(scene, "dm_control")
         super().__init__(scene)
-        self._rows: list[Physics] = []
+        self._allocate(0)
 
-    def __getstate__(self) -> dict:
-        """A copy in another process builds its own `Physics` objects, which go on."""
-        return self.__dict__ | {"_rows": self.history()}
-
-    def __setstate__(self, state: dict) -> None:
-        past = state.pop("_rows")
-        vars(self).update(state)
-        self._rows = [self._new() for _ in past]
-        self.restore(past, torch.ones(len(past), dtype=torch.bool))
-
-    def _new(self) -> "Physics":
-        return make_physics(self.scene, self.has_actuators)
-
-    def _restart(self) -> None:
-        self._rows = []
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Return the `Physics` of ``rows (num_envs,)`` to the state a new one has."""
-        count = state[QPOS].shape[0]
-        if len(self._rows) != count:
-            self._rows = [self._new() for _ in range(count)]
-            return
-        for row, physics in enumerate(self._rows):
-            if rows is None or rows[row]:
-                physics.reset()
+    def _allocate(self, count: int) -> None:
+        given = self.scene, self.has_actuators
+        self._rows = [make_physics(*given) for _ in range(count)]
 
     def history(self) -> list[np.ndarray]:
         """See `Dynamics.history`: all that MuJoCo integrates, warm start and time too."""
@@ -88,13 +66,14 @@ class DMControlDynamics(Engine):
             mujoco.mj_getState(*where, pasts[-1], INTEGRATED)
         return pasts
 
-    def restore(self, history: list[np.ndarray], rows: Tensor) -> None:
-        """See `Dynamics.restore`."""
+    def restore(self, history: list[np.ndarray] | None, rows: Tensor) -> None:
+        """See `Dynamics.restore`; without a history, to the state of a new `Physics`."""
         for row in rows.nonzero()[:, 0].tolist():
+            physics = self._rows[row]
             if not history:
-                self._rows[row] = self._new()
+                physics.reset()
                 continue
-            where = self._rows[row].model.ptr, self._rows[row].data.ptr
+            where = physics.model.ptr, physics.data.ptr
             mujoco.mj_resetData(*where)  # warnings of a step that is taken back
             mujoco.mj_setState(*where, history[row], INTEGRATED)
             mujoco.mj_step1(*where)  # with which `Physics` ends a step
@@ -102,8 +81,6 @@ class DMControlDynamics(Engine):
     def _step(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
     ) -> dict[str, Tensor]:
-        if len(self._rows) != len(command):
-            self.reset(state)
         qpos, qvel, told = (as_numpy(x) for x in (state[QPOS], state[QVEL], command))
         pose = ground_pose(self.scene, terrain)
         poses = [None] * len(qpos) if pose is None else as_numpy(pose)

@@ -6,7 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.dynamics.models import NeRDDynamics
+from torchrl_nerd.dynamics.base import Dynamics
+from torchrl_nerd.dynamics.models import OOD_SCORE, NeRDDynamics
 from torchrl_nerd.dynamics.mujoco import MujocoDynamics
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TRUST
 
@@ -19,7 +20,7 @@ class UntrustedError(RuntimeError):
     """An input too far from what the model was trained on."""
 
 
-class GuardedDynamics:
+class GuardedDynamics(Dynamics):
     """A `NeRDDynamics` whose every step says how far its input may be trusted.
 
     ``trust`` is 1 where the input is as familiar as 99% of the training data, and else
@@ -54,8 +55,8 @@ class GuardedDynamics:
                 "expected torques without delay for the guard 'fallback', whose MuJoCo "
                 f"starts anew at every step, got up to {varied.max_delay} steps"
             )
-        self.scene, self.learned = learned.scene, learned
-        self.kind, self.guard = learned.kind, guard
+        super().__init__(learned.scene)
+        self.kind, self.learned, self.guard = learned.kind, learned, guard
         self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
         self.ground_truth = MujocoDynamics(self.scene) if guard == "fallback" else None
 
@@ -91,8 +92,9 @@ class GuardedDynamics:
         Raises:
             UntrustedError: with the guard ``"raise"``, naming the envs.
         """
-        after, distance = self.learned.scored_step(state, joint_torque, terrain, ctrl)
-        assert distance is not None  # for the type checker: it was asked for
+        given = state, joint_torque, terrain, ctrl
+        after = self.learned.step(*given, is_scored=True)
+        distance = after.pop(OOD_SCORE)
         trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
         rows = trust < 1.0
         if self.guard == "raise" and rows.any():

@@ -1,7 +1,6 @@
 """Dynamics that torch computes: learned, hybrid and analytic models as `Dynamics`."""
 
 import copy
-from collections.abc import Mapping
 from typing import Any, Literal, cast, get_args
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from torchrl_nerd.analytic import AnalyticStep
 from torchrl_nerd.compiled import Compiled, RowThreads, parts_of, unaffected
-from torchrl_nerd.dynamics.base import check_step
+from torchrl_nerd.dynamics.base import Dynamics, check_step
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD, Network
@@ -18,6 +17,8 @@ from torchrl_nerd.modules.window import WindowNetwork
 from torchrl_nerd.scenes.commands import drive_of
 
 Inference = Literal["streaming", "window"]
+
+OOD_SCORE = "ood_score"
 
 Prediction = tuple[Tensor, Tensor, Tensor | None]
 """Next ``qpos`` and ``qvel``, and the out-of-distribution score of the input."""
@@ -55,7 +56,7 @@ SINGLE_THREADED = {
 MIN_WORK = 2048
 
 
-class TorchDynamics:
+class TorchDynamics(Dynamics):
     """Steps a batch of envs with a function of tensors, eager or compiled.
 
     A subclass gives ``_predict`` and, where it has a history, ``_memory``.
@@ -64,26 +65,20 @@ class TorchDynamics:
     _memory: Any = None
 
     def __init__(self, model: Model, compile: bool, differentiable: bool) -> None:
-        self.scene, self.device, self.kind = model.scene, model.device, model.kind
+        super().__init__(model.scene)
+        self.device, self.kind = model.device, model.kind
         self.compile, self.differentiable = compile, differentiable
-        self._suits_one_thread = model.compile_single_threaded
+        # compiled steps are long code for one thread of the processor
+        is_single = model.compile_single_threaded and self.device.type == "cpu"
+        self.is_single_threaded = is_single
+        self.compile_options: dict[str, Any] = SINGLE_THREADED if is_single else {}
+        if self.device.type == "cuda":
+            self.compile_options = {"dynamic": False}
         numbers = (x for x in model.buffers() if x.is_floating_point())
         self.state_dtype = next((x.dtype for x in numbers), torch.float64)
         self._rows = 0
         self._compiled = Compiled(self._predict, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
-
-    @property
-    def is_single_threaded(self) -> bool:
-        """Whether compiled steps are long code for one thread of the processor."""
-        return self._suits_one_thread and self.device.type == "cpu"
-
-    @property
-    def compile_options(self) -> Mapping[str, Any]:
-        """Of `torch.compile`, for a step."""
-        if self.device.type == "cuda":
-            return {"dynamic": False}
-        return SINGLE_THREADED if self.is_single_threaded else {}
 
     def parts(self, rows: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
@@ -91,9 +86,6 @@ class TorchDynamics:
         if is_whole or not self.is_single_threaded:
             return 1
         return parts_of(rows, max(1, MIN_WORK // self.scene.layout.nv))
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """See `Dynamics.reset`; there is no history to empty."""
 
     def history(self) -> Any:
         """See `Dynamics.history`."""
@@ -108,29 +100,19 @@ class TorchDynamics:
             elif self._memory is not None:
                 self._memory.clear(rows.to(self.device))
 
+    @unaffected
     def step(
         self,
         state: TensorDictBase,
         joint_torque: Tensor,
         terrain: Tensor | None = None,
         ctrl: Tensor | None = None,
+        is_scored: bool = False,
     ) -> TensorDictBase:
-        """See `Dynamics.step`."""
-        given = state, joint_torque, terrain, ctrl
-        return self.scored_step(*given, is_scored=False)[0]
+        """See `Dynamics.step`.
 
-    @unaffected
-    def scored_step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
-        ctrl: Tensor | None = None,
-        is_scored: bool = True,
-    ) -> tuple[TensorDictBase, Tensor | None]:
-        """`step`, and the out-of-distribution score ``(num_envs,)`` of its input.
-
-        The score is None where it was not asked for or the dynamics has none.
+        Where it ``is_scored`` and the dynamics is learned, the next state also holds the
+        out-of-distribution score of the step's input as ``ood_score (num_envs,)``.
 
         Raises:
             ValueError: servos without ``ctrl``.
@@ -158,7 +140,9 @@ class TorchDynamics:
         after = TensorDict(moved, state.batch_size, device=state.device)
         if PARAMETERS in state.keys():
             after[PARAMETERS] = state[PARAMETERS]
-        return after, None if score is None else score.to(there)
+        if score is not None:
+            after[OOD_SCORE] = score.to(there)
+        return after
 
     def _told(self, state: TensorDictBase, like: Tensor) -> Tensor | None:
         """What the model is told of a varied scene's parameters."""

@@ -63,56 +63,44 @@ class MujocoDynamics(Engine):
     """
 
     def __init__(self, scene: Scene, num_threads: int | None = None) -> None:
-        super().__init__(scene)
-        self.num_threads = default_threads() if num_threads is None else num_threads
-        expect_count(1, num_threads=self.num_threads)
-        self._start(np.zeros((0, scene.model.nv)))
+        num_threads = default_threads() if num_threads is None else num_threads
+        expect_count(1, num_threads=num_threads)
+        super().__init__(scene, num_threads)
+        self.num_threads = num_threads
+        self._allocate(0)
 
-    def _start(self, warmstart: np.ndarray, late: np.ndarray | None = None) -> None:
-        """Simulations, one for each row of the warm start ``(rows, nv)``.
-
-        ``late (rows, 1 + max_delay, m)``: the last commands, the latest first.
-        """
-        scene, rows = self.scene, len(warmstart)
-        longest = 0 if scene.variation is None else scene.variation.max_delay
-        size = 1 + longest, max(len(scene.actuated), scene.model.nu)
-        self._late = np.zeros((rows, *size)) if late is None else late
+    def _allocate(self, count: int) -> None:
+        model = self._model = engine_model(self.scene, self.has_actuators)
+        varied = self.scene.variation
+        size = max(len(self.scene.actuated), model.nu)
+        length = 1 if varied is None else 1 + varied.max_delay
+        self._late = np.zeros((count, length, size))  # commands, the latest first
         self._own: RowParameters | None = None
-        self._model = engine_model(self.scene, self.has_actuators)
         self._batch: Batch | None = None
-        self._warmstart = warmstart
-        if len(warmstart):
-            batch = Batch(self._model, len(warmstart), self.num_threads)
-            self._batch, self._warmstart = batch, batch.bind("qacc_warmstart")
-            self._warmstart[:] = warmstart
+        self._warmstart = np.zeros((count, model.nv))
+        if count:
+            self._batch = Batch(model, count, self.num_threads)
+            self._warmstart = self._batch.bind("qacc_warmstart")
+            self._warmstart[:] = 0.0
         _STARTED.add(self)
 
-    def __getstate__(self) -> dict:
-        """Threads do not travel: a copy in another process starts its own."""
-        made_of = self.scene, self.num_threads
-        return {"made_of": made_of, "past": self.history()}
+    def _restart(self) -> None:
+        """As `Engine._restart`, with the same past."""
+        past = self.history()
+        self._allocate(self._count)
+        self.restore(past, torch.ones(self._count, dtype=torch.bool))
 
-    def __setstate__(self, state: dict) -> None:
-        self.__init__(*state["made_of"])
-        self._start(*state["past"])
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Clear the warm start of ``rows (num_envs,)``; see `Dynamics.reset`."""
-        count = state[QPOS].shape[0]
-        if len(self._warmstart) != count:
-            self._start(np.zeros((count, self._model.nv)))
-        for past in (self._warmstart, self._late):
-            past[slice(None) if rows is None else rows.cpu().numpy()] = 0.0
-
-    def history(self) -> tuple[np.ndarray, np.ndarray]:
+    def history(self) -> tuple[np.ndarray, np.ndarray] | None:
         """See `Dynamics.history`: the warm start and the commands that may be late."""
-        return self._warmstart.copy(), self._late.copy()
+        return (self._warmstart.copy(), self._late.copy()) if self._count else None
 
-    def restore(self, history: tuple[np.ndarray, np.ndarray], rows: Tensor) -> None:
-        """See `Dynamics.restore`."""
+    def restore(
+        self, history: tuple[np.ndarray, np.ndarray] | None, rows: Tensor
+    ) -> None:
+        """See `Dynamics.restore`; without a history, to none."""
         mask, pasts = rows.cpu().numpy(), (self._warmstart, self._late)
-        for past, then in zip(pasts, history, strict=True):
-            past[mask] = then[mask] if len(then) == len(mask) else 0.0
+        for past, then in zip(pasts, history or (None, None), strict=True):
+            past[mask] = 0.0 if then is None else then[mask]
 
     def _step(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
@@ -162,14 +150,11 @@ class MujocoDynamics(Engine):
     ) -> dict[str, Tensor]:
         """``qpos`` and ``qvel`` after each of the commands ``(rows, T, m)``."""
         rows, length = command.shape[:2]
-        if len(self._warmstart) != rows:
-            self.reset(state)
         qpos = np.empty((rows, length, self._model.nq))
         qvel = np.empty((rows, length, self._model.nv))
-        batch = self._batch
-        if batch is not None and length:
-            pose = ground_pose(self.scene, terrain)
-            batch = self._vary(batch, state)
+        if self._batch is not None and length:
+            self._vary(self._batch, state.get(PARAMETERS, None))
+            batch, pose = self._batch, ground_pose(self.scene, terrain)
             self._place(batch, as_numpy(state[QPOS]), as_numpy(state[QVEL]), pose)
             commands, is_whole = as_numpy(command), np.ones(rows, bool)
             for t in range(length):
@@ -177,22 +162,15 @@ class MujocoDynamics(Engine):
                 qpos[:, t], qvel[:, t] = batch.bind(QPOS), batch.bind(QVEL)
         return {QPOS: torch.from_numpy(qpos), QVEL: torch.from_numpy(qvel)}
 
-    def _restart(self) -> None:
-        self._start(*self.history())
-
-    def _vary(self, batch: Batch, state: TensorDictBase) -> Batch:
-        """The batch, every simulation with the parameters of its state if there are any."""
-        given, variation = state.get(PARAMETERS, None), self.scene.variation
-        if variation is None or (given is None and self._own is None):
-            return batch
-        if given is None:  # the scene's own robot again
+    def _vary(self, batch: Batch, parameters: Tensor | None) -> None:
+        """Give every simulation its parameters, if there are any."""
+        if self.scene.variation is None:
+            return
+        if parameters is not None:
+            self._own = self._own or RowParameters(self.scene.variation, batch)
+            self._own.write(as_numpy(parameters))
+        elif self._own is not None:  # the scene's own robot again, in a new batch
             self._restart()
-            assert self._batch is not None  # for the type checker: it has rows
-            return self._batch
-        if self._own is None:
-            self._own = RowParameters(variation, batch)
-        self._own.write(as_numpy(given))
-        return batch
 
     def _place(
         self, batch: Batch, qpos: np.ndarray, qvel: np.ndarray, pose: Tensor | None

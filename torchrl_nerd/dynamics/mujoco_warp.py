@@ -50,7 +50,7 @@ class MujocoWarpDynamics(Engine):
         is_capturing: bool = True,
     ) -> None:
         refuse_variation(scene, "MuJoCo Warp")
-        super().__init__(scene)
+        super().__init__(scene, device, max_contacts, is_capturing)
         self.device = torch.device(device)
         self.max_contacts, self.is_capturing = max_contacts, is_capturing
         self._restart()
@@ -80,48 +80,28 @@ class MujocoWarpDynamics(Engine):
 
         self._model.callback.contactfilter = straighten_frames
         self._model.opt.warn_overflow = 0  # such envs become NaN
-        self._data: Any = None
-        self._graph: Any = None
-        self._rows = 0
+        super()._restart()
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is on the device does not travel, but for the warm start."""
-        kept = ("scene", "device", "max_contacts", "is_capturing")
-        kept = (*kept, "has_actuators", "feels_forces")
-        warmstart = self._view("qacc_warmstart").cpu() if self._rows else None
-        return {name: self.__dict__[name] for name in kept} | {"warmstart": warmstart}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        warmstart = state.pop("warmstart")
-        vars(self).update(state)
-        self._restart()
-        if warmstart is not None:
-            self._allocate(len(warmstart))
-            self._view("qacc_warmstart").copy_(warmstart)
-
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Clear the warm start of ``rows (num_envs,)``; see `Dynamics.reset`."""
-        if len(state[QPOS]) != self._rows:
-            self._allocate(len(state[QPOS]))
-        elif self._rows:
-            every = slice(None) if rows is None else rows.to(self.device)
-            self._view("qacc_warmstart")[every] = 0.0
+        """As `Engine`'s; nothing of it is on the device."""
+        past = self.history()
+        return super().__getstate__() | {"past": None if past is None else past.cpu()}
 
     def history(self) -> Tensor | None:
         """See `Dynamics.history`: the warm start."""
-        return self._view("qacc_warmstart").clone() if self._rows else None
+        return self._view("qacc_warmstart").clone() if self._count else None
 
     def restore(self, history: Tensor | None, rows: Tensor) -> None:
-        """See `Dynamics.restore`."""
+        """See `Dynamics.restore`; without a history, to no warm start."""
+        if not self._count:
+            return
         mask, now = rows.to(self.device), self._view("qacc_warmstart")
-        now[mask] = 0.0 if history is None else history[mask]
+        now[mask] = 0.0 if history is None else history.to(self.device)[mask]
 
     def _step(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
     ) -> dict[str, Tensor]:
-        if len(command) != self._rows:
-            self._allocate(len(command))
-        if not self._rows:
+        if not self._count:
             return {key: state[key].double() for key in (QPOS, QVEL)}
         is_broken = ~self._write(state, command, terrain)
         self._advance()
@@ -182,10 +162,10 @@ class MujocoWarpDynamics(Engine):
             return self._warp.ScopedDevice(self._place)
         return self._warp.ScopedStream(self._warp.stream_from_torch(self.device))
 
-    def _allocate(self, rows: int) -> None:
-        """Memory for so many envs, at rest, with nothing remembered."""
-        self._rows, self._graph, self._data = rows, None, None
-        if not rows:
+    def _allocate(self, count: int) -> None:
+        self._graph: Any = None
+        self._data: Any = None
+        if not count:
             return
         contacts, source = self.max_contacts, self._source
         if contacts is None:
@@ -195,7 +175,7 @@ class MujocoWarpDynamics(Engine):
         with self._scope():
             self._data = self._engine.make_data(
                 source,
-                nworld=rows,
+                nworld=count,
                 nconmax=contacts,
                 njmax=constraints,
                 njmax_nnz=constraints * source.nv,

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl_nerd.analytic import make_step
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
-from torchrl_nerd.dynamics.base import Memoryless
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.transformer import CausalTransformer
@@ -42,7 +41,7 @@ class Candidate:
     make: Callable[[Scene], Dynamics]
 
 
-class NoMotion(Memoryless):
+class NoMotion(Dynamics):
     """Dynamics in which every state stays as it is: the error of predicting nothing."""
 
     kind = "baseline"
