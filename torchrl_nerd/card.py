@@ -26,9 +26,8 @@ KINDS: dict[str, dict[str, type]] = {
         "penalty-contact": configs.PenaltyContactConfig,
         "free-body": configs.FreeBodyConfig,
     },
-    "features": {
-        "features": configs.FeatureConfig
-    },  # one kind, which cards do not name
+    # one kind, which cards do not name
+    "features": {"features": configs.FeatureConfig},
 }
 """Configurations by the part of the model and the name of their kind in a card."""
 
@@ -47,14 +46,12 @@ def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str,
         "network": None,
         "step": None,
     }
-    step = model if not isinstance(model, NeRD) else None
+    step = model.analytic_step if isinstance(model, HybridNeRD) else model
     if isinstance(model, NeRD):
         card["network"] = _described("network", model.config)
         card["features"] = asdict(model.scene_features.config)
         card["reference_ratio"] = model.reference_ratio
-    if isinstance(model, HybridNeRD):
-        step = model.analytic_step
-    if step is not None:
+    if not isinstance(step, NeRD):
         card["step"] = _described("step", step.config)
     return card | {
         "training_ranges": scene.sampling.ranges(),

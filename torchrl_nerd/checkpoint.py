@@ -143,17 +143,14 @@ def _not_shipped(name: str, hybrid_of: Scene | None) -> str:
     """That no model has this name, and how to make one; a hybrid where a scene is given."""
     how, folder = f"nerd train {name}", f"runs/{folder_name(name)}"
     what = f"no learned model of '{name}' is shipped: make one"
-    if hybrid_of is not None:
-        steps, reason = fitting_steps(hybrid_of)
-        if steps:
-            what = f"no hybrid model of '{name}' is shipped: make one, STEP being "
-            what += " or ".join(steps) + ","
-            how, folder = f"{how} --kind hybrid --step STEP", f"{folder}-hybrid"
-        else:
-            what = (
-                f"no hybrid model of '{name}' is possible, since no analytic step fits "
-            )
-            what += f"({reason}): make a learned one"
+    steps, reason = ([], "") if hybrid_of is None else fitting_steps(hybrid_of)
+    if steps:
+        what = f"no hybrid model of '{name}' is shipped: make one, STEP being "
+        what += " or ".join(steps) + ","
+        how, folder = f"{how} --kind hybrid --step STEP", f"{folder}-hybrid"
+    elif reason:
+        what = f"no hybrid model of '{name}' is possible, since no analytic step fits "
+        what += f"({reason}): make a learned one"
     return (
         f"{what} with `nerd data {name}` and `{how}`, and give its folder, such as "
         f"{folder}/best"

@@ -55,8 +55,8 @@ def unaffected(method: Function) -> Function:
 @contextmanager
 def announced(what: str) -> Iterator[None]:
     """Say on the terminal's error stream what it compiles, where that takes a while."""
-    said = [WAIT.format(what)]
-    timer = Timer(PATIENCE, print, said, {"file": sys.stderr, "flush": True})
+    how = {"file": sys.stderr, "flush": True}
+    timer = Timer(PATIENCE, print, [WAIT.format(what)], how)
     timer.daemon = True
     timer.start()
     try:
@@ -122,8 +122,8 @@ class RowThreads(Generic[Result]):
 
     For functions in which rows are independent, and which release Python's lock for most
     of the time, as compiled code does that is wrapped in C++. Tensors among its positional
-    arguments, and what it returns, have the rows as their first dimension; all else goes to
-    every part.
+    arguments, and in the tuple that it returns, have the rows as their first dimension; all
+    else goes to every part.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
@@ -134,17 +134,13 @@ class RowThreads(Generic[Result]):
         """What ``function`` gives, in so many parts; raises what it raises."""
         split = [x.chunk(parts) if isinstance(x, Tensor) else [x] * parts for x in args]
         pool, mode = _pool(os.getpid(), parts), torch.is_inference_mode_enabled()
-        futures = []
-        rows = next(len(x[0]) for x in split if isinstance(x[0], Tensor))
+        futures, rows = [], next(len(x[0]) for x in split if isinstance(x[0], Tensor))
         calls = self._known[rows] = self._known.get(rows, 0) + 1
         for part in zip(*split, strict=True):
             futures.append(pool.submit(self._work, mode, part))
             if calls <= WARM:  # what compiles does so once
                 futures[-1].result()
-        found = [future.result() for future in futures]
-        if isinstance(found[0], Tensor):
-            return cast(Result, torch.cat(cast(list[Tensor], found)))
-        columns = zip(*cast(list[tuple], found), strict=True)
+        columns = zip(*(cast(tuple, x.result()) for x in futures), strict=True)
         joined = (torch.cat(x) if isinstance(x[0], Tensor) else x[0] for x in columns)
         return cast(Result, tuple(joined))
 
@@ -160,29 +156,21 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     In each of them torch works alone. Its number of threads is one of each thread and one
     that new threads begin with, which setting the former sets as well.
     """
-    pool, all_here = ThreadPoolExecutor(threads, "rows"), Barrier(threads + 1)
 
     def begin() -> None:
         torch.get_num_threads()  # takes over the number that new threads begin with
         torch.set_num_threads(1)
-        all_here.wait()
 
+    pool, all_here = ThreadPoolExecutor(threads, "rows", begin), Barrier(threads + 1)
     number = torch.get_num_threads()
-    started = [pool.submit(begin) for _ in range(threads)]
+    for _ in range(threads):
+        pool.submit(all_here.wait)
     all_here.wait()
-    for each in started:
-        each.result()
     torch.set_num_threads(number)
     return pool
 
 
-def _use_one_thread() -> None:
-    """GNU's OpenMP waits in a forked process for threads that only its parent has.
-
-    What torch's own loaders do in their workers; whoever wants more sets it afterwards.
-    """
-    torch.set_num_threads(1)
-
-
+# GNU's OpenMP waits in a forked process for threads that only its parent has. As in the
+# workers of torch's own loaders there is one; whoever wants more sets it afterwards.
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_use_one_thread)
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))

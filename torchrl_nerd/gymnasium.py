@@ -42,16 +42,12 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     is, with a reward of zero: Gymnasium's mode ``NEXT_STEP``.
 
     Args:
-        task: id of a task, a scene, or a task.
-        dynamics: as for `make_env`.
-        num_envs: how many envs.
-        seed: of the resets, until `reset` is given another; None for a fresh one.
-        device: where the env computes.
+        task, dynamics, num_envs, device, camera_id: see `make_env`.
+        seed: of the resets, until `reset` is given another; drawn where none is given.
         render_mode: ``"rgb_array"`` for images by `render`, or None.
         max_episode_steps: steps until ``truncated``, where the task's horizon is longer.
         height: of an image, pixels.
         width: of an image, pixels.
-        camera_id: of an image, see `envs.rendering.Renderer`.
 
     Raises:
         ValueError: what `make_env` refuses, an unknown render mode, or no steps.
@@ -176,8 +172,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One env: observation ``(D,)``, action ``(A,)`` in [-1, 1], both float32.
 
     Args:
-        task: id of a task, a scene, or a task.
-        dynamics: as for `make_env`.
+        task, dynamics: see `make_env`.
         render_mode: ``"rgb_array"`` or None.
         settings: other arguments of `GymnasiumVectorEnv`, but ``num_envs``.
 
@@ -195,10 +190,10 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        settings |= {"render_mode": render_mode}
+        settings["render_mode"] = self.render_mode = render_mode
         self.vector = GymnasiumVectorEnv(task, dynamics, 1, **settings)
-        fps = {"render_fps": self.vector.metadata["render_fps"]}
-        self.metadata, self.render_mode = {**self.metadata, **fps}, render_mode
+        fps = self.vector.metadata["render_fps"]
+        self.metadata = {**self.metadata, "render_fps": fps}
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 

@@ -41,13 +41,10 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 def expect_fit(
     found: Mapping[str, Tensor], expected: Mapping[str, Tensor], what: str, of: str
 ) -> None:
-    """Refuse tensors of other names, shapes or kinds than expected, or not finite.
+    """Raise ValueError for a tensor of another name, shape or kind, or not finite.
 
     For the sentence, ``what`` was read, ``"weights in FOLDER"``, and ``of`` is whom they
     must fit, ``"scene 'cartpole'"``.
-
-    Raises:
-        ValueError: naming the first tensor that does not fit.
     """
     shapes, own = ({k: tuple(v.shape) for k, v in x.items()} for x in (expected, found))
     for key in sorted(shapes.keys() | own.keys()):

@@ -203,15 +203,13 @@ class NeRDDynamics(TorchDynamics):
     @unaffected
     def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
         """Empty the history of ``rows`` and leave the others bitwise as they are."""
-        count = state[QPOS].shape[0]
-        memory = self._memory if self._rows == count else None
+        count = len(state[QPOS])
         # gradients keep their history, and the past of all envs is forgotten
-        is_left = self.differentiable and rows is not None and bool(rows.all())
-        if rows is None or memory is None or is_left:
-            self._memory, self._rows = self.network.empty_memory(count), count
-        else:  # asks nothing of the device, and the memory stays where it is
-            with torch.set_grad_enabled(self.differentiable):
-                memory.clear(rows.reshape(count).to(self.device))
+        if rows is None or (self.differentiable and bool(rows.all())):
+            self._memory = None
+        self._prepare(count)
+        if rows is not None:  # asks nothing of the device; the memory stays where it is
+            self.restore(None, rows.reshape(count))
 
     def _told(self, state: TensorDictBase, like: Tensor) -> Tensor | None:
         features = self.model.scene_features

@@ -95,10 +95,8 @@ class SceneEnv(RenderedEnv):
         self._transition = Transition(task, dynamics)
         inner = self._torch_dynamics
         self._is_differentiable = inner is not None and inner.differentiable
-        self.recorder: FaultRecorder | None = None
-        if dump_dir is not None:
-            about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
-            self.recorder = FaultRecorder(Path(dump_dir), about)
+        about = {"scene": self.scene.name, "dynamics": type(dynamics).__name__}
+        self.recorder = None if dump_dir is None else FaultRecorder(dump_dir, about)
         of = task, self._state_sizes, self.batch_size, self.device
         for name, spec in make_specs(*of, self.guard is not None, state_dtype):
             setattr(self, name, spec)
@@ -182,26 +180,20 @@ class SceneEnv(RenderedEnv):
         self._keys = row_keys(seed, len(self._episode), self.device)
         self._episode = torch.zeros_like(self._episode)
 
-    def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
+    @unaffected
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         """Restore states, seed and episode counts; the history of every env starts empty.
 
         An empty one, which TorchRL's collectors keep of an env, changes nothing.
         """
-        if not state_dict:
-            return super().load_state_dict({}, strict=False)
-        return super().load_state_dict(state_dict, *args, **kwargs)
-
-    @unaffected
-    def _load_from_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> None:
-        """What torch calls, of an env inside another module too."""
-        if state_dict:
-            # torch writes into these, which a state or a graph of gradients may share
-            for name, value in self._buffers.items():
-                self._buffers[name] = cast(Tensor, value).detach().clone()
-        super()._load_from_state_dict(state_dict, *args, **kwargs)
-        if state_dict:
-            self._keys = row_keys(self.seed, len(self._episode), self.device)
-            self.dynamics.reset(self.state)
+        if not (state_dict or prefix):
+            return
+        # torch writes into these, which a state or a graph of gradients may share
+        for name, value in self._buffers.items():
+            self._buffers[name] = cast(Tensor, value).detach().clone()
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._keys = row_keys(self.seed, len(self._episode), self.device)
+        self.dynamics.reset(self.state)
 
     @property
     def state(self) -> TensorDict:

@@ -22,11 +22,7 @@ class DmEnvironment(dm_env.Environment):
     The observation is one array ``(D,)``, float32; an action is ``(A,)`` in [-1, 1]. An
     episode that failed ends with discount 0, one that ran out of time with discount 1.
 
-    Args:
-        task: id of a task, a scene, or a task.
-        dynamics: as for `make_env`.
-        seed: of the resets; drawn where none is given.
-        device: where the env computes.
+    Arguments as those of `make_env`.
 
     Examples:
         >>> env = DmEnvironment("cartpole/swingup")

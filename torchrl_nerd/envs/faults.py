@@ -52,8 +52,8 @@ class FaultRecorder:
         ValueError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, about: dict[str, str]) -> None:
-        self.folder, self.about = writable_folder(folder), about
+    def __init__(self, folder: Path | str, about: dict[str, str]) -> None:
+        self.folder, self.about = writable_folder(Path(folder)), about
         self._steps: deque[dict[str, Tensor]] = deque(maxlen=HISTORY)
         self._written: set[int] = set()
 
@@ -73,8 +73,7 @@ class FaultRecorder:
                 self._write(kind, int((fault == kind).nonzero()[0, 0]))
 
     def _write(self, kind: int, row: int) -> None:
-        steps = self._steps  # at most `HISTORY`, the oldest first
-        # (T, n) each
+        steps = self._steps  # at most `HISTORY`, the oldest first: (T, n) each
         tensors = {k: torch.stack([s[k][row] for s in steps]) for k in steps[0]}
         about = {**self.about, "reason": REASONS[kind], "env": str(row)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"

@@ -29,7 +29,7 @@ from torchrl_nerd.files import read_json
 from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.settings import expect_device
+from torchrl_nerd.settings import expect_device, look_up
 from torchrl_nerd.tasks import Task
 
 
@@ -62,13 +62,10 @@ class GroundTruthEnv(SceneEnv):
         dump_dir: Path | str | None = None,
         state_dtype: torch.dtype = torch.float64,
     ) -> None:
-        if engine not in ENGINES:
-            known = ", ".join(ENGINES)
-            raise ValueError(f"unknown engine {engine!r}, expected one of {known}")
+        make = look_up("engine", engine, ENGINES)
         task = task if isinstance(task, Task) else make_task(task)
-        dynamics = ENGINES[engine](task.scene, expect_device(str(device)))
-        shared = num_envs, seed, device, dump_dir, state_dtype
-        super().__init__(task, dynamics, *shared)
+        dynamics = make(task.scene, expect_device(str(device)))
+        super().__init__(task, dynamics, num_envs, seed, device, dump_dir, state_dtype)
 
 
 class NeRDEnv(SceneEnv):
@@ -130,8 +127,7 @@ class NeRDEnv(SceneEnv):
             _refuse_network_options(name, guard, inference)
         elif guard is not None:
             dynamics = GuardedDynamics(dynamics, guard)
-        shared = num_envs, seed, device, dump_dir, state_dtype
-        super().__init__(task, dynamics, *shared)
+        super().__init__(task, dynamics, num_envs, seed, device, dump_dir, state_dtype)
         self.model_name = name
 
 
@@ -189,11 +185,14 @@ def make_env(
         how: dict[str, Any] = {"guard": guard, "dump_dir": dump_dir}
         how |= {"differentiable": differentiable, "state_dtype": state_dtype}
         env = NeRDEnv(task, dynamics, *shared, **how)
-        env = env.compile() if compile else env
+        if compile:
+            env.compile()
     env.render_size, env.camera_id = image_size(render_size), camera_id
     if pixels_only and not from_pixels:
         raise ValueError("expected from_pixels=True with pixels_only=True, got False")
-    return env.add_pixels(pixels_only) if from_pixels else env
+    if from_pixels:
+        env.add_pixels(pixels_only)
+    return env
 
 
 def _refuse_network_options(

@@ -1,6 +1,6 @@
 """Images of an env: on demand, or as an observation."""
 
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,8 +13,6 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.keys import PIXELS
 from torchrl_nerd.settings import expect_count
-
-Env = TypeVar("Env", bound="RenderedEnv")
 
 
 def image_size(given: int | tuple[int, int]) -> tuple[int, int]:
@@ -78,8 +76,8 @@ class RenderedEnv(EnvBase):
         camera_id = self.camera_id if camera_id is None else camera_id
         return self._renderer(state, height, width, camera_id)
 
-    def add_pixels(self: Env, pixels_only: bool = False) -> Env:
-        """Show ``pixels`` of ``render_size`` at every reset and step; returns the env.
+    def add_pixels(self, pixels_only: bool = False) -> None:
+        """Show ``pixels`` of ``render_size`` at every reset and step.
 
         Args:
             pixels_only: instead of all other entries that an agent could see; a state
@@ -87,16 +85,13 @@ class RenderedEnv(EnvBase):
         """
         self.from_pixels, self.pixels_only = True, pixels_only
         shape = torch.Size((*self.batch_size, *self.render_size, 3))
-        how, seen = {"shape": self.batch_size, "device": self.device}, {}
+        how = {"shape": self.batch_size, "device": self.device}
+        pixels = Bounded(0, 255, shape, self.device, torch.uint8)
+        seen = dict(self.observation_spec.items())
         self._hidden: tuple[Any, ...] = ()
         if pixels_only:
-            self.state_spec = Composite(**how)
-            self._hidden = tuple(self.observation_spec.keys())
-        else:
-            seen.update(self.observation_spec.items())
-        seen[PIXELS] = Bounded(0, 255, shape, self.device, torch.uint8)
-        self.observation_spec = Composite(seen, **how)
-        return self
+            self.state_spec, self._hidden, seen = Composite(**how), tuple(seen), {}
+        self.observation_spec = Composite({**seen, PIXELS: pixels}, **how)
 
     def _seen(self, result: TensorDict) -> TensorDict:
         """``result`` as an agent sees it: with pixels, or with pixels alone."""

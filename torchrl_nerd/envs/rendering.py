@@ -94,12 +94,9 @@ class Renderer:
         self._lock = RLock()  # a context is current in one thread at a time
         _ALL.add(self)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Without what is drawn with."""
-        return {"task": self.task}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["task"])
+        return type(self), (self.task,)
 
     @cached_property
     def _model(self) -> mujoco.MjModel:
@@ -131,13 +128,9 @@ class Renderer:
     ) -> np.ndarray:
         """Images ``(n, height, width, 3)``, uint8; sizes are in pixels.
 
-        Lower ones than `SMALL` are drawn without shadows and smoothing, which is faster.
-
-        Args:
-            state: ``qpos (n, nq)`` and the task's parameters.
-            height: of an image.
-            width: of an image.
-            camera_id: number or name of a camera; -1 for the free one.
+        Of a ``state`` with ``qpos (n, nq)`` and the task's parameters, by the camera of
+        that number or name, -1 for the free one. Lower ones than `SMALL` are drawn without
+        shadows and smoothing, which is faster.
 
         Raises:
             ValueError: no such camera, or no OpenGL library works on this machine.

@@ -17,7 +17,7 @@ def make_specs(
     rows: torch.Size,
     device: torch.device,
     is_guarded: bool,
-    state_dtype: torch.dtype = torch.float64,
+    state_dtype: torch.dtype,
 ) -> Iterator[tuple[str, TensorSpec]]:
     """Name and value of every spec of an env of that task and batch size ``rows``.
 
