@@ -76,7 +76,6 @@ class TorchDynamics(Dynamics):
             self.compile_options = {"dynamic": False}
         numbers = (x for x in model.buffers() if x.is_floating_point())
         self.state_dtype = next((x.dtype for x in numbers), torch.float64)
-        self._rows = 0
         self._compiled = Compiled(self._predict, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
 
@@ -149,13 +148,12 @@ class TorchDynamics(Dynamics):
 
     def _prepare(self, rows: int) -> None:
         """What a step of so many envs needs beforehand."""
-        self._rows = rows
 
     def _run(self, given: tuple) -> Prediction:
         """`_predict`, eager or compiled, of all envs at once or in parts."""
         if not self.compile:
             return self._predict(*given)
-        parts = 1 if torch.compiler.is_compiling() else self.parts(self._rows)
+        parts = 1 if torch.compiler.is_compiling() else self.parts(len(given[0]))
         return self._in_parts(parts, *given) if parts > 1 else self._compiled(*given)
 
     def _predict(self, *args: Any, **kwargs: Any) -> Prediction:
@@ -198,6 +196,7 @@ class NeRDDynamics(TorchDynamics):
         self.network = cast(Network, model.network)
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.token_size)
+        self._rows = 0
         super().__init__(model, compile, differentiable)
 
     @unaffected

@@ -181,7 +181,9 @@ class SceneEnv(RenderedEnv):
         self._episode = torch.zeros_like(self._episode)
 
     @unaffected
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(
+        self, state_dict: Any, prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
         """Restore states, seed and episode counts; the history of every env starts empty.
 
         An empty one, which TorchRL's collectors keep of an env, changes nothing.
@@ -191,7 +193,7 @@ class SceneEnv(RenderedEnv):
         # torch writes into these, which a state or a graph of gradients may share
         for name, value in self._buffers.items():
             self._buffers[name] = cast(Tensor, value).detach().clone()
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._keys = row_keys(self.seed, len(self._episode), self.device)
         self.dynamics.reset(self.state)
 
