@@ -224,9 +224,17 @@ def refuse_variation(scene: Scene, engine: str) -> None:
         )
 
 
-def ground_pose(scene: Scene, terrain: Tensor | None) -> Tensor | None:
-    """`Terrain.mocap_pose` of each env; None where the ground does not vary."""
-    ground = scene.terrain
+def ground_pose(scene: Scene, terrain: Tensor | None) -> dict[str, Tensor]:
+    """`Terrain.mocap_pose` as ``mocap_pos (*batch, n, 3)`` and ``mocap_quat``.
+
+    Empty where the ground does not vary.
+    """
+    ground, size = scene.terrain, 3 * scene.model.nmocap
     if terrain is None or ground is None or not ground.is_per_row:
-        return None
-    return ground.mocap_pose(terrain.double())
+        return {}
+    pose = ground.mocap_pose(terrain.double())
+    pos, quat = pose[..., :size], pose[..., size:]
+    return {
+        "mocap_pos": pos.unflatten(-1, (-1, 3)),
+        "mocap_quat": quat.unflatten(-1, (-1, 4)),
+    }

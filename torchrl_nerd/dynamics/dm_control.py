@@ -81,13 +81,13 @@ class DMControlDynamics(Engine):
     def _step(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
     ) -> dict[str, Tensor]:
-        qpos, qvel, told = (as_numpy(x) for x in (state[QPOS], state[QVEL], command))
-        pose = ground_pose(self.scene, terrain)
-        poses = [None] * len(qpos) if pose is None else as_numpy(pose)
-        next_qpos, next_qvel = np.empty_like(qpos), np.empty_like(qvel)
-        felt = np.empty((len(qpos), self.scene.model.nsensordata))
+        given = {key: state[key] for key in (QPOS, QVEL)}
+        given |= ground_pose(self.scene, terrain)
+        placed, told = {k: as_numpy(x) for k, x in given.items()}, as_numpy(command)
+        next_qpos, next_qvel = np.empty_like(placed[QPOS]), np.empty_like(placed[QVEL])
+        felt = np.empty((len(told), self.scene.model.nsensordata))
         for row, physics in enumerate(self._rows):
-            _place(physics, qpos[row], qvel[row], poses[row])
+            _place(physics, {key: value[row] for key, value in placed.items()})
             if self.has_actuators:
                 physics.set_control(told[row])
             else:
@@ -104,20 +104,13 @@ class DMControlDynamics(Engine):
         return {key: torch.from_numpy(value) for key, value in values.items()}
 
 
-def _place(
-    physics: "Physics", qpos: np.ndarray, qvel: np.ndarray, pose: np.ndarray | None
-) -> None:
-    """Put an env where it should be, unless it is there already."""
-    data, size = physics.data, 3 * physics.model.nmocap
-    is_there = np.array_equal(data.qpos, qpos) and np.array_equal(data.qvel, qvel)
-    if pose is not None:
-        ground = np.concatenate((data.mocap_pos.ravel(), data.mocap_quat.ravel()))
-        is_there = is_there and np.array_equal(ground, pose)
-    if is_there:
+def _place(physics: "Physics", values: dict[str, np.ndarray]) -> None:
+    """Put an env and its ground where they should be, unless they are there already."""
+    data = physics.data
+    if all(np.array_equal(getattr(data, key), x) for key, x in values.items()):
         return
     with physics.reset_context():
-        data.qpos[:], data.qvel[:] = qpos, qvel
-        if pose is not None:
-            data.mocap_pos.flat, data.mocap_quat.flat = pose[:size], pose[size:]
+        for key, value in values.items():
+            getattr(data, key)[:] = value
     # `Physics` does this without actuators, whose speeds its next substep needs
     mujoco.mj_fwdVelocity(physics.model.ptr, data.ptr)

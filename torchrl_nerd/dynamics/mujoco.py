@@ -198,8 +198,11 @@ class MujocoDynamics(Engine):
         qvel = np.empty((rows, length, self._model.nv))
         if self._batch is not None and length:
             self._vary(self._batch, state.get(PARAMETERS, None))
-            batch, pose = self._batch, ground_pose(self.scene, terrain)
-            self._place(batch, as_numpy(state[QPOS]), as_numpy(state[QVEL]), pose)
+            batch = self._batch
+            batch.bind("time")[:] = 0.0
+            placed = {key: state[key] for key in (QPOS, QVEL)}
+            for key, value in (placed | ground_pose(self.scene, terrain)).items():
+                batch.bind(key)[:] = as_numpy(value)
             commands, is_whole = as_numpy(command), np.ones(rows, bool)
             for t in range(length):
                 self._advance(batch, commands[:, t], is_whole)
@@ -215,18 +218,6 @@ class MujocoDynamics(Engine):
             self._own.write(as_numpy(parameters))
         elif self._own is not None:  # the scene's own robot again, in a new batch
             self._restart()
-
-    def _place(
-        self, batch: Batch, qpos: np.ndarray, qvel: np.ndarray, pose: Tensor | None
-    ) -> None:
-        """Put every simulation at a state, and the ground where it belongs."""
-        batch.bind("time")[:] = 0.0
-        batch.bind(QPOS)[:], batch.bind(QVEL)[:] = qpos, qvel
-        if pose is not None:
-            place, turn = np.split(as_numpy(pose), [3 * self._model.nmocap], 1)
-            for key, value in (("mocap_pos", place), ("mocap_quat", turn)):
-                target = batch.bind(key)
-                target[:] = value.reshape(target.shape)
 
     def _advance(self, batch: Batch, command: np.ndarray, is_whole: np.ndarray) -> None:
         """One control step; a simulation with a warning is NaN, and whole no longer."""

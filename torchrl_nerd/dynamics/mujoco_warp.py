@@ -138,12 +138,8 @@ class MujocoWarpDynamics(Engine):
         else:
             self._view("qfrc_applied")[:, self.scene.actuated] = told
         self._view("overflow").zero_()
-        pose = ground_pose(self.scene, terrain)
-        if pose is not None:
-            sizes = 3 * self._source.nmocap, 4 * self._source.nmocap
-            pos, quat = pose.to(self.device).split(sizes, -1)
-            self._view("mocap_pos").copy_(pos.unflatten(-1, (-1, 3)))
-            self._view("mocap_quat").copy_(quat.unflatten(-1, (-1, 4)))
+        for key, value in ground_pose(self.scene, terrain).items():
+            self._view(key).copy_(value)
         return is_sound
 
     def _has_overflown(self) -> Tensor:

@@ -159,10 +159,8 @@ class Renderer:
     def _draw(self, row: State, renderer: "mujoco.Renderer", camera: Camera) -> None:
         model, data, scene = self._model, self._data, self.task.scene
         data.qpos[:] = as_numpy(row[QPOS])
-        pose = ground_pose(scene, row.get(TERRAIN))
-        if pose is not None:
-            position, turn = np.split(as_numpy(pose), [3 * scene.model.nmocap])
-            data.mocap_pos.flat, data.mocap_quat.flat = position, turn
+        for key, value in ground_pose(scene, row.get(TERRAIN)).items():
+            getattr(data, key)[:] = as_numpy(value)
         self.task.show(model, data, row)
         mujoco.mj_fwdPosition(model, data)
         if scene.base.is_floating and not isinstance(camera, int | str):
