@@ -162,13 +162,13 @@ class Engine(Dynamics):
 
     def _fit(self, count: int) -> None:
         if self._count != count:
-            self._count = count
             self._allocate(count)
+            self._count = count
 
     def _restart(self) -> None:
         """Begin anew, with or without actuators."""
-        self._count = 0
         self._allocate(0)
+        self._count = 0
 
     @abstractmethod
     def _allocate(self, count: int) -> None:
