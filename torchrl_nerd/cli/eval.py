@@ -19,6 +19,7 @@ from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.bench.candidates import (
     Candidate,
+    analytic_step,
     models,
     mujoco_name,
     simulators,
@@ -31,12 +32,7 @@ from torchrl_nerd.evaluation.bench.errors import (
     measure,
 )
 from torchrl_nerd.evaluation.bench.summary import summary_table, warnings
-from torchrl_nerd.evaluation.recorded_error import (
-    STATES,
-    compare,
-    errors_as_text,
-    rivals,
-)
+from torchrl_nerd.evaluation.recorded_error import STATES, compare, errors_as_text
 from torchrl_nerd.evaluation.results import make_record
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import (
@@ -134,9 +130,8 @@ class Eval(MeasuringCommand):
         names = [] if self.model is None else [self.model]
         learned = models(scene, names, self.device, self.variants)
         engines = [*simulators(scene), *([nominal(solver_name)] if ranges else [])]
-        rows = []
-        for part in self.measure(protocol, [*engines, *learned]):
-            rows += part
+        parts = self.measure(protocol, [*engines, *learned])
+        rows = [row for part in parts for row in part]
         print(f"\n{summary_table(scene, rows)}\n")
         for sentence in warnings(scene, rows):
             print(sentence)
@@ -170,8 +165,7 @@ class Eval(MeasuringCommand):
         Raises:
             ValueError: no such split, or no trajectory that is long enough.
         """
-        protocol = recorded_protocol(self.scene)
-        scene = recorded_scene(self.scene)
+        protocol, scene = recorded_protocol(self.scene), recorded_scene(self.scene)
         model = from_pretrained(self.model or protocol.model, scene).to(self.device)
         recording, split = load_recording(path, scene)
         if self.split != "all" and self.split not in split:
@@ -179,9 +173,13 @@ class Eval(MeasuringCommand):
             raise ValueError(f"expected split {expected}, got '{self.split}'")
         chosen = None if self.split == "all" else split[self.split]
         starts = recording.starts(self.states, chosen)
-        others = rivals(scene) if self.baselines else {}
-        others["model"] = dynamics_of(model)
-        table = compare(others, scene, recording, starts, self.states)
+        tested: dict[str, Dynamics] = {}
+        if self.baselines:
+            tested["MuJoCo"] = MujocoDynamics(scene)
+            if analytic_step(scene)[0]:
+                tested["analytic"] = dynamics_of(from_pretrained("analytic", scene))
+        tested["model"] = dynamics_of(model)
+        table = compare(tested, scene, recording, starts, self.states)
         print(errors_as_text(table, protocol.published, self.states))
         shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
         return {**shared, **table["model"], "others": table}

@@ -7,9 +7,8 @@ from itertools import chain
 import numpy as np
 from torch import Generator
 
-from torchrl_nerd.analytic import STEPS, default_step, make_step
 from torchrl_nerd.data.simulate import is_sound, simulate
-from torchrl_nerd.evaluation.bench.candidates import mujoco_name
+from torchrl_nerd.evaluation.bench.candidates import analytic_step, mujoco_name
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
     CONTACT_DISTANCE,
@@ -61,9 +60,7 @@ class SolverReport:
     control_step: float  # s
     solver: str  # integrator and substeps, see `mujoco_name`
     effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
-    why_all_kept: (
-        str | None
-    )  # the reason in words where hinges and slides are not moved
+    why_all_kept: str | None  # the reason where hinges and slides are not moved
     points_found: int  # contact points of the robot's shapes
     points_merged: int  # of these, how many always coincide with another one
     points_fixed: int  # of these, how many no joint can move
@@ -164,7 +161,7 @@ def explain(scene: Scene) -> SceneReport:
     fixed, controller = found.count(-1), scene.controller
     servos = scene.servos is not None
     effects = base_effects(model, scene.base, scene.substeps, servos)
-    step, reason = _analytic_step(scene)
+    step, reason = analytic_step(scene)
     return SceneReport(
         scene=scene.name,
         features=tuple(Feature(str(k), n, meanings[str(k)]) for k, n in sizes.items()),
@@ -229,13 +226,3 @@ def _terrain(scene: Scene, has_normal: bool) -> str:
     if planes < len(terrain.surfaces):
         shapes += f", {len(terrain.surfaces) - planes} other surfaces"
     return f"{shapes}, {where}; the normal is {normal}"
-
-
-def _analytic_step(scene: Scene) -> tuple[str | None, str | None]:
-    """The step that ``dynamics="analytic"`` stands for, or the reason why there is none."""
-    config = default_step(scene)
-    try:
-        make_step(scene, config)
-        return next(name for name, step in STEPS.items() if step == config), None
-    except ValueError as error:
-        return None, str(error)

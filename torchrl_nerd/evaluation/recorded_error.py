@@ -12,10 +12,9 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from torchrl_nerd.analytic import make_step
 from torchrl_nerd.data.recorded import Recording
-from torchrl_nerd.dynamics import AnalyticDynamics, Dynamics, MujocoDynamics
-from torchrl_nerd.evaluation.bench.candidates import NoMotion, has_step
+from torchrl_nerd.dynamics import Dynamics
+from torchrl_nerd.evaluation.bench.candidates import NoMotion
 from torchrl_nerd.evaluation.rollout_error import (
     Errors,
     open_loop,
@@ -116,11 +115,11 @@ def compare(
     starts: Tensor,
     states: int = STATES,
 ) -> dict[str, dict[str, Any]]:
-    """Errors of no motion and of every model, and differences between the models.
+    """Errors of no motion and of every model; ``starts`` and ``states`` of `window_errors`.
 
     ``against`` holds, for every other model, 95% intervals over trajectories of the errors
     less the other's: below 0 the model is ahead. Its keys are ``m`` and ``rad`` for the
-    base, names for joints. ``starts`` and ``states``: see `window_errors`.
+    base, names for joints.
     """
     errors = {
         name: window_errors(dynamics, recording, starts, states)
@@ -141,14 +140,6 @@ def compare(
     return table
 
 
-def rivals(scene: Scene) -> dict[str, Dynamics]:
-    """Dynamics with the scene's own parameters: MuJoCo, and an analytic step if any."""
-    found: dict[str, Dynamics] = {"MuJoCo": MujocoDynamics(scene)}
-    if has_step(scene):
-        found["analytic"] = AnalyticDynamics(make_step(scene))
-    return found
-
-
 def errors_as_text(
     table: Mapping[str, Mapping[str, Any]],
     published: Mapping[str, Mapping[str, float]],
@@ -156,16 +147,14 @@ def errors_as_text(
 ) -> str:
     """The rows of `compare` as text, published mean errors last."""
     columns = ("mean", "interval", "median", "final", "p95", "first")
-    found: list[tuple[str, Mapping[str, Any]]] = [*table.items()]
-    for name, means in published.items():
-        found.append((name, {key: {"mean": mean} for key, mean in means.items()}))
-    body = [
-        [
-            *(name, key.replace("_error_", " ")),
-            *(f"{error[c]:.4f}" if c in error else "" for c in columns),
-        ]
-        for name, row in found
-        for key, error in row.items()
-        if key != "against"
-    ]
+    papers = {
+        name: {key: {"mean": mean} for key, mean in means.items()}
+        for name, means in published.items()
+    }
+    body = []
+    for name, row in (*table.items(), *papers.items()):
+        for key, error in row.items():
+            if key != "against":
+                cells = (f"{error[c]:.4f}" if c in error else "" for c in columns)
+                body.append([name, key.replace("_error_", " "), *cells])
     return text_table([f"{states} states", "quantity", *columns], body)

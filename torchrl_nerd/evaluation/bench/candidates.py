@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_nerd.analytic import make_step
+from torchrl_nerd.analytic import STEPS, default_step, make_step
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.keys import QPOS, QVEL
@@ -99,20 +99,21 @@ def models(
     """
     for variant in variants:
         look_up("variant", variant, dict.fromkeys(VARIANTS))
-    own = ["analytic"] if has_step(scene) else []
+    own = ["analytic"] if analytic_step(scene)[0] else []
     found = []
     for name in dict.fromkeys((*own, *(names or shipped_models(scene)))):
         found += _ways(name, from_pretrained(name, scene).to(device), variants)
     return sorted(found, key=lambda c: KINDS.index(c.kind))
 
 
-def has_step(scene: Scene) -> bool:
-    """Whether the package knows the contact law of a scene."""
+def analytic_step(scene: Scene) -> tuple[str | None, str | None]:
+    """The step that ``dynamics="analytic"`` stands for, or the reason why there is none."""
+    config = default_step(scene)
     try:
-        make_step(scene)
-    except ValueError:
-        return False
-    return True
+        make_step(scene, config)
+    except ValueError as error:
+        return None, str(error)
+    return next(name for name, step in STEPS.items() if step == config), None
 
 
 def _ways(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidate]:
@@ -122,14 +123,12 @@ def _ways(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidat
         label = f"{name}, {variant}"
         if variant == "compiled":
             yield _candidate(label, model, compile=True)
-        elif not isinstance(model, NeRD):
-            continue
-        elif variant == "bf16":
+        elif isinstance(model, NeRD) and variant == "bf16":
             rounded = copy.deepcopy(model).to(torch.bfloat16)
             yield _candidate(label, rounded)
             if "compiled" in variants:
                 yield _candidate(f"{name}, compiled bf16", rounded, compile=True)
-        elif isinstance(model.network, CausalTransformer):
+        elif isinstance(model, NeRD) and isinstance(model.network, CausalTransformer):
             yield _candidate(label, model, inference="window")
 
 
