@@ -24,7 +24,6 @@ from torchrl_nerd.scenes.commands import actuate, drive, idle
 Drive = Callable[[int, TensorDictBase], tuple[Tensor, Tensor | None]]
 """``(step, state [n]) -> joint torque (n, num_actuated), N and N m, and ctrl (n, nu)``."""
 
-
 Errors = dict[str, Tensor]
 """Quantity of `position_errors` -> ``(n, steps)``, m or rad."""
 
@@ -51,7 +50,7 @@ def initial_states(source: Source, num_trajectories: int, seed: int) -> TensorDi
     if isinstance(source, Scene):
         values = source.sample_initial(num_trajectories, generator)[0]
     else:
-        shape = (num_trajectories, source.num_uniforms)
+        shape = num_trajectories, source.num_uniforms
         u = torch.rand(shape, dtype=torch.float64, generator=generator)
         values = source.initial_state(u)
     if (variation := scene_of(source).variation) is not None:
@@ -129,6 +128,8 @@ def motion_before(
         Where the motion ends, ``[n]``; its transitions ``[n, steps]``, None of no steps;
         and the drive from there on.
     """
+    if not steps:
+        return start, None, drive
     seen: list[TensorDictBase] = []
 
     def act(step: int, state: TensorDictBase) -> tuple[Tensor, Tensor | None]:
@@ -138,15 +139,10 @@ def motion_before(
         seen.append(state.select(QPOS, QVEL, PARAMETERS, strict=False).update(given))
         return torque, ctrl
 
-    if not steps:
-        return start, None, drive
     *_, last = states_of(ground_truth, start, steps, act)
     end = start.clone().update(last.select(QPOS, QVEL))
-    return (
-        end,
-        cast(TensorDict, TensorDict.stack(seen, 1)),
-        lambda step, state: drive(steps + step, state),
-    )
+    motion = cast(TensorDict, TensorDict.stack(seen, 1))
+    return end, motion, lambda step, state: drive(steps + step, state)
 
 
 def open_loop(
@@ -163,7 +159,7 @@ def open_loop(
     takes long over states that diverge.
     """
     shape = (len(start), steps, start[QPOS].shape[1])
-    positions = torch.full(shape, torch.nan).to(start[QPOS])
+    positions = start[QPOS].new_full(shape, torch.nan)
     states = states_of(dynamics, start, steps, command, history)
     for step, state in enumerate(states):
         positions[:, step] = state[QPOS]
@@ -243,13 +239,16 @@ def interval_of_mean(samples: Tensor) -> float:
     return float(1.96 * samples.std() / len(samples) ** 0.5)
 
 
-def summarize(scene: Scene, errors: Errors) -> dict[str, ErrorSummary]:
-    """Summary of each quantity of `position_errors`, ``(n, steps)``, m or rad.
+def summarize(
+    scene: Scene, errors: Errors, horizon: int | None = None
+) -> dict[str, ErrorSummary]:
+    """Summary of each quantity of `position_errors` over so many steps, or all.
 
     Errors that are not finite stay visible.
     """
     summaries = {}
-    for name, error in errors.items():
+    for name, all_steps in errors.items():
+        error = all_steps[:, :horizon]  # (n, horizon)
         over_time = error.mean(1)  # (n,)
         summaries[name] = ErrorSummary(
             unit=unit_of(scene, name),
@@ -278,17 +277,12 @@ def passive_errors(
     Passive where the source's controller makes no torque of a zero action; see
     `action_drive`. Both have seen the ground truth's ``history`` steps before it.
     """
-    start, scene = initial_states(source, num_trajectories, seed), scene_of(source)
-    steps = max(horizons)
+    scene, steps = scene_of(source), max(horizons)
+    start = initial_states(source, num_trajectories, seed).to(device)
     how = num_trajectories, history + steps, seed, random_actions
-    before = ground_truth, start.to(device), history, action_drive(source, *how)
-    start, seen, drive = motion_before(*before)
-    paths = (
-        open_loop(one, start, steps, drive, history=seen)
-        for one in (ground_truth, other)
-    )
+    drive = action_drive(source, *how)
+    start, seen, drive = motion_before(ground_truth, start, history, drive)
+    both = ground_truth, other
+    paths = (open_loop(one, start, steps, drive, history=seen) for one in both)
     errors = position_errors(scene, *paths)
-    return {
-        horizon: summarize(scene, {k: e[:, :horizon] for k, e in errors.items()})
-        for horizon in horizons
-    }
+    return {horizon: summarize(scene, errors, horizon) for horizon in horizons}

@@ -34,7 +34,6 @@ DRIVEN = "driven"
 GROUND_TRUTH = "ground truth"
 PAPER = "paper (NeRD)"
 QUANTITIES = 3  # side by side: more do not fit on a line
-NO_RATES: Mapping[str, Mapping[str, float]] = {}
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class EvaluationSet:
     drive: Tensor | Drive  # see `states_of`
     solver: str  # of the ground truth, see `mujoco_name`
     ground_truth: Tensor  # positions after each step, (n, steps, nq)
-    history: TensorDict | None = None  # what every candidate has seen before, [n, T]
+    history: TensorDict | None = None  # motion [n, T] seen before by every candidate
 
     @property
     def scene(self) -> Scene:
@@ -65,8 +64,8 @@ class EvaluationSet:
         """The same of a candidate: 0 by definition of the ground truth itself."""
         if candidate.name != self.solver:
             return self.errors(candidate.make(self.scene))
-        both = self.ground_truth, self.ground_truth
-        return {k: 0.0 * e for k, e in position_errors(self.scene, *both).items()}
+        path = self.ground_truth
+        return {k: 0.0 * e for k, e in position_errors(self.scene, path, path).items()}
 
     def perturbed(self, size: float, seed: int) -> TensorDict:
         """The initial states with ``size`` (m, rad) times a normal number added to each."""
@@ -109,8 +108,8 @@ def evaluation_set(
     exact = ground_truth(scene_of(source))
     start, seen, drive = motion_before(exact, start, history, drive)
     path = open_loop(exact, start, steps, drive, history=seen)
-    about = case, source, start, drive, mujoco_name(exact.scene)
-    return EvaluationSet(*about, path, seen)
+    solver = mujoco_name(exact.scene)
+    return EvaluationSet(case, source, start, drive, solver, path, seen)
 
 
 def measure(
@@ -121,10 +120,9 @@ def measure(
 ) -> dict[tuple[str, str], Errors]:
     """Errors over all sets together, by name and kind of the candidate."""
     found = {}
-    for candidate in tqdm(candidates, title, leave=False, disable=quiet):
-        kind = GROUND_TRUTH if candidate.name == sets[0].solver else candidate.kind
-        parts = [each.candidate_errors(candidate) for each in sets]
-        found[candidate.name, kind] = together(parts)
+    for c in tqdm(candidates, title, leave=False, disable=quiet):
+        kind = GROUND_TRUTH if c.name == sets[0].solver else c.kind
+        found[c.name, kind] = together([each.candidate_errors(c) for each in sets])
     return found
 
 
@@ -163,8 +161,7 @@ def error_rows(
     """
     rows, about = [], (case, horizon)
     for (name, kind), by_name in errors.items():
-        part = {k: e[:, :horizon] for k, e in by_name.items()}  # (n, horizon)
-        for quantity, error in summarize(scene, part).items():
+        for quantity, error in summarize(scene, by_name, horizon).items():
             rows.append(ErrorRow(*about, name, kind, quantity, **vars(error)))
     for quantity in dict.fromkeys(row.quantity for row in rows):
         mean = published.get((*about, quantity))
@@ -175,28 +172,25 @@ def error_rows(
 
 
 def error_table(
-    rows: Sequence[ErrorRow], rates: Mapping[str, Mapping[str, float]] = NO_RATES
+    rows: Sequence[ErrorRow], rates: Mapping[str, Mapping[str, float]] | None = None
 ) -> str:
     """Text of the rows of one case and horizon: a line for every candidate.
 
     ``rates``: column -> name -> control steps per second.
     """
+    rates = rates or {}
     quantities = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
-    candidates = list(dict.fromkeys((row.name, row.kind) for row in rows))
-    found = {
-        (row.name, row.quantity): [
-            error_text(x) for x in (row.mean, row.final, row.p95)
-        ]
-        for row in rows
-    }
+    numbers = {(x.name, x.quantity): (x.mean, x.final, x.p95) for x in rows}
+    missing = None, None, None
     tables = []
     for first in range(0, len(quantities), QUANTITIES):
         shown = quantities[first : first + QUANTITIES]
         titles = [title for q, unit in shown for title in (f"{q} ({unit})", "", "")]
         head = ["name", "kind", *("mean", "final", "p95") * len(shown), *rates]
         body = []
-        for name, kind in candidates:
-            cells = [x for q, _ in shown for x in found.get((name, q), ["-"] * 3)]
+        for name, kind in dict.fromkeys((row.name, row.kind) for row in rows):
+            found = (numbers.get((name, q), missing) for q, _ in shown)
+            cells = [error_text(x) for each in found for x in each]
             speeds = [speed.get(name) for speed in rates.values()]
             cells += ["-" if x is None else f"{x:,.0f}" for x in speeds]
             body.append([name, kind, *cells])

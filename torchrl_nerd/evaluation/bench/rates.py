@@ -23,9 +23,6 @@ from torchrl_nerd.robots import Source
 SAMPLE_SECONDS = 0.1  # one sample lasts about as long
 MAX_STEP = 64  # control steps to the latest moment that states are taken at
 
-Clock = Callable[[], float]
-"""s: `time.perf_counter`, or `time.process_time`, which other work disturbs less."""
-
 
 @dataclass(frozen=True)
 class RateRow:
@@ -53,10 +50,9 @@ def rate_rows(
     state, scene = mid_states(source, batch, seed).to(device), scene_of(source)
     runners = [Runner(stepper(c.make(scene), state)) for c in candidates]
     samples = [[runner.steps_per_s() for runner in runners] for _ in range(rounds)]
-    found = zip(candidates, runners, zip(*samples, strict=True), strict=True)
     return [
         RateRow(c.name, c.kind, batch, batch * median(rates), runner.warm_up_s)
-        for c, runner, rates in found
+        for c, runner, *rates in zip(candidates, runners, *samples, strict=True)
     ]
 
 
@@ -66,8 +62,7 @@ def mid_states(source: Source, batch: int, seed: int) -> TensorDict:
     path = rollout(MujocoDynamics(scene_of(source)), start, MAX_STEP)
     generator = torch.Generator().manual_seed(seed)
     moment = 1 + torch.randint(MAX_STEP, (batch,), generator=generator)
-    # one moment of each trajectory: [batch]
-    state = cast(TensorDict, path[torch.arange(batch), moment])
+    state = cast(TensorDict, path[torch.arange(batch), moment])  # [batch]
     return state.update(start.select(TERRAIN, strict=False))
 
 
@@ -81,30 +76,28 @@ def stepper(dynamics: Dynamics, state: TensorDict) -> Callable[[int], None]:
     return run
 
 
-def _seconds(
-    run: Callable[[int], None], steps: int, clock: Clock = time.perf_counter
-) -> float:
-    began = clock()
-    run(steps)
-    if torch.cuda.is_initialized():  # a GPU may still be at work
-        torch.cuda.synchronize()
-    return clock() - began
-
-
 class Runner:
     """Runs for about as long as a sample lasts.
 
-    ``run`` makes so many steps; two of them, ``warm_up_s`` long, warm it up.
+    ``run`` makes so many steps; two of them, ``warm_up_s`` long, warm it up. ``clock``:
+    `time.perf_counter`, or `time.process_time`, which other work disturbs less.
     """
 
     def __init__(
-        self, run: Callable[[int], None], clock: Clock = time.perf_counter
+        self, run: Callable[[int], None], clock: Callable[[], float] = time.perf_counter
     ) -> None:
         self._run, self._clock = run, clock
-        self.warm_up_s = _seconds(run, 2)
-        self._length = max(2, round(2 * SAMPLE_SECONDS / _seconds(run, 2, clock)))
+        self.warm_up_s = self._seconds(2)
+        self._length = max(2, round(2 * SAMPLE_SECONDS / self._seconds(2)))
         run(self._length)
+
+    def _seconds(self, steps: int) -> float:
+        began = self._clock()
+        self._run(steps)
+        if torch.cuda.is_initialized():  # a GPU may still be at work
+            torch.cuda.synchronize()
+        return self._clock() - began
 
     def steps_per_s(self) -> float:
         """Of one sample."""
-        return self._length / _seconds(self._run, self._length, self._clock)
+        return self._length / self._seconds(self._length)
