@@ -93,9 +93,8 @@ class Data(SceneOptions, Command):
         scene, out = self.load(), self.folder
         _, draw = self.strategy(scene) or (None, partial(simulate, scene))
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
-        wanted, existing = self.config.trajectories, 0
-        if (out / CARD).exists():
-            existing = read_json(out / CARD)["trajectories"]
+        wanted, card = self.config.trajectories, out / CARD
+        existing = read_json(card)["trajectories"] if card.exists() else 0
         return [
             f"draw {wanted} trajectories of {scene.name}, {size * wanted / 1e9:.2g} GB, "
             f"in {out}, where {existing} exist"
@@ -116,7 +115,7 @@ class Data(SceneOptions, Command):
             scene = recorded_scene(self.scene)
             out = self.out or Path("datasets") / f"{scene.name}_recorded"
             card = write_recording(self.recorded, scene, out)
-            print("\n".join(card["checks"]))
+            print(*card["checks"], sep="\n")
             count = card["trajectories"]
             print(f"{count} recorded trajectories in {out}: they pass all checks")
             return card
@@ -124,7 +123,8 @@ class Data(SceneOptions, Command):
         mapper = partial(ray_map, address=self.ray) if self.ray else map
         generate(scene, self.config, out, self.quiet, self.strategy(scene), mapper)
         card = read_json(out / CARD)
-        count, dropped = card["trajectories"], card["dropped"]
-        print(f"{count} trajectories in {out}, {dropped} dropped")
+        print(
+            f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"
+        )
         expect_few_dropped(card)
         return card

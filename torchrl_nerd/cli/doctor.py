@@ -53,8 +53,7 @@ class Doctor(Command):
                 f"{check['seconds']:>7} s  {'ok' if check['agrees'] else 'DIFFERS'}"
             )
             tqdm.write(f"  {name:<29} {shown}")
-        wrong = [name for name, check in checks.items() if not check["agrees"]]
-        if wrong:
+        if wrong := [name for name, check in checks.items() if not check["agrees"]]:
             raise RuntimeError(
                 f"expected every shipped model to repeat its stored steps, "
                 f"{', '.join(wrong)} did not"

@@ -45,15 +45,6 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 
 
-def nominal(solver: str) -> Candidate:
-    """MuJoCo with the robot as its file has it, whatever varies."""
-
-    def make(scene: Scene) -> Dynamics:
-        return MujocoDynamics(replace(scene, variation=None))
-
-    return Candidate(f"{solver}, nominal", "simulator", make)
-
-
 @dataclass(frozen=True)
 class Eval(MeasuringCommand):
     """Open-loop error of MuJoCo at coarser settings and of every model, beside the paper.
@@ -96,11 +87,7 @@ class Eval(MeasuringCommand):
     own parameters."""
 
     def run(self) -> dict[str, Any]:
-        """Print the tables and return their rows.
-
-        Raises:
-            ValueError: fewer than 2 trajectories, or no such robot or model.
-        """
+        """Print the tables and return their rows; bad input raises ValueError."""
         if self.data is not None:
             if self.vary or self.history:
                 raise ValueError("expected --vary and --history without --data")
@@ -122,15 +109,18 @@ class Eval(MeasuringCommand):
             f"{solver_name}, {solver}. "
             "Every row, coarse MuJoCo included, is measured against it."
         )
+        candidates = simulators(scene)
         if ranges:
             print(
                 f"Every trajectory is of another robot: {', '.join(ranges)}. MuJoCo's rows "
                 "know each, but for the nominal one. So do models told their parameters."
             )
+            candidates.append(
+                Candidate(f"{solver_name}, nominal", "simulator", _as_in_its_file)
+            )
         names = [] if self.model is None else [self.model]
-        learned = models(scene, names, self.device, self.variants)
-        engines = [*simulators(scene), *([nominal(solver_name)] if ranges else [])]
-        parts = self.measure(protocol, [*engines, *learned])
+        candidates += models(scene, names, self.device, self.variants)
+        parts = self.measure(protocol, candidates)
         rows = [row for part in parts for row in part]
         print(f"\n{summary_table(scene, rows)}\n")
         for sentence in warnings(scene, rows):
@@ -160,11 +150,7 @@ class Eval(MeasuringCommand):
                 yield error_rows(chosen.scene, case, horizon, errors, published)
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
-        """The same for recorded trajectories.
-
-        Raises:
-            ValueError: no such split, or no trajectory that is long enough.
-        """
+        """The same for recorded trajectories; a split that is none raises ValueError."""
         protocol, scene = recorded_protocol(self.scene), recorded_scene(self.scene)
         model = from_pretrained(self.model or protocol.model, scene).to(self.device)
         recording, split = load_recording(path, scene)
@@ -191,3 +177,8 @@ class Eval(MeasuringCommand):
         record = make_record(results, self.seed, self.command_line(), self.device)
         about = {"configuration": self.configuration(), **results}
         write_json(self.record, about | record)
+
+
+def _as_in_its_file(scene: Scene) -> Dynamics:
+    """MuJoCo with the robot as its file has it, whatever varies."""
+    return MujocoDynamics(replace(scene, variation=None))

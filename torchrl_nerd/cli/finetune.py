@@ -39,10 +39,8 @@ class Finetune(DeviceCommand):
 
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""
-        _, parts = load_recording(self.recorded, recorded_scene(self.scene))
-        return [
-            f"{name}: {len(members)} trajectories" for name, members in parts.items()
-        ]
+        _, split = load_recording(self.recorded, recorded_scene(self.scene))
+        return [f"{name}: {len(part)} trajectories" for name, part in split.items()]
 
     def run(self) -> dict[str, Any]:
         """Train on the log's training trajectories; return the best model's card.
@@ -72,11 +70,11 @@ class Finetune(DeviceCommand):
         tuner = FineTuner(model, recording, *parts, self.config, self.quiet, keep)
         keep(tuner.run())
         card = read_json(out / CARD)
-        results = card["finetuning"]
+        results, prefix = card["finetuning"], "validation_"
         errors = ", ".join(
-            f"{name.removeprefix('validation_')} {value:.4f}"
+            f"{name.removeprefix(prefix)} {value:.4f}"
             for name, value in results.items()
-            if name.startswith("validation_")
+            if name.startswith(prefix)
         )
         print(
             f"best model in {out}: {errors} on validation trajectories; within 5% of "

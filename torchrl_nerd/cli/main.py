@@ -41,8 +41,6 @@ COMMANDS: dict[str, type[Command]] = {
     "stability": Stability,
     "doctor": Doctor,
 }
-
-
 INTERRUPTED = 130  # exit status of a process that Ctrl-C ended
 
 
@@ -72,9 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail((str(error) or repr(error)).splitlines()[0])
     except KeyboardInterrupt:  # Ctrl-C
-        return _fail(
-            "interrupted; the same command resumes data and training", INTERRUPTED
-        )
+        said = "interrupted; the same command resumes data and training"
+        return _fail(said, INTERRUPTED)
     return 0
 
 
@@ -85,16 +82,16 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
         SettingError: a setting out of range, in its own words and without a box.
     """
     said, shown = io.StringIO(), io.StringIO()
-    how: dict[str, Any] = {"args": argv[1:], "prog": f"nerd {argv[0]}"}
+    name, *args = argv
     try:
         with redirect_stderr(said), redirect_stdout(shown), REGISTRY:
-            return tyro.cli(kind, default=_default(kind, argv[1:]), **how)
+            default = _default(kind, args)
+            return tyro.cli(kind, prog=f"nerd {name}", args=args, default=default)
     except SystemExit as stop:
-        cause = stop.__context__
-        while cause is not None:
+        cause: BaseException | None = stop
+        while cause := cause.__cause__ or cause.__context__:
             if isinstance(cause, SettingError):
                 raise cause from None
-            cause = cause.__cause__ or cause.__context__
         sys.stderr.write(tidy(said.getvalue()))
         sys.stdout.write(tidy(shown.getvalue()))
         raise

@@ -44,11 +44,11 @@ def varied_ranges(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
     ranges = dict[str, Sequence[float]]()
     for given in vary:
         if given == "preset":
-            if not preset_of(name).variation:
+            if not (preset := preset_of(name).variation):
                 raise ValueError(
                     f"expected NAME=LOW:HIGH for '{name}', which has no preset to vary"
                 )
-            ranges |= preset_of(name).variation
+            ranges |= preset
             continue
         parameter, _, ends = given.partition("=")
         try:

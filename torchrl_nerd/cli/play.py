@@ -69,20 +69,15 @@ class Play(DeviceCommand):
         return self.json or self.video.with_name(f"{self.video.name}.json")
 
     def run(self) -> dict[str, Any]:
-        """Roll out, write the video and return what happened.
-
-        Raises:
-            ValueError: in one sentence, an option out of range or no such task or model.
-        """
+        """Roll out, write the video and return what happened; refuse bad input."""
         task, out = make_task(self.task), self.video
         check_video(out)
         if not 0.0 < self.slowdown < float("inf"):
             raise ValueError(f"expected slowdown above 0, got {self.slowdown}")
         expect_at_least(64, width=self.width)
-        steps = min(task.horizon, round(SECONDS / task.step_size))
-        if self.steps is not None:
-            expect_at_least(1, steps=self.steps)
-            steps = self.steps
+        shown = min(task.horizon, round(SECONDS / task.step_size))
+        steps = shown if self.steps is None else self.steps
+        expect_at_least(1, steps=steps)
         folder, actor = self.policy, self.actions or "random"
         if folder is None and self.actions is None:
             folder = shipped_policies().get(self.task)
@@ -97,11 +92,6 @@ class Play(DeviceCommand):
         for name, kind, total in zip(pair.names, pair.kinds, pair.returns, strict=True):
             rollouts.append({"dynamics": name, "kind": kind, "return": total})
             print(f"{name:<20} {kind:<14}{total:.1f} return")
-        return {
-            "task": self.task,
-            "video": out,
-            "steps": pair.steps,
-            "seconds": pair.seconds,
-            "ending": pair.ending or "steps",
-            "rollouts": rollouts,
-        }
+        length = {"steps": pair.steps, "seconds": pair.seconds}
+        found = {"ending": pair.ending or "steps", "rollouts": rollouts}
+        return {"task": self.task, "video": out, **length, **found}

@@ -37,11 +37,7 @@ class Stability(MeasuringCommand):
     """Compile the model's step: long cases take a fraction of the time."""
 
     def run(self) -> dict[str, Any]:
-        """Print a verdict per case, then the table, and return the results.
-
-        Raises:
-            ValueError: no such robot, case or model, or a scale out of range.
-        """
+        """Print verdicts, then the table, and return the results; refuse bad input."""
         if not 0.0 < self.scale <= 1.0:
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
         cases = [look_up("case", name, CASES) for name in self.cases or CASES]
@@ -58,6 +54,5 @@ class Stability(MeasuringCommand):
             results.append(result)
             found[result.case] = asdict(result)
             self.keep(found)  # hours of long cases outlive an interruption
-        print()
-        print(as_table(results, model.kind))
+        print(f"\n{as_table(results, model.kind)}")
         return found

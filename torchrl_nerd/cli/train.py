@@ -94,33 +94,30 @@ class Train(SceneOptions, DeviceCommand):
 
     def plan(self) -> list[str]:
         """Which model would be trained on which data, and what exists already."""
-        scene = self.load()
-        out, folders = self.folders
-        for folder in () if _is_missing(folders) else folders:
-            read_card(scene, folder)
-        initial = self.initial(scene)
-        if initial is None:
+        scene, (out, folders) = self.load(), self.folders
+        if _is_missing(folders):
+            count = preset_of(self.scene).data.trajectories
+            data = f"draw {count} trajectories, to {folders[0]}"
+        else:
+            for folder in folders:
+                read_card(scene, folder)
+            data = f"use the data in {', '.join(map(str, folders))}"
+        if (initial := self.initial(scene)) is None:
             model = make_model(scene, self.config)
         else:
             model = begin_from(initial, scene, self.config)
         weights = sum(weight.numel() for weight in model.network.parameters())
-        count = preset_of(self.scene).data.trajectories
         return [
-            f"draw {count} trajectories, to {folders[0]}"
-            if _is_missing(folders)
-            else f"use the data in {', '.join(map(str, folders))}",
-            f"resume the run in {out}"
-            if (out / STATE).exists()
-            else f"begin a run in {out}",
+            data,
+            f"{'resume the' if (out / STATE).exists() else 'begin a'} run in {out}",
             f"train the {weights} weights of a {model.kind} model for "
             f"{self.config.total_steps} updates",
         ]
 
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the preset chooses."""
-        scene = self.load()
-        preset, (out, folders) = preset_of(self.scene), self.folders
-        initial = self.initial(scene)
+        scene, preset = self.load(), preset_of(self.scene)
+        (out, folders), initial = self.folders, self.initial(scene)
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
         if _is_missing(folders):
@@ -159,11 +156,10 @@ def _is_missing(folders: tuple[Path, ...]) -> bool:
 
 def _errors(card: dict[str, Any]) -> str:
     """Validation errors of a card in one line."""
-    parts = [
-        f"{name} {error['mean']:.2g} {error['unit']} at {horizon} steps"
-        if error["mean"] is not None
-        else f"{name} not finite at {horizon} steps"
-        for horizon, by_name in card.get("validation_error", {}).items()
-        for name, error in by_name.items()
-    ]
+    parts = []
+    for horizon, by_name in card.get("validation_error", {}).items():
+        for name, error in by_name.items():
+            mean = error["mean"]
+            shown = "not finite" if mean is None else f"{mean:.2g} {error['unit']}"
+            parts.append(f"{name} {shown} at {horizon} steps")
     return ", ".join(parts) or "not validated"

@@ -38,31 +38,16 @@ class Transfer(MeasuringCommand):
     """Seed of the resets."""
 
     def run(self) -> dict[str, Any]:
-        """Print a table and return its rows.
-
-        Raises:
-            ValueError: fewer than 2 episodes; see `shipped_policy`, `load_policy` and
-                `transfer`.
-        """
+        """Print a table and return its rows; bad input raises ValueError."""
         if self.episodes < 2:
             raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
-        task = make_task(self.task)
-        folder = self.policy or shipped_policy(self.task)
-        policy = load_policy(folder, task)
-        actor = make_actor(policy.to(self.device))
+        task, folder = make_task(self.task), self.policy or shipped_policy(self.task)
+        actor = make_actor(load_policy(folder, task).to(self.device))
+        about = self.task, actor, self.dynamics, self.episodes
         summaries = transfer(
-            self.task,
-            actor,
-            self.dynamics,
-            self.episodes,
-            seed=self.seed,
-            device=self.device,
-            quiet=self.quiet,
+            *about, seed=self.seed, device=self.device, quiet=self.quiet
         )
         print(transfer_table(summaries))
         rows = [{"dynamics": name, **asdict(s)} for name, s in summaries.items()]
-        return {
-            "task": self.task,
-            "policy": str(self.policy or "shipped"),
-            "returns": rows,
-        }
+        used = str(self.policy or "shipped")
+        return {"task": self.task, "policy": used, "returns": rows}

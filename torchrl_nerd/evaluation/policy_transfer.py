@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_nerd.checkpoint import model_name, shipped_models
+from torchrl_nerd.checkpoint import shipped_models
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
@@ -24,11 +24,9 @@ from torchrl_nerd.evaluation.rollout_error import interval_of_mean
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import make_task
-from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
 
 GROUND_TRUTH = "mujoco"
-TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
 NOTE = (
     "Return difference: to MuJoCo, over the initial states that both ran. "
     "Behind ±: half of the 95% interval."
@@ -124,14 +122,13 @@ def transfer(
     Raises:
         ValueError: see `summarize` and `make_env`.
     """
-    names, returns = dict.fromkeys((*map(str, dynamics), GROUND_TRUTH)), {}
     counts = {"dm_control": min(episodes, slow_episodes)}
     envs = {  # all at first: an unknown name is refused before any episode
         name: make_env(task, name, counts.get(name, episodes), seed, device)
-        for name in names
+        for name in dict.fromkeys((*map(str, dynamics), GROUND_TRUTH))
     }
-    for name, env in tqdm(envs.items(), "dynamics", disable=quiet):
-        returns[name] = policy_returns(env, actor)
+    progress = tqdm(envs.items(), "dynamics", disable=quiet)
+    returns = {name: policy_returns(env, actor) for name, env in progress}
     found = {}
     for name, env in envs.items():
         about = env.dynamics.kind, env.model_name or name
@@ -139,21 +136,16 @@ def transfer(
     return found
 
 
-def model_title(scene: Scene, name: str) -> str:
-    """The model that a name stands for; engines by their proper names."""
-    return TITLES.get(name) or model_name(name, scene)
-
-
 def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     """Lines for the terminal: one dynamics each, with 95% intervals."""
     head = "dynamics", "kind", "model", "episodes", "return", "std", "return difference"
     body = []
     for name, s in summaries.items():
+        about = name, s.kind, s.model, str(s.episodes)
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
         difference = f"{s.difference:+.3%} ± {s.difference_interval:.3%}"
-        difference = difference if isfinite(s.difference) else "-"
-        about = [name, s.kind, s.model, str(s.episodes)]
-        body.append([*about, mean, f"{s.std:.1f}", difference])
+        shown = difference if isfinite(s.difference) else "-"
+        body.append([*about, mean, f"{s.std:.1f}", shown])
     return f"{text_table(head, body)}\n{NOTE}"
 
 

@@ -1,9 +1,4 @@
-"""The one schema of files in ``results/``: how numbers were made, and the numbers.
-
-``{"command", "commit", "machine", "seed", "results"}``: the command line that makes the
-file again, the commit of the code, processor and versions, the seed or seeds, and what
-was measured.
-"""
+"""The one schema of files in ``results/``: how numbers were made, and the numbers."""
 
 import platform
 import re
@@ -20,11 +15,11 @@ from torchrl_nerd import __version__
 from torchrl_nerd.files import read_json, write_json
 
 KEYS = {
-    "command": str,
-    "commit": str,
-    "machine": dict,
-    "seed": int | list | None,
-    "results": dict | list,
+    "command": str,  # line that makes the file again
+    "commit": str,  # of the code
+    "machine": dict,  # processor and versions
+    "seed": int | list | None,  # or seeds; None: nothing is random
+    "results": dict | list,  # what was measured
 }
 
 Results = dict[str, Any] | list[dict[str, Any]]
@@ -36,10 +31,7 @@ def make_record(
     command: str | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Results with their command line, commit, machine and seed.
-
-    Without ``command`` it is the running script's; without a seed nothing is random.
-    """
+    """The record of `KEYS`; ``command`` is the running script's by default."""
     return {
         "command": command or script_command(),
         "commit": commit(),
@@ -52,14 +44,8 @@ def make_record(
 def write_results(
     path: Path, results: Results, seed: int | list[int] | None = None, **about: Any
 ) -> None:
-    """Write the record of `make_record`, which has the same arguments, as JSON.
-
-    Raises:
-        ValueError: a part of another type, or a file that cannot be written.
-    """
-    record = make_record(results, seed, **about)
-    check_record(record)
-    write_json(path, record)
+    """Write the record of `make_record`, which has the same arguments, as JSON."""
+    write_json(path, make_record(results, seed, **about))
 
 
 def script_command() -> str:
@@ -80,28 +66,17 @@ def read_results(path: Path) -> dict[str, Any]:
     """The record in a file.
 
     Raises:
-        ValueError: no JSON there, or no record (what is wrong is named).
+        ValueError: no JSON there, or a key that is missing or of another type.
     """
     record = read_json(path)
-    try:
-        check_record(record)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return record
-
-
-def check_record(record: dict[str, Any]) -> None:
-    """Refuse what is not a record.
-
-    Raises:
-        ValueError: in one sentence, a key that is missing or of another type.
-    """
     for key, kind in KEYS.items():
         if key not in record:
-            raise ValueError(f"expected keys {', '.join(KEYS)}, found no '{key}'")
+            expected = ", ".join(KEYS)
+            raise ValueError(f"{path}: expected keys {expected}, found no '{key}'")
         if not isinstance(record[key], kind):
             found = type(record[key]).__name__
-            raise ValueError(f"expected '{key}' of type {kind}, got {found}")
+            raise ValueError(f"{path}: expected '{key}' of type {kind}, got {found}")
+    return record
 
 
 def commit() -> str:
@@ -117,21 +92,16 @@ def commit() -> str:
 
 def machine(device: str = "cpu") -> dict[str, Any]:
     """Processor, threads, device and versions."""
-    where = torch.device(device)
+    where, information = torch.device(device), Path("/proc/cpuinfo")
+    said = information.read_text() if information.exists() else ""
+    model = re.search(r"^model name\s*:\s*(.*)$", said, re.M)
     is_gpu = where.type == "cuda"
     return {
-        "processor": _processor(),
+        "processor": model[1] if model else platform.processor() or platform.machine(),
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name(where) if is_gpu else where.type,
         **versions("torch", "torchrl", "mujoco"),
     }
-
-
-def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    said = information.read_text() if information.exists() else ""
-    model = re.search(r"^model name\s*:\s*(.*)$", said, re.M)
-    return model[1] if model else platform.processor() or platform.machine()
 
 
 def versions(*packages: str) -> dict[str, str]:

@@ -11,14 +11,15 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from torchrl_nerd.checkpoint import model_name
 from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import frame_stack_of, stack_frames
-from torchrl_nerd.evaluation.policy_transfer import model_title
 from torchrl_nerd.files import check_writable, write_atomically
 from torchrl_nerd.keys import ACTION
 
 FixedActions = Literal["random", "zero"]
+TITLES = {"mujoco": "MuJoCo", "mujoco_warp": "MuJoCo Warp"}
 FRAMES_PER_SECOND = 25  # a GIF counts in hundredths of a second
 SHADES = (np.arange(256) // 8 * 255 / 31).astype(np.uint8)  # 32: half the GIF
 INK, GRAY = (30, 30, 30), (110, 110, 110)
@@ -61,7 +62,8 @@ class SideBySide:
         frames = 1 if isinstance(actor, str) else frame_stack_of(actor)
         bare = [make_env(task, name, 1, seed, device) for name in dynamics]
         self.envs = [stack_frames(env, frames) for env in bare]
-        self.names = [model_title(bare[1].scene, str(name)) for name in dynamics]
+        models = [model_name(name, bare[1].scene) for name in dynamics]
+        self.names = [TITLES.get(name, name) for name in models]
         self.kinds = [env.dynamics.kind for env in bare]
         self.returns, self.steps, self.ending = [0.0, 0.0], 0, ""
         self._dynamics, self._actor, self._closed_loop = dynamics, actor, closed_loop
