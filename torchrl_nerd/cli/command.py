@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_nerd import __version__
-from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.evaluation.results import make_record
 from torchrl_nerd.files import write_json
 from torchrl_nerd.settings import expect_device
 
@@ -38,11 +38,14 @@ class Command(ABC):
         return {k: v for k, v in asdict(self).items() if k not in ("json", "dry_run")}
 
     def keep(self, results: dict[str, Any]) -> None:
-        """Write results and settings to `record`, where there is one."""
+        """Write results and how they were made to `record`, where there is one."""
         if self.record is not None:
-            how: dict[str, Any] = {"command": type(self).__name__.lower()}
-            how |= {"version": __version__, "configuration": self.configuration()}
-            write_json(self.record, how | results)
+            write_json(self.record, self.content(results))
+
+    def content(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Of the file: results, command, version and all settings."""
+        how = {"command": type(self).__name__.lower(), "version": __version__}
+        return how | {"configuration": self.configuration()} | results
 
     def plan(self) -> list[str]:
         """What `run` would do, in sentences; bad input is refused as in `run`."""
@@ -76,12 +79,10 @@ class DeviceCommand(Command):
 class MeasuringCommand(DeviceCommand):
     """A command that writes its results in the schema of ``results/``."""
 
-    def keep(self, results: dict[str, Any]) -> None:
-        """Write results, command line, commit, machine and seed to `record`."""
-        if self.record is not None:
-            seed = getattr(self, "seed", None)
-            how = {"command": self.command_line(), "device": self.device}
-            write_results(self.record, results, seed, **how)
+    def content(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Of the file, see `make_record`."""
+        seed = getattr(self, "seed", None)
+        return make_record(results, seed, self.command_line(), self.device)
 
     def command_line(self) -> str:
         """The command line that does the same again, without what only shows or writes."""

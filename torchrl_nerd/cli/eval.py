@@ -33,8 +33,6 @@ from torchrl_nerd.evaluation.bench.errors import (
 )
 from torchrl_nerd.evaluation.bench.summary import summary_table, warnings
 from torchrl_nerd.evaluation.recorded_error import STATES, compare, errors_as_text
-from torchrl_nerd.evaluation.results import make_record
-from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import (
     EvaluationProtocol,
     load_scene,
@@ -170,13 +168,12 @@ class Eval(MeasuringCommand):
         shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
         return {**shared, **table["model"], "others": table}
 
-    def keep(self, results: dict[str, Any]) -> None:
+    def content(self, results: dict[str, Any]) -> dict[str, Any]:
         """As of every measurement; of recordings, each result at the top as well."""
-        if self.data is None or self.record is None:
-            return super().keep(results)
-        record = make_record(results, self.seed, self.command_line(), self.device)
-        about = {"configuration": self.configuration(), **results}
-        write_json(self.record, about | record)
+        record = super().content(results)
+        if self.data is None:
+            return record
+        return {"configuration": self.configuration(), **results, **record}
 
 
 def _as_in_its_file(scene: Scene) -> Dynamics:

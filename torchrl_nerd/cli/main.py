@@ -29,18 +29,8 @@ from torchrl_nerd.robots import PRESETS, preset_of
 from torchrl_nerd.scenes import is_import
 from torchrl_nerd.settings import SettingError, did_you_mean
 
-COMMANDS: dict[str, type[Command]] = {
-    "data": Data,
-    "train": Train,
-    "eval": Eval,
-    "finetune": Finetune,
-    "transfer": Transfer,
-    "play": Play,
-    "explain": Explain,
-    "bench": Bench,
-    "stability": Stability,
-    "doctor": Doctor,
-}
+KINDS = Data, Train, Eval, Finetune, Transfer, Play, Explain, Bench, Stability, Doctor
+COMMANDS: dict[str, type[Command]] = {kind.__name__.lower(): kind for kind in KINDS}
 INTERRUPTED = 130  # exit status of a process that Ctrl-C ended
 
 

@@ -46,16 +46,15 @@ class ErrorSummary:
 
 def initial_states(source: Source, num_trajectories: int, seed: int) -> TensorDict:
     """Initial states ``[n]`` of a task's resets or a scene's sampling ranges."""
-    generator = Generator().manual_seed(seed)
+    generator, n = Generator().manual_seed(seed), num_trajectories
     if isinstance(source, Scene):
-        values = source.sample_initial(num_trajectories, generator)[0]
+        values = source.sample_initial(n, generator)[0]
     else:
-        shape = num_trajectories, source.num_uniforms
-        u = torch.rand(shape, dtype=torch.float64, generator=generator)
+        u = torch.rand(n, source.num_uniforms, generator=generator, dtype=torch.float64)
         values = source.initial_state(u)
     if (variation := scene_of(source).variation) is not None:
-        values[PARAMETERS] = variation.draw(num_trajectories, generator)
-    return TensorDict(values, batch_size=[num_trajectories])
+        values[PARAMETERS] = variation.draw(n, generator)
+    return TensorDict(values, [n])
 
 
 def action_drive(
@@ -159,7 +158,7 @@ def open_loop(
     takes long over states that diverge.
     """
     shape = (len(start), steps, start[QPOS].shape[1])
-    positions = start[QPOS].new_full(shape, torch.nan)
+    positions = torch.full(shape, torch.nan).to(start[QPOS])
     states = states_of(dynamics, start, steps, command, history)
     for step, state in enumerate(states):
         positions[:, step] = state[QPOS]
@@ -175,10 +174,7 @@ def rollout(
     command: Tensor | Drive | None = None,
     every: int = 1,
 ) -> TensorDict:
-    """``qpos`` and ``qvel`` at the start and ``every`` so many steps; see `states_of`.
-
-    ``[n, 1 + steps // every]``.
-    """
+    """States ``[n, 1 + steps // every]`` at the start and after ``every`` so many steps."""
     kept: list[TensorDictBase] = [start.select(QPOS, QVEL)]
     for step, state in enumerate(states_of(dynamics, start, steps, command), 1):
         if step % every == 0:
@@ -193,36 +189,34 @@ def position_errors(scene: Scene, ground_truth: Tensor, other: Tensor) -> Errors
     over ``joints`` (rad); a fixed base gives one entry per joint, see `joint_label`.
     Another free body gives its position (m) and orientation (rad).
     """
-    model, both, joints, props = scene.model, (ground_truth, other), {}, {}
+    model, both, joints = scene.model, (ground_truth, other), {}
+    base, bodies = {}, {}  # of free joints: the base's, and all others
     for joint in range(model.njnt):
         q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
-        if kind == FREE:
-            if not scene.base.is_floating or q != scene.base.qpos_address:
-                body = model.body(model.jnt_bodyid[joint]).name
-                label = model.joint(joint).name or body or joint_label(model, joint)
-                place, turn = _pose_error(q, *both)
-                props |= {f"{label} position": place, f"{label} orientation": turn}
-            continue
-        if kind == BALL:
+        if kind == FREE and scene.base.is_floating and q == scene.base.qpos_address:
+            base = _pose_errors("base_", q, *both)
+        elif kind == FREE:
+            body = model.body(model.jnt_bodyid[joint]).name
+            label = model.joint(joint).name or body or joint_label(model, joint)
+            bodies |= _pose_errors(f"{label} ", q, *both)
+        elif kind == BALL:
             error = orientation_error(*(x[..., q : q + 4] for x in both))
+            joints[joint_label(model, joint)] = error
         else:
             error = ground_truth[..., q] - other[..., q]  # (n, steps)
             error = (wrap_angle(error) if kind == HINGE else error).abs()
-        joints[joint_label(model, joint)] = error
-    if not scene.base.is_floating:
-        return joints | props
-    place, turn = _pose_error(scene.base.qpos_address, *both)
-    errors = {"base_position": place, "base_orientation": turn}
-    if joints:
-        errors["joints"] = torch.stack(list(joints.values())).mean(0)  # (n, steps)
-    return errors | props
+            joints[joint_label(model, joint)] = error
+    if base and joints:
+        joints = {"joints": torch.stack(list(joints.values())).mean(0)}  # (n, steps)
+    return base | joints | bodies
 
 
-def _pose_error(q: int, one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """Error of the free joint at ``q`` in qpos: position, m, and orientation, rad."""
+def _pose_errors(label: str, q: int, one: Tensor, other: Tensor) -> Errors:
+    """Errors of the free joint at ``q`` in qpos: position, m, and orientation, rad."""
     offset = one[..., q : q + 3] - other[..., q : q + 3]
     turn = orientation_error(*(x[..., q + 3 : q + 7] for x in (one, other)))
-    return torch.linalg.vector_norm(offset, dim=-1), turn
+    place = torch.linalg.vector_norm(offset, dim=-1)
+    return {f"{label}position": place, f"{label}orientation": turn}
 
 
 def unit_of(scene: Scene, quantity: str) -> str:

@@ -182,10 +182,7 @@ def run_cases(
 
 def as_table(results: list[Result], kind: str = "tested") -> str:
     """Markdown: one line per metric; ``kind`` heads the tested dynamics' column."""
-    lines = [
-        f"| case | metric | MuJoCo | {kind} | tolerance | |",
-        "|---|---|---|---|---|---|",
-    ]
+    lines = [f"| case | metric | MuJoCo | {kind} | tolerance | |", "|---" * 6 + "|"]
     for result in results:
         name = result.case
         for metric in result.tested | result.ground_truth:

@@ -95,12 +95,10 @@ def mechanics(scene: Scene, states: TensorDictBase) -> dict[str, Tensor]:
         mass, kg m^2/s; ``penetration (n,)``, the deepest contact, m. In world axes.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
-    mass, count = float(model.body_mass.sum()), len(states)
-    sizes = {"energy": (), "com": (3,), "momentum": (3,), "angular_momentum": (3,)}
-    found = {
-        key: torch.full((count, *size), torch.nan, dtype=torch.float64)
-        for key, size in {**sizes, "penetration": ()}.items()
-    }
+    mass = float(model.body_mass.sum())
+    none = torch.full((len(states), 3), torch.nan, dtype=torch.float64)
+    found = {k: none.clone() for k in ("com", "momentum", "angular_momentum")}
+    found |= {k: none[:, 0].clone() for k in ("energy", "penetration")}
     both = torch.cat((states[QPOS], states[QVEL]), -1)  # (n, nq + nv)
     for i in torch.nonzero(both.isfinite().all(-1))[:, 0].tolist():
         data.qpos[:], data.qvel[:] = both[i].cpu().split((model.nq, model.nv))
