@@ -1,9 +1,7 @@
 """``nerd bench``: speed and error of MuJoCo and of every model of a scene."""
 
-from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
-
-import tyro
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional, SceneName
@@ -23,11 +21,6 @@ class Bench(BenchConfig, MeasuringCommand):
     """
 
     scene: Positional[SceneName]
-    models: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--model",))] = field(
-        default=(), kw_only=True
-    )
-    """Names of models or checkpoint folders; by default all that are shipped for the
-    robot."""
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""

@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+import tyro
 from tqdm import tqdm
 
 from torchrl_nerd.dynamics import MujocoDynamics
@@ -31,7 +33,7 @@ ALL = "all"
 class BenchConfig:
     """What `bench` measures, and how finely."""
 
-    models: tuple[str, ...] = ()
+    models: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--model",))] = ()
     """Names of models or checkpoint folders; by default all that are shipped for the
     robot."""
     variants: tuple[str, ...] = ("compiled",)
