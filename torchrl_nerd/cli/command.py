@@ -60,11 +60,7 @@ class Command(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceCommand(Command):
-    """A command that computes on a device.
-
-    Raises:
-        SettingError: a device that torch does not find.
-    """
+    """A command that computes on a device; one that torch does not find is refused."""
 
     device: str = "cpu"
     """Device of the model: cpu, cuda, or cuda:1 for the second GPU."""

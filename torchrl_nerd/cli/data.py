@@ -76,9 +76,9 @@ class Data(SceneOptions, Command):
         Raises:
             ValueError: hidden parameters change along a policy, or in too few steps.
         """
+        if self.policy is not None and self.changes:
+            raise ValueError("expected --changes without --policy")
         if self.policy is not None:
-            if self.changes:
-                raise ValueError("expected --changes without --policy")
             return along_policy(scene, self.policy, self.noise)
         if self.changes:
             expect_at_least(SEGMENT + 1, steps=self.config.steps)
@@ -101,12 +101,7 @@ class Data(SceneOptions, Command):
         ]
 
     def run(self) -> dict[str, Any]:
-        """Write the data set and return its card.
-
-        Raises:
-            ValueError: options that exclude each other, or too many trajectories that had
-                to be dropped; see `generate`, `load_recording`.
-        """
+        """Write the data set and return its card; bad input or data raise ValueError."""
         if self.recorded is not None:
             if self.policy is not None or self.vary or self.changes:
                 raise ValueError(

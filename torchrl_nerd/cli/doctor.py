@@ -33,11 +33,7 @@ class Doctor(Command):
     """Show no progress bar."""
 
     def run(self) -> dict[str, Any]:
-        """Print what was found and return it.
-
-        Raises:
-            RuntimeError: a shipped model does not repeat its stored steps.
-        """
+        """Print what was found and return it; RuntimeError where a model differs."""
         packages = {"torchrl_nerd": __version__, **versions(*PACKAGES)}
         found = {"versions": packages, "machine": _machine()}
         for title, entries in found.items():

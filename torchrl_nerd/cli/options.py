@@ -72,11 +72,7 @@ class SceneOptions:
     vary: Vary = ()
 
     def load(self) -> Scene:
-        """The scene with its own or the reference solver, and with what varies.
-
-        Raises:
-            ValueError: no such scene, parameter or range.
-        """
+        """The scene with its own or the reference solver, and with what varies."""
         scene, ranges = load_scene(self.scene), varied_ranges(self.scene, self.vary)
         scene = scene.reference if self.reference else scene
         return scene.vary(ranges) if ranges else scene

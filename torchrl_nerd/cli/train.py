@@ -77,11 +77,7 @@ class Train(SceneOptions, DeviceCommand):
         return self.out or Path("runs") / run, self.data or (Path("datasets") / name,)
 
     def initial(self, scene: Scene) -> NeRD | None:
-        """The model whose training continues; None: fresh weights.
-
-        Raises:
-            ValueError: no such model, or an analytic step.
-        """
+        """The model whose training continues, or None; refuse an analytic step."""
         if self.init_from is None:
             return None
         model = from_pretrained(self.init_from, scene)
