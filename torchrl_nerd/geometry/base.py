@@ -158,12 +158,7 @@ class JointAxes:
 
     def ancestry(self, bodies: list[int]) -> np.ndarray:
         """``(J, len(bodies))``: 1 where a body moves with a joint, else 0."""
-        moved = self.bodies[: len(self.joints)]
-        below = [[_is_below(self.model, body, top) for body in bodies] for top in moved]
-        return np.array(below, dtype=np.float64).reshape(len(moved), len(bodies))
-
-
-def _is_below(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
-    while body > ancestor:  # parents come first
-        body = int(model.body_parentid[body])
-    return body == ancestor
+        moves = np.eye(self.model.nbody)  # [body, ancestor or itself]
+        for body in range(1, self.model.nbody):  # parents come first
+            moves[body] += moves[self.model.body_parentid[body]]
+        return moves[np.ix_(bodies, self.bodies[: len(self.joints)])].T

@@ -54,27 +54,24 @@ class PointKinematics(nn.Module):
         self.base, self.depths = base, nn.ModuleList()
         self.trees = OtherTrees(model, base) if base.others else None
         roots = (base.body, *base.others)
-        moving = (base.is_floating, *(is_free(model, root) for root in base.others))
         # roots whose pose is a state, and those that stand in the world
-        above = {r: i for i, r in enumerate(roots) if moving[i]}
-        standing = {r: i for i, r in enumerate(roots) if not moving[i]}
+        above = {r: i for i, r in enumerate(roots) if is_free(model, r)}
+        standing = {r: i for i, r in enumerate(roots) if not is_free(model, r)}
         depth: dict[int, int] = {}
+        levels: list[dict[tuple, list[int]]] = []  # by depth, then by kinds of joints
         for body in _bodies_on_path(model, above, standing, bodies):  # parents first
             depth[body] = depth.get(int(model.body_parentid[body]), -1) + 1
+            if depth[body] == len(levels):
+                levels.append({})
+            kinds = tuple(model.jnt_type[body_joints(model, body)].tolist())
+            levels[depth[body]].setdefault(kinds, []).append(body)
         self.shows_roots = len(roots) > 1 or base.is_floating
         # a place in the world is no body: its root comes later
         order = [r if r in above else -r for r in roots] if self.shows_roots else []
-        for level in range(max(depth.values(), default=-1) + 1):
-            by_kind: dict[tuple, list[int]] = {}
-            for body in depth:
-                if depth[body] == level:
-                    joints = body_joints(model, body)
-                    kinds = tuple(model.jnt_type[joints].tolist())
-                    by_kind.setdefault(kinds, []).append(body)
-            members = by_kind.values()
-            groups = (_Group(model, standing, alike, above) for alike in members)
+        for level in levels:
+            groups = (_Group(model, standing, x, above) for x in level.values())
             self.depths.append(nn.ModuleList(groups))
-            ordered = [body for alike in members for body in alike]
+            ordered = [body for alike in level.values() for body in alike]
             above = {body: index for index, body in enumerate(ordered)}
             order += ordered
         self.body_of_point = [order.index(body) for body in bodies]

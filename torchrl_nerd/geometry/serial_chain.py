@@ -42,22 +42,28 @@ class SiteKinematics:
     """
 
     def __init__(self, model: mujoco.MjModel, site: str) -> None:
-        self.joints = _joints_to(model, site)
-        self.qpos_addresses = model.jnt_qposadr[self.joints].tolist()
-        self.dof_addresses = model.jnt_dofadr[self.joints].tolist()
-        self._chains = {torch.device("cpu"): serial_chain(model, site)}
+        bodies = _bodies_to(model, site)
+        joints = [joint for body in bodies for joint in body_joints(model, body)]
+        others = [j for j in joints if model.jnt_type[j] not in (HINGE, SLIDE)]
+        if others or not joints:
+            found = f"joint '{model.joint(others[0]).name}'" if others else "no joint"
+            raise ValueError(
+                f"expected hinges and slides on the way to site '{site}', got {found}"
+            )
+        self.qpos_addresses = model.jnt_qposadr[joints].tolist()
+        self.dof_addresses = model.jnt_dofadr[joints].tolist()
+        self._chains = {torch.device("cpu"): _serial_chain(model, site, bodies)}
 
     def __call__(self, qpos: Tensor) -> EndEffector:
         """Pose and Jacobian at ``qpos (*batch, nq)``, in the dtype of ``qpos``."""
-        batch, chain = qpos.shape[:-1], self.chain(qpos.device)
+        batch, chain = qpos.shape[:-1], self._chain(qpos.device)
         joints = qpos.reshape(batch.numel(), qpos.shape[-1])
         joints = take(joints, self.qpos_addresses)
         jacobian, pose = chain.jacobian_tensor(joints.double(), ret_eef_pose=True)
         parts = (x.to(qpos.dtype) for x in (pose[:, :3, 3], pose[:, :3, :3], jacobian))
         return EndEffector(*(x.reshape(*batch, *x.shape[1:]) for x in parts))
 
-    def chain(self, device: torch.device) -> "SerialChain":
-        """The chain on a device: float64, the joints in the order of the attributes."""
+    def _chain(self, device: torch.device) -> "SerialChain":
         if device not in self._chains:
             with torch.inference_mode(False):
                 first = copy.deepcopy(self._chains[torch.device("cpu")])
@@ -89,18 +95,13 @@ def bias_acceleration(jacobian: Tensor, rates: Tensor) -> Tensor:
 
 
 @torch.inference_mode(False)
-def serial_chain(model: mujoco.MjModel, site: str) -> "SerialChain":
-    """pytorch-kinematics' chain from the world to a site, float64; its joints take qpos.
-
-    Raises:
-        ValueError: as for `SiteKinematics`.
-    """
+def _serial_chain(model: mujoco.MjModel, site: str, bodies: list[int]) -> "SerialChain":
+    """pytorch-kinematics' chain from the world to a site, float64; its joints take qpos."""
     from pytorch_kinematics import Chain, SerialChain
 
-    _joints_to(model, site)
     root = last = make_frame("world", np.eye(4))
     offset = np.eye(4)
-    for body in _bodies_to(model, site):
+    for body in bodies:
         last, offset = add_body(model, body, last, offset)
     place = model.site(site)
     end = make_frame(END, offset @ _matrix(place.pos, place.quat))
@@ -166,15 +167,3 @@ def _bodies_to(model: mujoco.MjModel, site: str) -> list[int]:
         bodies.insert(0, body)
         body = int(model.body_parentid[body])
     return bodies
-
-
-def _joints_to(model: mujoco.MjModel, site: str) -> list[int]:
-    """Joints from the base to the site."""
-    joints = [j for b in _bodies_to(model, site) for j in body_joints(model, b)]
-    others = [j for j in joints if model.jnt_type[j] not in (HINGE, SLIDE)]
-    if others or not joints:
-        found = f"joint '{model.joint(others[0]).name}'" if others else "no joint"
-        raise ValueError(
-            f"expected hinges and slides on the way to site '{site}', got {found}"
-        )
-    return joints
