@@ -9,11 +9,8 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_nerd.geometry.manifold import JointLayout
-from torchrl_nerd.geometry.rotations import (
-    quat_normalize,
-    random_tilt,
-    rotate,
-)
+from torchrl_nerd.geometry.rotations import quat_normalize, random_tilt, rotate
+from torchrl_nerd.scenes.controllers import Row
 
 GroundSampler = Callable[[Tensor, Generator], Tensor]
 """``(qpos (n, nq), generator) -> terrain (n, terrain.size)``."""
@@ -24,7 +21,6 @@ Drive = Callable[[Tensor, Tensor, Tensor, Generator], Tensor]
 Starts = Callable[[int, Generator], dict[str, Tensor]]
 """``(rows, generator) -> qpos (rows, nq), qvel (rows, nv)``, perhaps ``terrain``."""
 
-Row = tuple[float, ...]
 MAX_REDRAWS = 300  # of states that are not clear of the ground or of the robot itself
 
 
@@ -93,8 +89,9 @@ class Sampling:
             if not 0.0 <= (value := getattr(self, name)) <= 1.0:
                 raise ValueError(f"expected {name} from 0 to 1, got {value}")
         if least is not None and not 0.0 < least <= 1.0:
-            wanted = "a min_torque_scale above 0 and up to 1"
-            raise ValueError(f"expected {wanted}, got {least}")
+            raise ValueError(
+                f"expected a min_torque_scale above 0 and up to 1, got {least}"
+            )
         if times is not None and not 0.0 < times[0] <= times[1]:
             wanted = "two correlation times above 0 s, the lower first"
             raise ValueError(f"expected {wanted}, got {times}")
@@ -138,23 +135,21 @@ def draw_initial(
         ValueError: no state within the ranges is clear of the ground.
     """
 
-    def draw(rows: int) -> tuple[Tensor, Tensor]:
-        return _draw(sampling, layout, rows, generator)
-
-    def excess(qpos: Tensor) -> tuple[Tensor, Tensor]:
-        """By how much states are too near to the ground, and too deep, m, ``(n,)``."""
-        low = deep = qpos.new_zeros(len(qpos))
+    def draw(rows: int) -> tuple[Tensor, ...]:
+        """States, and by how much they are too near to the ground, and too deep, m."""
+        qpos, qvel = _draw(sampling, layout, rows, generator)
+        low = deep = qpos.new_zeros(rows)
         if sampling.clearance is not None:
             low = (sampling.clearance - clearances(qpos).amin(-1)).clamp_min(0.0)
         if sampling.penetration is not None:
             deep = (depths(qpos) - sampling.penetration).clamp_min(0.0)
-        return low, deep
+        return qpos, qvel, low, deep
 
     if sampling.starts is not None:
         state = dict(sampling.starts(rows, generator))
         torque_scale, _ = sample_scale(sampling, rows, generator)
     else:
-        qpos, qvel = _draw_clear(rows, draw, excess)
+        qpos, qvel = _draw_clear(rows, draw)
         torque_scale, speed_scale = sample_scale(sampling, rows, generator)
         state = {"qpos": qpos, "qvel": speed_scale * qvel}
     if sampling.ground is not None and "terrain" not in state:
@@ -163,23 +158,18 @@ def draw_initial(
 
 
 def _draw_clear(
-    rows: int,
-    draw: Callable[[int], tuple[Tensor, Tensor]],
-    excess: Callable[[Tensor], tuple[Tensor, Tensor]],
+    rows: int, draw: Callable[[int], tuple[Tensor, ...]]
 ) -> tuple[Tensor, Tensor]:
-    """Positions and velocities, drawn again where they have an excess."""
-    qpos, qvel = draw(rows)
-    low, deep = excess(qpos)
+    """Positions and velocities, drawn again where they are too near or too deep."""
+    drawn = qpos, qvel, low, deep = draw(rows)
     for _ in range(MAX_REDRAWS):
         again = (low + deep > 0.0).nonzero()[:, 0]
         if not len(again):
             return qpos, qvel
-        new_qpos, new_qvel = draw(len(again))
-        new_low, new_deep = excess(new_qpos)
-        better = new_low + new_deep < (low + deep)[again]
-        chosen = again[better]
-        qpos[chosen], qvel[chosen] = new_qpos[better], new_qvel[better]
-        low[chosen], deep[chosen] = new_low[better], new_deep[better]
+        new = draw(len(again))
+        better = new[2] + new[3] < (low + deep)[again]
+        for kept, other in zip(drawn, new, strict=True):
+            kept[again[better]] = other[better]
     if low.any():
         raise ValueError(
             f"expected ranges with states clear of the ground, found none in {MAX_REDRAWS} "

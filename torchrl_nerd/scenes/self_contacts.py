@@ -15,6 +15,7 @@ from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.geometry.segments import between_segments
 from torchrl_nerd.scenes.contact_points import own_contacts
 from torchrl_nerd.scenes.ranges import position_ranges
+from torchrl_nerd.scenes.shapes import geom_kind
 
 MAX_PAIRS = 16
 MARGIN_PER_RADIUS = 2.0  # of the sum of both radii
@@ -79,14 +80,12 @@ def capsule_pairs(model: mujoco.MjModel) -> CapsulePairs:
 def _capsule(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     """Ends ``(2, 3)``, m, in the body's frame, and radius, m."""
     half, centre = model.geom_size[geom].copy(), np.zeros(3)
-    kind = mujoco.mjtGeom(model.geom_type[geom])
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        half[1:] = half[0]
-    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        half = np.array([half[0], half[0], half[1] + half[0]])
-    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        half = np.array([half[0], half[0], half[1]])
-    elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+    kind, (radius, length, _) = geom_kind(model, geom), half
+    if kind == "sphere":
+        half[:] = radius
+    elif kind in ("capsule", "cylinder"):
+        half[:] = radius, radius, length + radius * (kind == "capsule")
+    elif kind == "mesh":
         centre, half = np.split(model.geom_aabb[geom], 2)
     longest = int(half.argmax())
     radius = min(float(np.delete(half, longest).mean()), float(half[longest]))
