@@ -58,7 +58,7 @@ class DynamicsEvaluation(nn.Module):
         self.num_base_dofs = 3 * scene.base.is_floating
         # points of several bodies in one place act together, each moved by its own joints
         every, *_ = shape_points(model, scene.max_contact_points)
-        weights = points.merged @ axes.ancestry(every).T
+        weights = points.merged @ axes.ancestry[:, every].T
         weights /= points.merged.sum(1, keepdims=True)  # (P, J)
         longest = int((weights > 0.0).sum(1).max(initial=0))
         # a point's own joints first, then others of weight zero, to fill the row

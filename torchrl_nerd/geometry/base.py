@@ -125,11 +125,11 @@ class JointAxes:
     The anchor and the tip of every axis are points for `PointKinematics` to find.
     """
 
-    model: mujoco.MjModel
     joints: list[int]  # ids, in the order of their dofs
     bodies: list[int]  # of the points: all anchors, then all tips
     positions: np.ndarray  # (2 J, 3), m, in the body's frame
     is_slide: np.ndarray  # (J,): 1 for a slide, 0 for a hinge
+    ancestry: np.ndarray  # (J, bodies of the model): 1 where one moves with a joint
 
     @classmethod
     def of(cls, model: mujoco.MjModel, base: Base) -> "JointAxes":
@@ -152,13 +152,8 @@ class JointAxes:
         anchor, axis = model.jnt_pos[joints], model.jnt_axis[joints]
         positions = np.concatenate((anchor, anchor + axis))
         is_slide = (model.jnt_type[joints] == SLIDE).astype(np.float64)
-        return cls(
-            model, joints, 2 * model.jnt_bodyid[joints].tolist(), positions, is_slide
-        )
-
-    def ancestry(self, bodies: list[int]) -> np.ndarray:
-        """``(J, len(bodies))``: 1 where a body moves with a joint, else 0."""
-        moves = np.eye(self.model.nbody)  # [body, ancestor or itself]
-        for body in range(1, self.model.nbody):  # parents come first
-            moves[body] += moves[self.model.body_parentid[body]]
-        return moves[np.ix_(bodies, self.bodies[: len(self.joints)])].T
+        moves = np.eye(model.nbody)  # [body, ancestor or itself]
+        for body in range(1, model.nbody):  # parents come first
+            moves[body] += moves[model.body_parentid[body]]
+        moved = model.jnt_bodyid[joints]
+        return cls(joints, 2 * moved.tolist(), positions, is_slide, moves[:, moved].T)

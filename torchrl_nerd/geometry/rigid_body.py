@@ -70,10 +70,10 @@ class RigidBodyDynamics(nn.Module):
         joints, below = axes.joints, axes.bodies[: len(axes.joints)]
         self.qpos_addresses = model.jnt_qposadr[joints].tolist()
         ancestry = np.ones((model.nv, len(found)))
-        ancestry[self.num_base_dofs :] = axes.ancestry(found)
+        ancestry[self.num_base_dofs :] = axes.ancestry[:, found]
         together = np.ones((model.nv, model.nv))
         together[self.num_base_dofs :] = 0.0
-        together[self.num_base_dofs :, self.num_base_dofs :] = axes.ancestry(below)
+        together[self.num_base_dofs :, self.num_base_dofs :] = axes.ancestry[:, below]
         keep_constants(
             self,
             mass=model.body_mass[found, None],

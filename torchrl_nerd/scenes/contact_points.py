@@ -84,24 +84,23 @@ def shape_points(
     ``thinned`` of `ContactPoints`. A robot of ``most`` points of spheres, capsules and
     boxes keeps them all; of another one the spheres' remain and those that `thin` keeps.
     """
-    bodies, exact, single, error = [], [], [], 0.0
+    geoms, error = touching_geoms(model), 0.0
     parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 3)), np.zeros(0))]
-    for geom in touching_geoms(model):
+    for geom in geoms:
         points, radius, beyond = shape_balls(model, geom)
         parts.append((points, radius))
-        bodies += [int(model.geom_bodyid[geom])] * len(points)
-        exact += [geom_kind(model, geom) in EXACT] * len(points)
-        single += [len(points) == 1] * len(points)
         error = max(error, beyond)
+    counts = np.array([len(radius) for _, radius in parts[1:]], int)
     positions, radii = (np.concatenate(x) for x in zip(*parts, strict=True))
-    kept = np.array(exact, bool)
+    bodies = np.repeat(model.geom_bodyid[geoms], counts)
+    is_exact = np.array([geom_kind(model, geom) in EXACT for geom in geoms], bool)
+    kept = np.repeat(is_exact, counts)
     if not kept.all() or len(kept) > most:
-        kept = np.array(single, bool)
-        kept, more = thin(positions, radii, np.array(bodies), kept, TOLERANCE, most)
+        single = np.repeat(counts == 1, counts)
+        kept, more = thin(positions, radii, bodies, single, TOLERANCE, most)
         error += more
-    chosen = np.flatnonzero(kept)
-    bodies = [bodies[i] for i in chosen]
-    return bodies, positions[chosen], radii[chosen], error, int((~kept).sum())
+    thinned = int((~kept).sum())
+    return bodies[kept].tolist(), positions[kept], radii[kept], error, thinned
 
 
 def touching_geoms(model: mujoco.MjModel) -> list[int]:

@@ -61,11 +61,8 @@ def check_supported(name: str, model: mujoco.MjModel) -> None:
     Raises:
         ValueError: with all reasons, each naming its elements and their bodies.
     """
-    base, reasons = None, []
-    try:
-        base = Base.from_model(model)
-    except ValueError as error:
-        reasons.append(str(error))
+    base = Base.from_model(model) if model.njnt else None
+    reasons = [] if base else ["no joint"]
     is_floating = base is not None and base.is_floating
     for what, is_there, get in (*_parts(model, is_floating), *_actuators(model)):
         found = np.flatnonzero(is_there).tolist()

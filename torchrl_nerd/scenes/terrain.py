@@ -23,6 +23,8 @@ from torchrl_nerd.geometry.rotations import (
 )
 from torchrl_nerd.scenes.contact_points import HEIGHT_FIELD, PLANE
 
+Pair = tuple[Tensor, Tensor]
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -169,9 +171,9 @@ class TerrainDistance(nn.Module):
         """
         if terrain is None:
             terrain = self.default.expand(*points.shape[:-2], -1)
-        planes = list(self.terrain.split(terrain))
+        planes, frame = list(self.terrain.split(terrain)), (position, rotation)
         (distance, normal), *others = (
-            self._to_surface(index, points, planes, position, rotation)
+            self._to_surface(index, points, planes, frame)
             for index in range(len(self.terrain.surfaces))
         )
         for other_distance, other_normal in others:
@@ -181,13 +183,8 @@ class TerrainDistance(nn.Module):
         return distance, normal
 
     def _to_surface(
-        self,
-        index: int,
-        points: Tensor,
-        planes: list[Tensor],
-        position: Tensor,
-        rotation: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+        self, index: int, points: Tensor, planes: list[Tensor], frame: Pair
+    ) -> Pair:
         """Distance and normal to one surface; takes the row's ``planes`` in their order."""
         surface = self.terrain.surfaces[index]
 
@@ -197,10 +194,10 @@ class TerrainDistance(nn.Module):
         if surface.kind == PLANE:
             plane = planes.pop(0) if surface.mocap >= 0 else own("plane")
             plane = plane.expand(*points.shape[:-2], -1)
-            seen = surfaces.plane_in_frame(plane, position, rotation)
+            seen = surfaces.plane_in_frame(plane, *frame)
             return surfaces.plane_distance(points, seen)
-        frame = position, rotation, own("position"), own("rotation")
-        local, turn = surfaces.into_frame(points, *frame)
+        there = own("position"), own("rotation")
+        local, turn = surfaces.into_frame(points, *frame, *there)
         if surface.kind == HEIGHT_FIELD:
             half_x, half_y = (float(half) for half in surface.size[:2])
             field = own("heights"), half_x, half_y, self.reach

@@ -137,7 +137,7 @@ class PredictedForce(nn.Module):
         keep_constants(
             self,
             law=np.stack(numbers),  # (5, P)
-            ancestry=axes.ancestry(scene.contacts.bodies),  # (J, P)
+            ancestry=axes.ancestry[:, scene.contacts.bodies],  # (J, P)
             is_slide=axes.is_slide,
         )
 
