@@ -67,6 +67,22 @@ def test_a_payload_is_a_small_heavy_body(generator):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
+def test_the_place_of_a_payload_of_every_body():
+    """It is in each body's frame; where no axis has a place, the centre of mass."""
+    ranges = {"payload": (0.0, 2.0), "payload_x": (-1.0, 1.0)}
+    found, given = (
+        variation("double_pendulum", ranges),
+        torch.tensor([2.0, 0.5]).double(),
+    )
+    before, after = found.model, varied_model(found, given)
+    for body in found.parameters[0].indices:
+        mass, centre = before.body_mass[body], before.body_ipos[body]
+        moved = (mass * centre[0] + 2.0 * 0.5) / (mass + 2.0)
+        assert after.body_mass[body] == mass + 2.0
+        np.testing.assert_allclose(after.body_ipos[body], [moved, *centre[1:]])
+    assert len(found.parameters[0].indices) == 2
+
+
 @pytest.mark.parametrize("friction", [0.1, 0.5])
 def test_a_slope_is_steep_where_friction_does_not_hold(friction):
     """A cube rests on ground that rises by less than its friction, and slides on more."""
@@ -130,6 +146,7 @@ def test_presets_name_what_is_there(name):
         ({"delay:slider": (0, 2)}, "without a target"),
         ({"motor:hinge": (0.5, 2)}, "a joint with a motor"),
         ({"payload_x:pole": (0, 1)}, "expected 'payload:pole' beside"),
+        ({"payload_x": (0, 1)}, "expected 'payload' beside 'payload_x', got none"),
         ({"slope": (0, 1)}, "slope:x or slope:y"),
         ({"slope:x": (-2, 2)}, "possible range"),
         ({"friction": (1e-300, 1e300)}, "possible range"),

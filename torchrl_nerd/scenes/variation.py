@@ -51,6 +51,11 @@ class Parameter:
     indices: list[int]  # of its target's bodies, dofs or geoms
 
     @property
+    def suffix(self) -> str:
+        """Of its name, such as ``:torso``; empty without a target."""
+        return self.name.removeprefix(self.kind)
+
+    @property
     def is_factor(self) -> bool:
         """Whether it multiplies what the robot has."""
         return KINDS[self.kind].unit == "factor"
@@ -75,16 +80,13 @@ class Variation:
         self.parameters = [_parameter(model, *item) for item in ranges.items()]
         self._columns = {p.name: i for i, p in enumerate(self.parameters)}
         for parameter in self.parameters:
-            kind, _, target = parameter.name.partition(":")
-            if kind.startswith("payload_") and f"payload:{target}" not in ranges:
-                raise ValueError(
-                    f"expected 'payload:{target}' beside '{parameter.name}', got none"
-                )
+            name, kind = parameter.name, parameter.kind
+            load = "payload" + parameter.suffix
+            if kind.startswith("payload_") and load not in ranges:
+                raise ValueError(f"expected '{load}' beside '{name}', got none")
             has_motors = set(parameter.indices) <= set(actuated)
-            if kind == "motor" and target and not has_motors:
-                raise ValueError(
-                    f"expected a joint with a motor, got '{parameter.name}'"
-                )
+            if kind == "motor" and parameter.suffix and not has_motors:
+                raise ValueError(f"expected a joint with a motor, got '{name}'")
 
     @property
     def size(self) -> int:
@@ -155,10 +157,10 @@ class Variation:
             for i, p in self._of_kind(kind):
                 value, indices = parameters[:, i : i + 1], p.indices
                 if kind == "payload":
-                    target = p.name.partition(":")[2]
-                    places = [self._columns.get(f"payload_{x}:{target}") for x in "xyz"]
+                    names = (f"payload_{x}{p.suffix}" for x in "xyz")
+                    columns = [self._columns.get(name) for name in names]
                     none = np.full(len(parameters), np.nan)
-                    at = [none if j is None else parameters[:, j] for j in places]
+                    at = [none if j is None else parameters[:, j] for j in columns]
                     value = np.column_stack((value, *at))
                 if about.write is not None:
                     about.write(fields, indices, value)
