@@ -8,9 +8,7 @@ can move are dropped: the ground cannot do work on them, but for friction at the
 cap that turns on the spot.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -105,26 +103,16 @@ def shape_points(
 
 def touching_geoms(model: mujoco.MjModel) -> list[int]:
     """Moving shapes that can touch a surface of `terrain_geoms`."""
-    grounds, is_pair = terrain_geoms(model), collision_filter(model)
-    return [
-        geom
-        for geom in _moving_geoms(model)
-        if any(is_pair(geom, ground) for ground in grounds)
-    ]
+    touches = collision_filter(model)[:, terrain_geoms(model)].any(1)
+    return np.flatnonzero(_is_moving(model) & touches).tolist()
 
 
 def ground_geoms(model: mujoco.MjModel) -> list[int]:
     """Static or mocap shapes that something moving can touch."""
-    if model.opt.disableflags & NO_CONTACT:
-        return []
-    moving, weld = _moving_geoms(model), model.body_weldid[model.geom_bodyid]
-    is_pair = collision_filter(model)
+    weld = model.body_weldid[model.geom_bodyid]
     is_ground = (weld == 0) | (model.body_mocapid[weld] >= 0)
-    return [
-        geom
-        for geom in np.flatnonzero(is_ground).tolist()
-        if any(is_pair(geom, other) for other in moving)
-    ]
+    touches = collision_filter(model)[:, _is_moving(model)].any(1)
+    return np.flatnonzero(is_ground & touches).tolist()
 
 
 def terrain_geoms(model: mujoco.MjModel) -> list[int]:
@@ -135,36 +123,32 @@ def terrain_geoms(model: mujoco.MjModel) -> list[int]:
 
 def own_contacts(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Pairs of the robot's own shapes between which MuJoCo detects contact."""
-    if model.opt.disableflags & NO_CONTACT:
-        return []
-    is_pair = collision_filter(model)
-    return [pair for pair in combinations(_moving_geoms(model), 2) if is_pair(*pair)]
+    moving = _is_moving(model)
+    pairs = np.argwhere(np.triu(collision_filter(model) & moving[:, None] & moving))
+    return [(low, high) for low, high in pairs.tolist()]
 
 
-def collision_filter(model: mujoco.MjModel) -> Callable[[int, int], bool]:
-    """Whether MuJoCo looks for contact between two geoms, one of which moves.
+def collision_filter(model: mujoco.MjModel) -> np.ndarray:
+    """Between which geoms, one of which moves, MuJoCo detects contact, ``(n, n)`` bool.
 
     Explicit pairs always. Else not those of one body, of a body and its parent (but for
     the world), or that the model excludes, and only those whose bits say so. Source:
     https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
     """
-    keep_parents = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
-    weld, excluded = model.body_weldid, set(model.exclude_signature.tolist())
-    ends = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-    pairs = {tuple(sorted(pair)) for pair in ends}
-    kinds, partners = model.geom_contype, model.geom_conaffinity
-
-    def is_pair(geom: int, other: int) -> bool:
-        if tuple(sorted((geom, other))) in pairs:
-            return True
-        low, high = sorted(int(model.geom_bodyid[x]) for x in (geom, other))
-        top, below = sorted((int(weld[low]), int(weld[high])))
-        is_parent = 0 < top == weld[model.body_parentid[below]] and not keep_parents
-        if top == below or is_parent or (low << 16) + high in excluded:
-            return False
-        return bool(kinds[geom] & partners[other] or kinds[other] & partners[geom])
-
-    return is_pair
+    if model.opt.disableflags & NO_CONTACT:
+        return np.zeros((model.ngeom, model.ngeom), bool)
+    body = model.geom_bodyid
+    top, parent = model.body_weldid[body], model.body_weldid[model.body_parentid]
+    is_child = (parent[top] == top[:, None]) & (top[:, None] > 0)
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        is_child[:] = False
+    low, high = np.minimum(body, body[:, None]), np.maximum(body, body[:, None])
+    is_excluded = np.isin((low << 16) + high, model.exclude_signature)
+    is_asked = (model.geom_contype & model.geom_conaffinity[:, None]) != 0
+    is_pair = (is_asked | is_asked.T) & (top != top[:, None])
+    is_pair &= ~(is_child | is_child.T | is_excluded)
+    is_pair[model.pair_geom1, model.pair_geom2] = True
+    return is_pair | is_pair.T
 
 
 def body_label(model: mujoco.MjModel, body: int) -> str:
@@ -172,9 +156,8 @@ def body_label(model: mujoco.MjModel, body: int) -> str:
     return model.body(body).name or f"body {body}"
 
 
-def _moving_geoms(model: mujoco.MjModel) -> list[int]:
-    weld = model.body_weldid[model.geom_bodyid]
-    return np.flatnonzero(model.body_dofnum[weld]).tolist()
+def _is_moving(model: mujoco.MjModel) -> np.ndarray:
+    return model.body_dofnum[model.body_weldid[model.geom_bodyid]] > 0
 
 
 def _leaders(

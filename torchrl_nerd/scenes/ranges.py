@@ -121,29 +121,24 @@ def _speeds(
     model: mujoco.MjModel, controller: ActuatorController, torque: list[float]
 ) -> np.ndarray:
     """Largest speed of every dof, m/s or rad/s, to three digits."""
-    gravity, reach = float(np.linalg.norm(model.opt.gravity)), _reaches(model)
-    strength = dict(zip(controller.dof_addresses, torque, strict=True))
-    weight, damping = _gravity_moments(model), model.dof_damping
-    speeds = np.empty(model.nv)
-    for dof in range(model.nv):
-        joint = int(model.dof_jntid[dof])
-        kind = int(model.jnt_type[joint])
-        fall = 2.0 * sqrt(gravity * reach[joint])  # over twice the reach
-        is_linear = kind == FREE and dof < model.jnt_dofadr[joint] + 3
-        if kind == FREE:
-            speed = fall if is_linear else fall / max(reach[joint], LEAST_REACH)
-        else:
-            width = 2.0 * (FREE_SLIDE if kind == SLIDE else pi)
-            if model.jnt_limited[joint] and kind != BALL:
-                width = float(np.ptp(model.jnt_range[joint]))
-            effort = strength.get(dof, 0.0) + weight[joint] * (kind != SLIDE)
-            speed = sqrt(effort * width / model.dof_M0[dof])
-            if damping[dof] > 0.0:
-                speed = min(speed, effort / damping[dof])
-            if kind == SLIDE:
-                speed = max(speed, fall)
-            speed = min(speed, width / CROSSING)
-        speeds[dof] = max(speed, LEAST_SPEED)
+    joint, damping = model.dof_jntid, model.dof_damping
+    kind, reach = model.jnt_type[joint], np.array(_reaches(model))[joint]
+    fall = 2.0 * np.sqrt(
+        np.linalg.norm(model.opt.gravity) * reach
+    )  # over twice the reach
+    width = np.where(kind == SLIDE, 2.0 * FREE_SLIDE, 2.0 * pi)
+    is_limited = (model.jnt_limited[joint] > 0) & (kind != BALL)
+    width = np.where(is_limited, np.ptp(model.jnt_range[joint], 1), width)
+    effort = _gravity_moments(model)[joint] * (kind != SLIDE)
+    effort[list(controller.dof_addresses)] += torque
+    speed = np.sqrt(effort * width / model.dof_M0)
+    at_most = np.full(model.nv, np.inf)
+    speed = np.minimum(speed, np.divide(effort, damping, at_most, where=damping > 0.0))
+    speed = np.where(kind == SLIDE, np.maximum(speed, fall), speed)
+    speed = np.minimum(speed, width / CROSSING)
+    is_linear = np.arange(model.nv) < model.jnt_dofadr[joint] + 3
+    free = np.where(is_linear, fall, fall / np.maximum(reach, LEAST_REACH))
+    speeds = np.maximum(np.where(kind == FREE, free, speed), LEAST_SPEED)
     slower = _stable(model, controller, speeds)
     return np.array([float(f"{speed:.3g}") for speed in slower])
 
