@@ -68,6 +68,14 @@ def is_free(model: mujoco.MjModel, body: int) -> bool:
     return bool(model.jnt_type[model.body_jntadr[body]] == FREE)
 
 
+def ancestors(model: mujoco.MjModel) -> np.ndarray:
+    """Which bodies each hangs on, itself and the world too, ``(nbody, nbody)``, bool."""
+    found = np.eye(model.nbody, dtype=bool)
+    for body in range(1, model.nbody):  # parents come first
+        found[body] |= found[model.body_parentid[body]]
+    return found
+
+
 def root_pose(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Where a tree's root body stands before its joints move.
 
@@ -152,8 +160,6 @@ class JointAxes:
         anchor, axis = model.jnt_pos[joints], model.jnt_axis[joints]
         positions = np.concatenate((anchor, anchor + axis))
         is_slide = (model.jnt_type[joints] == SLIDE).astype(np.float64)
-        moves = np.eye(model.nbody)  # [body, ancestor or itself]
-        for body in range(1, model.nbody):  # parents come first
-            moves[body] += moves[model.body_parentid[body]]
         moved = model.jnt_bodyid[joints]
-        return cls(joints, 2 * moved.tolist(), positions, is_slide, moves[:, moved].T)
+        ancestry = ancestors(model)[:, moved].T.astype(np.float64)
+        return cls(joints, 2 * moved.tolist(), positions, is_slide, ancestry)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import Base, is_free
+from torchrl_nerd.geometry.base import Base, ancestors, is_free
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import BALL, SLIDE, body_joints
 from torchrl_nerd.geometry.motion import (
@@ -229,15 +229,9 @@ def _bodies_on_path(
     bodies: list[int],
 ) -> list[int]:
     """Bodies from the roots to the points' bodies, parents first; free roots left out."""
-    needed: set[int] = set()
-    for body in bodies:
-        while body not in above:
-            if body == 0:
-                raise ValueError(
-                    "expected contact points on moving bodies of the robot"
-                )
-            needed.add(body)
-            if body in standing:
-                break
-            body = int(model.body_parentid[body])
-    return sorted(needed)
+    on_way = ancestors(model)  # [body, body on its way to the world]
+    moves = np.any(on_way[:, [*above, *standing]], 1)
+    if not moves[bodies].all():
+        raise ValueError("expected contact points on moving bodies of the robot")
+    moves[list(above)] = False
+    return np.flatnonzero(on_way[bodies].any(0) & moves).tolist()

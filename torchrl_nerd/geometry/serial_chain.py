@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_nerd.geometry.base import ancestors
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE, body_joints
 from torchrl_nerd.geometry.rotations import quat_matrix
@@ -162,8 +163,4 @@ def _bodies_to(model: mujoco.MjModel, site: str) -> list[int]:
     if site not in names:
         known = ", ".join(filter(None, names)) or "none"
         raise ValueError(f"expected the name of a site ({known}), got {site!r}")
-    bodies, body = [], int(model.site(site).bodyid[0])
-    while body:
-        bodies.insert(0, body)
-        body = int(model.body_parentid[body])
-    return bodies
+    return np.flatnonzero(ancestors(model)[model.site(site).bodyid[0]])[1:].tolist()

@@ -176,16 +176,11 @@ def _leaders(
         turns = data.xmat[bodies].reshape(-1, 3, 3)
         tracks.append(data.xpos[bodies] + (turns @ positions[..., None])[..., 0])
     track = np.stack(tracks, 1)  # (P, poses, 3)
-    leaders: list[int] = []
-    for i in range(len(bodies)):
-        if not base.is_floating and np.ptp(track[i], 0).max() < 1e-9:
-            leaders.append(-1)
-            continue
-        twins = (
-            k
-            for k in range(i)
-            if leaders[k] == k and radii[i] == radii[k]
-            if abs(track[i] - track[k]).max() < 1e-9
-        )
-        leaders.append(next(twins, i))
-    return leaders
+    apart = abs(track[:, None] - track).max((2, 3))  # (P, P), m
+    twins = (apart < 1e-9) & (radii[:, None] == radii)
+    leaders = np.array(
+        [row.argmax() for row in twins], int
+    )  # the first twin, or itself
+    if not base.is_floating:
+        leaders[np.ptp(track, 1).max(1) < 1e-9] = -1
+    return leaders.tolist()

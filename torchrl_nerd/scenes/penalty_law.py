@@ -68,13 +68,12 @@ def set_penalty_contact(
     limit ``kf``, N s/m; Coulomb friction coefficient ``mu``.
     """
     model.opt.impratio = kf / kd
-    for geom in range(model.ngeom):
-        inverse_mass = model.body_invweight0[model.geom_bodyid[geom], 0]
-        if inverse_mass:
-            model.geom_solref[geom] = (-ke * inverse_mass, -kd * inverse_mass)
-            model.geom_solimp[geom] = SOLIMP
-            model.geom_friction[geom, 0] = mu
-            model.geom_priority[geom] = 1
+    inverse_mass = model.body_invweight0[model.geom_bodyid, 0]
+    geoms = np.flatnonzero(inverse_mass)
+    model.geom_solref[geoms] = np.outer(inverse_mass[geoms], (-ke, -kd))
+    model.geom_solimp[geoms] = SOLIMP
+    model.geom_friction[geoms, 0] = mu
+    model.geom_priority[geoms] = 1
 
 
 def set_penalty_limit(
@@ -84,10 +83,10 @@ def set_penalty_limit(
 
     As `set_penalty_contact`; ``ke`` in N/m or N m/rad, ``kd`` in N s/m or N m s/rad.
     """
-    for index in (model.joint(joint).id for joint in joints):
-        inverse_mass = model.dof_invweight0[model.jnt_dofadr[index]]
-        model.jnt_solref[index] = (-ke * inverse_mass, -kd * inverse_mass)
-        model.jnt_solimp[index] = SOLIMP
+    ids = [model.joint(joint).id for joint in joints]
+    inverse_mass = model.dof_invweight0[model.jnt_dofadr[ids]]
+    model.jnt_solref[ids] = np.outer(inverse_mass, (-ke, -kd))
+    model.jnt_solimp[ids] = SOLIMP
 
 
 @dataclass(frozen=True)
