@@ -30,11 +30,9 @@ def take(x: Tensor, places: Sequence[int], dim: int = -1) -> Tensor:
 def cast_constants(module: Module, dtype: torch.dtype) -> Module:
     """The module itself, its float64 numbers in another precision, and finite there."""
     limit = torch.finfo(dtype).max
-    for part in module.modules():
-        for numbers in (part._buffers, part._parameters):
-            for x in numbers.values():
-                if x is not None and x.dtype == torch.float64:
-                    x.data = x.data.clamp(-limit, limit).to(dtype)
+    for x in (*module.buffers(), *module.parameters()):
+        if x.dtype == torch.float64:
+            x.data = x.data.clamp(-limit, limit).to(dtype)
     return module
 
 

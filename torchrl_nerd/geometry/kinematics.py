@@ -6,6 +6,8 @@ relative to the base frame, so distance from the world's origin never costs digi
 Source: Featherstone, "Rigid Body Dynamics Algorithms" (2008), section 4.4.
 """
 
+from collections import defaultdict
+
 import mujoco
 import numpy as np
 import torch
@@ -58,17 +60,16 @@ class PointKinematics(nn.Module):
         above = {r: i for i, r in enumerate(roots) if is_free(model, r)}
         standing = {r: i for i, r in enumerate(roots) if not is_free(model, r)}
         depth: dict[int, int] = {}
-        levels: list[dict[tuple, list[int]]] = []  # by depth, then by kinds of joints
+        # by depth, then by kinds of joints
+        levels: dict[int, dict[tuple, list[int]]] = defaultdict(dict)
         for body in _bodies_on_path(model, above, standing, bodies):  # parents first
             depth[body] = depth.get(int(model.body_parentid[body]), -1) + 1
-            if depth[body] == len(levels):
-                levels.append({})
             kinds = tuple(model.jnt_type[body_joints(model, body)].tolist())
             levels[depth[body]].setdefault(kinds, []).append(body)
         self.shows_roots = len(roots) > 1 or base.is_floating
         # a place in the world is no body: its root comes later
         order = [r if r in above else -r for r in roots] if self.shows_roots else []
-        for level in levels:
+        for level in levels.values():
             groups = (_Group(model, standing, x, above) for x in level.values())
             self.depths.append(nn.ModuleList(groups))
             ordered = [body for alike in level.values() for body in alike]

@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_nerd.geometry.base import Base
-from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE, body_joints
+from torchrl_nerd.geometry.base import Base, ancestors
+from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE
 from torchrl_nerd.scenes.contact_points import contact_points, terrain_geoms
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.sampling import BaseSampling, Sampling, uniform
@@ -122,7 +122,7 @@ def _speeds(
 ) -> np.ndarray:
     """Largest speed of every dof, m/s or rad/s, to three digits."""
     joint, damping = model.dof_jntid, model.dof_damping
-    kind, reach = model.jnt_type[joint], np.array(_reaches(model))[joint]
+    kind, reach = model.jnt_type[joint], _reaches(model)[joint]
     fall = 2.0 * np.sqrt(
         np.linalg.norm(model.opt.gravity) * reach
     )  # over twice the reach
@@ -181,19 +181,15 @@ def _gravity_moments(model: mujoco.MjModel) -> np.ndarray:
     return size * model.body_subtreemass[bodies] * arms
 
 
-def _reaches(model: mujoco.MjModel) -> list[float]:
-    """Distance from each joint to the far end of all that hangs on it, m."""
-    data = mujoco.MjData(model)
+def _reaches(model: mujoco.MjModel) -> np.ndarray:
+    """Distance from each joint to the far end of all that hangs on it, m, ``(njnt,)``."""
+    data, reaches = mujoco.MjData(model), np.zeros(model.njnt)
     mujoco.mj_forward(model, data)
-    reaches = [0.0] * model.njnt
-    for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
-        while body:  # every joint between the shape and the world
-            for joint in body_joints(model, body):
-                offset = data.geom_xpos[geom] - data.xanchor[joint]
-                reach = float(np.linalg.norm(offset) + model.geom_rbound[geom])
-                reaches[joint] = max(reaches[joint], reach)
-            body = int(model.body_parentid[body])
+    hangs = ancestors(model)[np.ix_(model.geom_bodyid, model.jnt_bodyid)]
+    for geom, joint in np.argwhere(hangs):
+        offset = data.geom_xpos[geom] - data.xanchor[joint]
+        reach = np.linalg.norm(offset) + model.geom_rbound[geom]
+        reaches[joint] = max(reaches[joint], reach)
     return reaches
 
 
@@ -206,7 +202,7 @@ def _base_sampling(model: mujoco.MjModel, speed: list[float]) -> BaseSampling:
     linear, angular = (tuple(speed[a : a + 3]) for a in (0, 3))
     return BaseSampling(
         low=(0.0, 0.0, ground),
-        high=(0.0, 0.0, ground + 2.0 * _reaches(model)[0]),
+        high=(0.0, 0.0, ground + 2.0 * float(_reaches(model)[0])),
         tilt=pi,
         linear_low=tuple(-v for v in linear),
         linear_high=linear,

@@ -49,12 +49,10 @@ class Terrain:
     """One or more surfaces; for every contact point the nearest one counts.
 
     Every contact point sees all of them, whatever the filters of its shape say.
-
-    ``mocap_default (mocap bodies, 7)``: poses as the file has them.
     """
 
     surfaces: tuple[Surface, ...]
-    mocap_default: np.ndarray
+    mocap_default: np.ndarray  # (mocap bodies, 7): poses as the file has them
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel, geoms: list[int]) -> "Terrain":
