@@ -255,11 +255,11 @@ def sample_scale(
     torque 0 in the zero-torque fraction; both U(0, 1) in the low-torque one.
     """
     draw = torch.rand(2, rows, 1, dtype=torch.float64, generator=generator)
-    loud = one = torch.ones_like(draw[0])
+    loud = torch.ones_like(draw[0])
     is_passive = draw[0] < sampling.zero_torque_fraction
     is_quiet = draw[0] > 1.0 - sampling.low_torque_fraction
-    speed = torch.where(is_quiet | is_passive, draw[1], one)
+    speed = torch.where(is_quiet | is_passive, draw[1], 1.0)
     if sampling.min_torque_scale is not None:
         loud = log_uniform(sampling.min_torque_scale, 1.0, rows, generator)
-    torque = torch.where(is_passive, 0.0 * one, torch.where(is_quiet, draw[1], loud))
+    torque = torch.where(is_passive, 0.0, torch.where(is_quiet, draw[1], loud))
     return torque, speed

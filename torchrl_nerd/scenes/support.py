@@ -35,7 +35,7 @@ _LOCK = fork_safe_lock()
 
 @contextmanager
 def silence_mujoco() -> Iterator[list[str]]:
-    """Neither warnings on the terminal nor a MUJOCO_LOG.TXT: MuJoCo adds to this list.
+    """Collect MuJoCo's warnings in a list: none on the terminal, no MUJOCO_LOG.TXT.
 
     What MuJoCo calls is one for all threads: the last that leaves such a block puts back
     what the first found.

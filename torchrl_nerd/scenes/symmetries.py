@@ -157,7 +157,7 @@ def _largest_change(
     With a floating ``base``, its linear velocity is seen from the base and no force
     drives it; without one, every dof is driven.
     """
-    largest, num_valid = 0.0, 0
+    changes: list[float] = []
     for _ in range(TRIALS):
         data = mujoco.MjData(model)
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
@@ -172,16 +172,14 @@ def _largest_change(
             data.ctrl = rng.normal(size=model.nu)
         moved = copy.copy(data)
         move(moved, rng)
-        size = abs(data.qvel).max()
+        speed = abs(data.qvel).max()
         with silence_mujoco():
             change = _change(model, data, substeps, base)
             moved_change = _change(model, moved, substeps, base)
-        if data.warning.number.any() or moved.warning.number.any():
-            continue  # MuJoCo reset the state: nothing to compare
-        num_valid += 1
-        size += abs(change).max()
-        largest = max(largest, float(abs(change - moved_change).max() / size))
-    return largest if num_valid else 1.0
+        if not (data.warning.number.any() or moved.warning.number.any()):
+            size = speed + abs(change).max()
+            changes.append(float(abs(change - moved_change).max() / size))
+    return max(changes, default=1.0)  # MuJoCo resets what it warns of: not comparable
 
 
 def _change(
