@@ -178,9 +178,8 @@ def _leaders(
     track = np.stack(tracks, 1)  # (P, poses, 3)
     apart = abs(track[:, None] - track).max((2, 3))  # (P, P), m
     twins = (apart < 1e-9) & (radii[:, None] == radii)
-    leaders = np.array(
-        [row.argmax() for row in twins], int
-    )  # the first twin, or itself
+    # the first twin, which may be the point itself
+    leaders = np.array([row.argmax() for row in twins], int)
     if not base.is_floating:
         leaders[np.ptp(track, 1).max(1) < 1e-9] = -1
     return leaders.tolist()
