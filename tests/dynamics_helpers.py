@@ -346,3 +346,11 @@ def edit_card(folder: Path, **changes: object) -> None:
     """Replace entries of a checkpoint's card."""
     card = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps({**card, **changes}))
+
+
+def stand_on_feet(scene: Scene, state: TensorDict) -> None:
+    """Put dm_control's hopper 5 mm into the ground, upright and at rest, in place."""
+    qpos = torch.from_numpy(scene.model.qpos0).expand(len(state), -1).clone()
+    height = scene.model.joint("rootz").qposadr[0]
+    qpos[:, height] -= scene.clearances(qpos, None).amin(-1) + 0.005
+    state["qpos"], state["qvel"] = qpos, torch.zeros_like(state["qvel"])

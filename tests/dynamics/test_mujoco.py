@@ -6,9 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from dynamics_helpers import each_with_motors, random_drive, roll, unequal_keys
+from dynamics_helpers import (
+    each_with_motors,
+    random_drive,
+    roll,
+    stand_on_feet,
+    unequal_keys,
+)
 from torch import Generator, Tensor
 
+from torchrl_nerd import load_scene
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.scenes import Scene
 
@@ -55,6 +62,23 @@ def test_rollout_is_a_plain_loop_of_mj_step(scene, generator):
 def test_one_substep_at_a_time_is_the_same_loop(scene, generator):
     fine = Scene(scene.name, scene.model, 1, scene.controller, scene.sampling)
     assert_is_plain_loop(fine, generator)
+
+
+def test_sensors_feel_from_the_first_step_on(generator):
+    scene = load_scene("dm_control/hopper-hop")
+    start, torques, _ = random_drive(scene, 2, 3, generator)
+    stand_on_feet(scene, start)
+    engine, state = MujocoDynamics(scene, 1), start
+    model, data = copy.copy(scene.model), mujoco.MjData(scene.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    data.qpos[:] = start["qpos"][0]
+    for torque in torques:
+        state = engine.step(state, torque)
+        data.qfrc_applied[scene.actuated] = torque[0]
+        mujoco.mj_step(model, data, scene.substeps)
+        felt = state["sensordata"][0].numpy()
+        np.testing.assert_array_equal(felt, data.sensordata)
+        assert felt[-2:].any()  # toe and heel
 
 
 @pytest.mark.parametrize("rows", [1, 3, 33])

@@ -126,6 +126,8 @@ class MujocoDynamics(Engine):
             self._batch = Batch(model, count, self.num_threads)
             self._warmstart = self._batch.bind("qacc_warmstart")
             self._warmstart[:] = 0.0
+            if self.feels_forces:  # filled by the steps that follow
+                self._batch.bind(SENSORDATA)
         _STARTED.add(self)
 
     def _restart(self) -> None:
@@ -154,7 +156,7 @@ class MujocoDynamics(Engine):
         if self.feels_forces:
             felt = np.zeros((0, self._model.nsensordata))
             if self._batch is not None:
-                felt = self._batch.bind("sensordata").copy()
+                felt = self._batch.bind(SENSORDATA).copy()
             values[SENSORDATA] = torch.from_numpy(felt)
         return values
 
