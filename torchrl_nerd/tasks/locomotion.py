@@ -21,7 +21,6 @@ from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.tasks.body_motion import BodyMotion
 from torchrl_nerd.tasks.task import State, Task, own_actuators
 
-HORIZON = 1000  # control steps
 RARE = 1e-12  # a uniform number nearer to 0 or 1 would be an infinite normal one
 
 
@@ -67,13 +66,9 @@ class LocomotionTask(Task):
 
     Raises:
         ValueError: no such task.
-
-    Examples:
-        >>> LocomotionTask("gymnasium/Hopper-v5").observation_size
-        11
     """
 
-    horizon = HORIZON
+    horizon = 1000
 
     def __init__(self, name: str) -> None:
         env_id = name.removeprefix("gymnasium/")

@@ -43,11 +43,6 @@ class SuiteTask(Task):
 
     Raises:
         ValueError: in one sentence, no such task or something not supported.
-
-    Examples:
-        >>> task = SuiteTask("dm_control/pendulum-swingup")
-        >>> task.horizon, task.observation_size
-        (1000, 3)
     """
 
     num_uniforms = 1
@@ -55,18 +50,16 @@ class SuiteTask(Task):
     def __init__(self, name: str, frame_skip: int = 1) -> None:
         self.name, self.frame_skip = name, frame_skip
         model = self.scene.model  # refuses what is not supported
-        judge = SuiteReward(name)
-        self.horizon = ceil(judge.horizon / frame_skip)
-        self.observation_size = judge.observation_size
-        width = 3 * len(judge.targets)
+        suite = SuiteReward(name)
+        self.horizon = ceil(suite.horizon / frame_skip)
+        self.observation_size = suite.observation_size
+        width = 3 * len(suite.targets)
         self.parameters = {TARGET: width} if width else {}
         self._sizes = (model.nq, model.nv, width)
-        self._forces, self._num_ctrl = judge.forces, model.nu
-        self._targets = judge.targets
-        self._start, self._judge = _RowMemo(judge.start), _RowMemo(judge)
-        domain, _, task = name.removeprefix("dm_control/").partition("-")
-        known = domain in FORMULAS
-        self._formula = FORMULAS[domain](self.scene, task) if known else None
+        self._forces, self._targets = suite.forces, suite.targets
+        self._start, self._judge = _RowMemo(suite.start), _RowMemo(suite.judge)
+        formula = FORMULAS.get(suite.domain)
+        self._formula = None if formula is None else formula(self.scene, suite.task)
 
     def build_scene(self) -> Scene:
         """The suite's robot and its ground."""
@@ -74,7 +67,7 @@ class SuiteTask(Task):
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """By the suite's ``initialize_episode``, seeded with u."""
-        qpos, qvel, target = _on_rows(self._start, u).split(self._sizes, -1)
+        qpos, qvel, target = self._start(u).split(self._sizes, -1)
         targets = {TARGET: target} if self.parameters else {}
         return {QPOS: qpos, QVEL: qvel, **targets}
 
@@ -118,7 +111,7 @@ class SuiteTask(Task):
     def _judged(self, state: State) -> Tensor:
         """Reward, end and observation of each env; the control is zero after a reset."""
         qpos = state[QPOS]
-        ctrl = qpos.new_zeros(*qpos.shape[:-1], self._num_ctrl)
+        ctrl = qpos.new_zeros(*qpos.shape[:-1], self.scene.model.nu)
         if ACTION in state.keys():
             ctrl = own_actuators(self).ctrl(state[ACTION].to(qpos.dtype))
         felt = qpos.new_full((*qpos.shape[:-1], len(self._forces)), torch.nan)
@@ -126,7 +119,7 @@ class SuiteTask(Task):
             felt = state[SENSORDATA][..., self._forces]
         target = [state[key] for key in self.parameters]
         row = torch.cat((qpos, state[QVEL], *target, ctrl, felt), -1)
-        return _on_rows(self._judge, row)
+        return self._judge(row)
 
 
 class SuiteReward:
@@ -142,8 +135,8 @@ class SuiteReward:
     """
 
     def __init__(self, name: str) -> None:
-        domain, _, task = name.removeprefix("dm_control/").partition("-")
-        env = load_suite(domain, task)
+        self.domain, _, self.task = name.removeprefix("dm_control/").partition("-")
+        env = load_suite(self.domain, self.task)
         self._task, self._physics = env.task, env.physics
         if not np.isfinite(env._step_limit):
             raise ValueError(f"task '{name}' has no time limit: not supported")
@@ -176,7 +169,7 @@ class SuiteReward:
         target = self._model.geom_pos[self.targets].ravel()
         return np.concatenate((self._data.qpos, self._data.qvel, target))
 
-    def __call__(self, row: np.ndarray) -> np.ndarray:
+    def judge(self, row: np.ndarray) -> np.ndarray:
         """Reward, whether the episode ends (0 or 1), and observation of one state.
 
         ``row``: qpos, qvel, the targets' positions, ctrl and the `forces` felt, NaN where
@@ -231,29 +224,22 @@ _ONE_AT_A_TIME = fork_safe_lock()
 
 
 class _RowMemo:
-    """A slow function of rows; a row that is the same as last time keeps its answer."""
+    """A slow function of NumPy rows; answers of the last call are known in the next."""
 
     def __init__(self, function: Callable[[np.ndarray], np.ndarray]) -> None:
         self.function = function
-        self._given, self._answers = np.zeros((0, 0)), np.zeros((0, 0))
+        self._answers: dict[bytes, np.ndarray] = {}
 
-    def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Answers to ``rows (n, k)``; of the same n and k as last time, or all anew."""
+    @uncompiled
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Answers to ``rows (*batch, k)``, in float64."""
+        flat = rows.double().flatten(0, -2).cpu().numpy()
         with _ONE_AT_A_TIME:  # one `Physics`, written in and read
-            is_known = np.zeros(len(rows), bool)
-            if rows.shape == self._given.shape:  # bit for bit: NaN equals NaN
-                is_known = (rows.view(np.int64) == self._given.view(np.int64)).all(-1)
-            answers = [
-                self._answers[i] if is_known[i] else self.function(row)
-                for i, row in enumerate(rows)
-            ]
-            self._given, self._answers = rows, np.array(answers)
-            return self._answers
-
-
-@uncompiled
-def _on_rows(function: _RowMemo, rows: Tensor) -> Tensor:
-    """A function of NumPy rows ``(n, k)``, of float64 tensors ``(*batch, k)``."""
-    flat = rows.double().flatten(0, -2).cpu().contiguous().numpy().copy()
-    answers = torch.from_numpy(function(flat).copy())
-    return answers.to(rows.device).unflatten(0, rows.shape[:-1])
+            known, self._answers = self._answers, {}
+            keys = [row.tobytes() for row in flat]
+            for key, row in zip(keys, flat, strict=True):
+                if key not in self._answers:
+                    found = known[key] if key in known else self.function(row)
+                    self._answers[key] = found
+            answers = np.array([self._answers[key] for key in keys])
+        return torch.from_numpy(answers).to(rows.device).unflatten(0, rows.shape[:-1])
