@@ -130,27 +130,18 @@ def _check_names(robot: Robot) -> None:
             f"({', '.join(RESERVED)}), got {found}"
         )
 
-    # a scene's name may hold a dash
-    starts = {mark: tuple(scene + mark for scene in scenes) for mark in "/-"}
-    of_scenes: dict[str, tuple[str, Callable[[str], bool]]] = {
-        "tasks": ("SCENE/TASK", lambda name: name.startswith(starts["/"])),
-        "presets": ("SCENE", lambda name: name in scenes),
-        "models": (
-            "SCENE or SCENE-KIND",
-            lambda name: name in scenes or name.startswith(starts["-"]),
-        ),
+    # names that fit, and beginnings of them; a scene's name may hold a dash
+    tasks = tuple(f"{scene}/" for scene in scenes)
+    kinds = tuple(f"{scene}-" for scene in scenes)
+    rules = {
+        "tasks": ("SCENE/TASK of its scenes", scenes, (), tasks),
+        "presets": ("SCENE of its scenes", scenes, scenes, ()),
+        "models": ("SCENE or SCENE-KIND of its scenes", scenes, scenes, kinds),
+        "ppo": ("its tasks", robot.tasks, robot.tasks, ()),
+        "policies": ("its tasks", robot.tasks, robot.tasks, ()),
     }
-    for field, (form, fits) in of_scenes.items():
+    for field, (form, listed, names, starts) in rules.items():
         for name in getattr(robot, field):
-            if not fits(name) or name.endswith("/"):
-                known = ", ".join(scenes)
-                raise ValueError(
-                    f"expected {form} of its scenes ({known}) as {field}, got '{name}'"
-                )
-    for field in ("ppo", "policies"):
-        for name in getattr(robot, field):
-            if name not in robot.tasks:
-                known = ", ".join(robot.tasks) or "none"
-                raise ValueError(
-                    f"expected its tasks ({known}) as {field}, got '{name}'"
-                )
+            if name not in names and not name.startswith(starts) or name.endswith("/"):
+                known = ", ".join(listed) or "none"
+                raise ValueError(f"expected {form} ({known}) as {field}, got '{name}'")
