@@ -73,7 +73,8 @@ class SuiteTask(Task):
 
     def observation(self, state: State) -> Tensor:
         """The suite's, flattened in its order."""
-        if self._formula is None or not self._is_felt(state):
+        knows_forces = not len(self._forces) or SENSORDATA in state.keys()
+        if self._formula is None or not knows_forces:
             return self._judged(state)[..., 2:]
         return self._formula.observation(state[QPOS], state[QVEL], self._extra(state))
 
@@ -95,10 +96,6 @@ class SuiteTask(Task):
         """Its targets, where this episode has them."""
         if self.parameters:
             model.geom_pos[self._targets] = state[TARGET].cpu().reshape(-1, 3)
-
-    def _is_felt(self, state: State) -> bool:
-        """Whether all contact forces that the task reads are known."""
-        return not len(self._forces) or SENSORDATA in state.keys()
 
     def _extra(self, state: State) -> Tensor:
         """Targets, or forces felt, where the task has any, ``(*batch, k)``."""
@@ -153,10 +150,6 @@ class SuiteReward:
     def _model(self) -> mujoco.MjModel:
         return self._physics.model.ptr
 
-    @property
-    def _data(self) -> mujoco.MjData:
-        return self._physics.data.ptr
-
     def start(self, u: np.ndarray) -> np.ndarray:
         """Start of an episode by the suite's own ``initialize_episode``.
 
@@ -166,8 +159,8 @@ class SuiteReward:
         self._task.random.seed(int(u[0] * SEEDS))
         with self._physics.reset_context():
             self._task.initialize_episode(self._physics)
-        target = self._model.geom_pos[self.targets].ravel()
-        return np.concatenate((self._data.qpos, self._data.qvel, target))
+        data, target = self._physics.data.ptr, self._model.geom_pos[self.targets]
+        return np.concatenate((data.qpos, data.qvel, target.ravel()))
 
     def judge(self, row: np.ndarray) -> np.ndarray:
         """Reward, whether the episode ends (0 or 1), and observation of one state.
@@ -175,7 +168,7 @@ class SuiteReward:
         ``row``: qpos, qvel, the targets' positions, ctrl and the `forces` felt, NaN where
         nobody knows them: MuJoCo then computes them at this state.
         """
-        model, data = self._model, self._data
+        model, data = self._model, self._physics.data.ptr
         sizes = (model.nq, model.nv, 3 * len(self.targets), model.nu)
         data.qpos, data.qvel, target, data.ctrl, felt = np.split(row, np.cumsum(sizes))
         model.geom_pos[self.targets] = target.reshape(-1, 3)
