@@ -15,7 +15,6 @@ from torchrl_nerd.configs import (
     UnconstrainedConfig,
 )
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.settings import look_up
 
 __all__ = [
     "STEPS",
@@ -27,7 +26,6 @@ __all__ = [
     "default_step",
     "fitting_steps",
     "make_step",
-    "step_config",
 ]
 
 STEPS: dict[str, StepConfig] = {
@@ -37,11 +35,6 @@ STEPS: dict[str, StepConfig] = {
     "penalty-contact-1-stage": PenaltyContactConfig(num_stages=1),
     "penalty-contact-1-stage-merged": PenaltyContactConfig(1, merged_substeps=2),
 }
-
-
-def step_config(name: str) -> StepConfig:
-    """The configuration of that name in `STEPS`; a SettingError where there is none."""
-    return look_up("analytic step", name, STEPS)
 
 
 def default_step(scene: Scene) -> StepConfig:

@@ -1,10 +1,9 @@
 """A control step with penalty contacts: few dynamics evaluations, many force substeps.
 
-MuJoCo evaluates everything anew in every substep: mass matrix, bias forces, kinematics and
-collision. Within a control step these change little and smoothly. The stiff forces of
-contacts and limits do not, but their law is a cheap function of depth and velocity. So the
-dynamics are evaluated at ``num_stages`` times only, and MuJoCo's substeps are made with the
-force law anew and all else interpolated, see `substeps`.
+Within a control step the mass matrix, bias forces, kinematics and collision change little
+and smoothly. The stiff forces of contacts and limits do not, but their law is a cheap
+function of depth and velocity. So the dynamics are evaluated at ``num_stages`` times only,
+and MuJoCo's substeps are made with the force law anew and all else interpolated.
 
 | stages | evaluated at |
 |---|---|
@@ -12,7 +11,6 @@ force law anew and all else interpolated, see `substeps`.
 | 2 | the start, and the mean time, which the substeps so far lead to |
 """
 
-import mujoco
 import torch
 from torch import Tensor
 
@@ -23,8 +21,6 @@ from torchrl_nerd.configs import PenaltyContactConfig, Precision
 from torchrl_nerd.geometry.base import JointAxes
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.scene import Scene
-
-EULER = mujoco.mjtIntegrator.mjINT_EULER
 
 
 class PenaltyContactStep(AnalyticStep):
@@ -58,19 +54,20 @@ class PenaltyContactStep(AnalyticStep):
         if num_stages not in (1, 2):
             raise ValueError(f"expected 1 or 2 stages, got {num_stages}")
         check_supported(scene)
-        given = num_stages, num_outer_steps, merged_substeps, precision
-        config = PenaltyContactConfig(*given)
+        config = PenaltyContactConfig(
+            num_stages, num_outer_steps, merged_substeps, precision
+        )
         super().__init__(scene, config, num_outer_steps * scene.layout.nv)
-        if scene.model.opt.integrator != EULER:
+        if scene.integrator != "Euler":
             raise ValueError(
                 f"expected substeps of Euler, got {scene.integrator} in scene "
                 f"'{scene.name}'"
             )
         substeps = max(1, scene.substeps // merged_substeps)
         if num_outer_steps < 1 or substeps % num_outer_steps:
-            got = f"got {num_outer_steps}"
             raise ValueError(
-                f"expected outer steps that divide {substeps} substeps, {got}"
+                f"expected outer steps that divide {substeps} substeps, got "
+                f"{num_outer_steps}"
             )
         self.num_stages, self.num_outer_steps = num_stages, num_outer_steps
         self.num_substeps = substeps // num_outer_steps  # of each outer step

@@ -1,8 +1,7 @@
-"""Substeps of contact and limit forces while the rest of the dynamics is frozen.
+"""MuJoCo's substeps of contact and limit forces, while the rest of the dynamics is frozen.
 
-MuJoCo's substeps, but for what changes little within a control step: the contact Jacobian
-and the smooth acceleration change linearly from one `FrozenDynamics` to another, and the
-mass matrix is that of the second one. All tensors have the batch last.
+The contact Jacobian and the smooth acceleration change linearly from one `FrozenDynamics`
+to another; the mass matrix is that of the second one. All tensors have the batch last.
 
 A contact that slides is the point of MuJoCo's elliptic friction cone that is nearest to the
 force of spring and dampers without a cone; its normal force is a little larger than theirs.
@@ -103,20 +102,21 @@ class SubstepIntegrator(nn.Module):
         step, jacobian, normal, depth, qacc_smooth, inverse, _ = self.step_size, *last
         joints = qpos.mT[self.limited_qpos].to(qacc_smooth)
         speed = self.to_base_frame(qvel.mT, last.rotation.mT).to(qacc_smooth)
-        jacobian_rate, qacc_rate = None, None
+        drift = None  # of Jacobian and acceleration, per substep
         if between:
             turn = last.rotation.mT @ first.rotation
             jacobian = _rotated(first.jacobian, turn)
             normal = _rotated(first.normal, turn)
             qacc_smooth = self.to_base_frame(first.qacc_smooth, turn)
-            depth, rate = first.depth, 1.0 / between  # per substep
-            jacobian_rate = rate * (last.jacobian - jacobian)
-            qacc_rate = rate * (last.qacc_smooth - qacc_smooth)
-        jacobian_0, moved = jacobian, torch.zeros_like(speed)
+            depth, rate = first.depth, 1.0 / between
+            changes = last.jacobian - jacobian, last.qacc_smooth - qacc_smooth
+            drift = [rate * change for change in changes]
+        qacc, jacobian_0, moved = qacc_smooth, jacobian, torch.zeros_like(speed)
         states, scatter = [SubstepState(speed, moved)], self.scatter.to(speed)
         for number in range(ceil(num_substeps)):
-            if jacobian_rate is not None:
-                jacobian = torch.add(jacobian_0, jacobian_rate, alpha=number)
+            if drift is not None:
+                jacobian = torch.add(jacobian_0, drift[0], alpha=number)
+                qacc = torch.add(qacc_smooth, drift[1], alpha=number)
             velocity = self.evaluation.point_velocity(jacobian, speed)
             rising = (velocity * normal).sum(0)  # (P, N)
             if number:
@@ -128,9 +128,6 @@ class SubstepIntegrator(nn.Module):
             qfrc = matvec(scatter, torch.cat((columns, limit)))
             if self.num_base_dofs:  # forces on the base itself, not through its columns
                 qfrc = torch.cat((force.sum(1), qfrc[self.num_base_dofs :]))
-            qacc = qacc_smooth
-            if qacc_rate is not None:
-                qacc = torch.add(qacc_smooth, qacc_rate, alpha=number)
             speed = speed + step * (qacc + (inverse * qfrc).sum(1))
             moved = self._composed(moved, step * speed)
             states.append(SubstepState(speed, moved))

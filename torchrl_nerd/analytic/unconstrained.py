@@ -1,10 +1,9 @@
 """Unconstrained (contact-free) forward dynamics over one control step.
 
-MuJoCo's semi-implicit Euler method moves on by the accelerations at the starts of its n
-substeps. Their mean is, to second order, the acceleration at the mean of those times,
-``(h - h/n) / 2``. The step evaluates the dynamics twice: at the start, to predict the state
-at that time, and there. This midpoint rule shares the error of the substeps instead of
-adding its own. Joint limits change faster and are solved anew several times per step.
+The mean of MuJoCo's accelerations at the starts of its n semi-implicit Euler substeps is,
+to second order, that at the mean of those times, ``(h - h/n) / 2``. The step evaluates the
+dynamics at the start, to predict the state at that time, and there. This midpoint rule
+shares the substeps' error. Joint limits change faster: several solves per step.
 """
 
 import mujoco
@@ -49,9 +48,8 @@ class UnconstrainedStep(AnalyticStep):
         self.kinematics = PointKinematics(model, scene.base, *points)
         self.pose = BasePose(model, scene.base)
         self.layout = scene.layout
-        is_limited = model.jnt_limited[axes.joints] != 0
         self.limits, self.num_solves = None, 1
-        if is_limited.any() and not scene.base.is_floating:
+        if model.jnt_limited[axes.joints].any() and not scene.base.is_floating:
             # MuJoCo's shortest time constant follows from the scene's own substep
             substep = scene.control_step / (scene.substeps // scene.reference_ratio)
             self.limits = JointLimits(model, axes, substep)

@@ -5,12 +5,13 @@ from collections.abc import Mapping
 
 from tensordict.utils import NestedKey
 
-from torchrl_nerd.analytic import make_step, step_config
+from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.settings import look_up
 from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.transforms import Stats
 
@@ -26,7 +27,7 @@ def make_model(
     network, features = network_config(config.network), config.features
     if config.step is None:
         return NeRD(scene, features, network, stats)
-    step = make_step(scene, step_config(config.step))
+    step = make_step(scene, look_up("analytic step", config.step, STEPS))
     return HybridNeRD(scene, step, features, network, stats)
 
 
