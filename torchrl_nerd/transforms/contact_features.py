@@ -38,7 +38,7 @@ from torchrl_nerd.transforms.base import FeatureTransform
 from torchrl_nerd.transforms.predicted_contact import (
     PredictedForce,
     PredictedPenetration,
-    num_times,
+    times_of,
 )
 
 FADE = 0.25  # share of the way from margin to touching over which velocities fade in
@@ -61,11 +61,6 @@ class ContactFeatures(FeatureTransform):
 
     The K = min(substeps, 5) times are those of `PredictedPenetration`. A scene without
     contact gives no keys at all. ``features`` adds predictions; none by default.
-
-    Examples:
-        >>> transform = ContactFeatures(load_scene("cartpole"))
-        >>> transform.out_keys
-        []
     """
 
     why_no_inverse = "distances do not determine a pose"
@@ -79,7 +74,7 @@ class ContactFeatures(FeatureTransform):
         if terrain is not None:
             in_keys = [QPOS, QVEL]
             sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
-            sizes[CONTACT_DEPTH] = num_times(scene) * count
+            sizes[CONTACT_DEPTH] = len(times_of(scene)) * count
             if terrain.is_per_row:
                 in_keys.append(TERRAIN)
             if features.predicted_force:

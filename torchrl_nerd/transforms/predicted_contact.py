@@ -94,14 +94,10 @@ class PredictedPenetration(nn.Module):
         return (torch.cat((ends[0], ends[1]), -1) @ self.cubic).clamp_min(0.0)
 
 
-def num_times(scene: Scene) -> int:
-    """K: number of predicted times per step."""
-    return min(scene.substeps // scene.reference_ratio, MAX_TIMES)
-
-
 def times_of(scene: Scene) -> np.ndarray:
     """The predicted times as shares of the step, ``(K,)``."""
-    return np.arange(num_times(scene)) / num_times(scene)
+    count = min(scene.substeps // scene.reference_ratio, MAX_TIMES)
+    return np.arange(count) / count
 
 
 def parabola(times: np.ndarray) -> np.ndarray:

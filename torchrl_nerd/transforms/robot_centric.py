@@ -86,13 +86,10 @@ class RobotCentric(FeatureTransform):
         parts = self.joints(qpos, qvel)
         if self.base.is_floating:
             q, v = self.base.qpos_address, self.base.dof_address
-            quat, down = qpos[..., q + 3 : q + 7], torch.zeros_like(qvel[..., :3])
-            for axis, share in enumerate(self.down):
-                if share:  # a tensor of `down` would have to follow the device
-                    down[..., axis] = share
+            quat, angular = qpos[..., q + 3 : q + 7], qvel[..., v + 3 : v + 6]
             linear = rotate_inverse(quat, qvel[..., v : v + 3])
-            angular = qvel[..., v + 3 : v + 6]
-            parts = [linear, angular, rotate_inverse(quat, down), *parts]
+            gravity = rotate_inverse(quat, constant(qvel, self.down))
+            parts = [linear, angular, gravity, *parts]
         if self.trees is not None:
             parts += self._other_trees(self.trees, qpos, qvel)
         return torch.cat(parts, -1)

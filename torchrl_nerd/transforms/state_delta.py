@@ -138,14 +138,12 @@ class StateDelta(Transform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         keys = tensordict.keys(True)
-        is_known = NEXT_QPOS in keys and NEXT_QVEL in keys  # as in a buffer's extend
         if self.parent is None and STATE_DELTA in keys:
             expect_keys("the inverse of StateDelta", (QPOS, QVEL), tensordict)
-            if is_known:
-                return tensordict
-            state = (tensordict[QPOS], tensordict[QVEL], tensordict[STATE_DELTA])
-            next_qpos, next_qvel = self.integrate(*state)
-            tensordict.set(NEXT_QPOS, next_qpos).set(NEXT_QVEL, next_qvel)
+            if NEXT_QPOS not in keys or NEXT_QVEL not in keys:  # a buffer's has both
+                given = (tensordict[key] for key in (QPOS, QVEL, STATE_DELTA))
+                next_qpos, next_qvel = self.integrate(*given)
+                tensordict.set(NEXT_QPOS, next_qpos).set(NEXT_QVEL, next_qvel)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
