@@ -5,7 +5,7 @@ centre of mass that is not the body frame's origin, and friction that fades unde
 ``mu / (1 + normal force * fading)``, as that of elastic asperities (J. F. Archard,
 "Elastic deformation and the laws of friction", 1957). A few substeps with a backward
 Euler spring are stable at any stiffness. Every operation is differentiable, also in the
-physical parameters: a rollout fits them to recordings.
+physical parameters.
 """
 
 from typing import ClassVar

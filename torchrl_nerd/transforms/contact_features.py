@@ -4,11 +4,8 @@ NeRD section 3.2 feeds closest point p1, normal n and distance d of every contac
 zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out. Where
 the ground is one plane that all rows share, and it is level (gravity is normal to it) or a
 fixed base cannot turn against it, n follows from gravity and pose and is left out too. Of
-several surfaces each point sees the nearest, so that a model fits any number.
-
-Added are the point's velocity and its predicted penetration over the step, see
-`predicted_contact`. All of it fades to zero at the margin without a jump. `FeatureConfig`
-adds the predicted contact force, and predicts along unconstrained motion.
+several surfaces each point sees the nearest, so that a model fits any number. Added are
+velocities and predictions, see `predicted_contact`; all fades to zero at the margin.
 """
 
 import numpy as np

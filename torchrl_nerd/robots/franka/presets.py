@@ -11,7 +11,6 @@ from torchrl_nerd.robots.franka.tasks import (
     FrankaReachTorque,
 )
 from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
-from torchrl_nerd.tasks import Task
 
 TRAIN = TrainConfig(
     network="mlp-4x128",
@@ -34,16 +33,9 @@ PPO = PPOConfig(
     std=0.7,
     frame_stack=3,  # its observation has no velocities, and the policy must brake
 )
-
-
-def _protocol(task: Task) -> EvaluationProtocol:
-    """An episode of random torques within the effort limits; nothing is published.
-
-    Passive, the arm would stay where it is: it starts at rest and knows no gravity.
-    """
-    return EvaluationProtocol({"random": task}, (128,), random_actions=("random",))
-
-
+# Of both: an episode of random torques within the effort limits; nothing is published.
+# Passive, the arm would stay where it is: it starts at rest and knows no gravity.
+RANDOM = {"horizons": (128,), "random_actions": ("random",)}
 VARIATION = {
     "payload:link7": (0.0, 3.0),
     "damping": (0.0, 5.0),
@@ -60,14 +52,14 @@ ROBOT = Robot(
     },
     presets={
         "franka": Preset(
-            _protocol(FrankaReachTorque()),
+            EvaluationProtocol({"random": FrankaReachTorque()}, **RANDOM),
             DATA,
             TRAIN,
             task="franka/reach_torque",
             variation=VARIATION,
         ),
         "franka_gravity": Preset(
-            _protocol(FrankaGravityReachTorque()),
+            EvaluationProtocol({"random": FrankaGravityReachTorque()}, **RANDOM),
             DATA,
             replace(TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500),
             task="franka_gravity/reach_torque",
