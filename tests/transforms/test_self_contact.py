@@ -12,7 +12,7 @@ from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.robots import SCENES, load_scene
 from torchrl_nerd.scenes.self_contacts import capsule_pairs
-from torchrl_nerd.transforms import SelfContactFeatures
+from torchrl_nerd.transforms import ContactFeatures, SelfContactFeatures
 from torchrl_nerd.transforms.predicted_contact import times_of
 
 ROWS, TINY = 60, 1e-7
@@ -133,3 +133,10 @@ def test_the_transform_writes_its_key(generator):
     value = transform(rows.clone())["self_contact"]
     (want,) = transform.self_contact_features(rows[QPOS], rows[QVEL])
     torch.testing.assert_close(value, want.float())
+
+
+@pytest.mark.parametrize("kind", [ContactFeatures, SelfContactFeatures])
+def test_a_robot_without_contacts_needs_no_state(kind):
+    transform = kind(load_scene("cartpole"), ON)
+    assert not transform.in_keys and not transform.out_keys
+    assert transform(TensorDict(action=torch.zeros(ROWS, 1))).keys() == {"action"}

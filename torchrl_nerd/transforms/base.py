@@ -47,6 +47,8 @@ class FeatureTransform(StateTransform):
         raise NotImplementedError
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.sizes:  # such as contacts of a scene without a ground
+            return next_tensordict
         expect_keys(type(self).__name__, self.in_keys, next_tensordict)
         for key, value in self._features(next_tensordict).items():
             next_tensordict.set(key, value.to(torch.float32))

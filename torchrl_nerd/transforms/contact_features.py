@@ -151,9 +151,7 @@ class ContactFeatures(FeatureTransform):
         return features
 
     def _features(self, tensordict: TensorDictBase) -> dict:
-        if self.terrain is None:
-            return {}
-        terrain = tensordict[TERRAIN] if self.terrain.is_per_row else None
+        terrain = tensordict[TERRAIN] if TERRAIN in self.in_keys else None
         torque = tensordict.get(JOINT_TORQUE, None)
         state = tensordict[QPOS], tensordict[QVEL]
         values = self.contact_features(*state, terrain, torque)

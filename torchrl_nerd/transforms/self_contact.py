@@ -83,5 +83,5 @@ class SelfContactFeatures(FeatureTransform):
         return [torch.cat((beyond.clamp_max(0.0), gated.flatten(-2)), -1)]
 
     def _features(self, tensordict: TensorDictBase) -> dict:
-        state = tensordict[QPOS], tensordict[QVEL]
-        return dict(zip(self.out_keys, self.self_contact_features(*state), strict=True))
+        values = self.self_contact_features(tensordict[QPOS], tensordict[QVEL])
+        return dict(zip(self.out_keys, values, strict=True))
