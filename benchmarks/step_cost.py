@@ -23,7 +23,8 @@ from torchrl_nerd.evaluation.bench.rates import mid_states
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
-from torchrl_nerd.modules.nerd import History, Network
+from torchrl_nerd.modules.history import History
+from torchrl_nerd.modules.nerd import Network
 from torchrl_nerd.robots import load_scene, source_of
 
 

@@ -12,8 +12,8 @@ from torchrl_nerd.compiled import Compiled, RowThreads, parts_of, unaffected
 from torchrl_nerd.dynamics.base import Dynamics, check_step
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
+from torchrl_nerd.modules.history import WindowNetwork
 from torchrl_nerd.modules.nerd import NeRD, Network
-from torchrl_nerd.modules.window import WindowNetwork
 from torchrl_nerd.scenes.commands import drive_of
 
 Inference = Literal["streaming", "window"]

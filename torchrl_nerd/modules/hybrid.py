@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from torchrl_nerd.analytic import AnalyticStep, make_step
 from torchrl_nerd.configs import FeatureConfig
-from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD, NetworkConfig
+from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD
+from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Stats
 

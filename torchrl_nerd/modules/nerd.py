@@ -19,6 +19,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import FeatureConfig
+from torchrl_nerd.modules.history import History
+from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
@@ -30,17 +32,6 @@ State = tuple[Tensor, Tensor]
 """``qpos (*batch, nq)`` and ``qvel (*batch, nv)``, float64."""
 
 
-class History(Protocol):
-    """History of a network, one entry per env."""
-
-    def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool ``(num_envs,)``)."""
-        ...
-
-    def restore(self, past: Any, rows: Tensor) -> None:
-        """Take the history of ``rows`` from a `copy.copy` of this one, made before."""
-
-
 class Network(Protocol):
     """What every network can do; `step` takes the history that its own kind makes."""
 
@@ -50,14 +41,6 @@ class Network(Protocol):
 
     def step(self, token: Tensor, memory: Any) -> Tensor:
         """Output for the next token, ``(num_envs, F) -> (num_envs, D)``."""
-        ...
-
-
-class NetworkConfig(Protocol):
-    """Size of a network, which it can build."""
-
-    def build(self, num_inputs: int, num_outputs: int) -> Any:
-        """A freshly initialised module that is a `Network`."""
         ...
 
 
@@ -84,6 +67,7 @@ class NeRD(nn.Module):
     """
 
     kind: ClassVar[str] = "learned"
+    network: Any  # a module that is a `Network`
     zero: Tensor
     one: Tensor
     compile_single_threaded: ClassVar[bool] = False

@@ -5,16 +5,15 @@ The MLP has no history (a Markov model); the GRU's history is a hidden state.
 
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor, nn
 
+from torchrl_nerd.modules.history import History, stored
 from torchrl_nerd.modules.linear import FullLinear
 from torchrl_nerd.modules.transformer import (
     FeedForward,
     TransformerConfig,
     initialize,
     make_head,
-    stored,
 )
 from torchrl_nerd.settings import SettingError, look_up
 
@@ -31,14 +30,8 @@ class MLPConfig:
         return MLP(self, num_inputs, num_outputs)
 
 
-class NoMemory:
+class NoMemory(History):
     """History of a network that has none."""
-
-    def clear(self, rows: Tensor) -> None:
-        """Nothing to forget."""
-
-    def restore(self, past: "NoMemory", rows: Tensor) -> None:
-        """Nothing to remember."""
 
 
 class MLP(nn.Module):
@@ -83,26 +76,10 @@ class GRUConfig:
 
 
 @dataclass
-class HiddenState:
+class HiddenState(History):
     """Hidden state of a GRU; zero is an empty history."""
 
-    value: Tensor  # (layers, rows, width)
-
-    def clear(self, rows: Tensor) -> None:
-        """See `History.clear`."""
-        self._put(rows, 0.0)
-
-    def __copy__(self) -> "HiddenState":
-        """Apart from the original, which is written to in place."""
-        return HiddenState(self.value.clone())
-
-    def restore(self, past: "HiddenState", rows: Tensor) -> None:
-        """See `History.restore`."""
-        self._put(rows, past.value)
-
-    def _put(self, rows: Tensor, value: Tensor | float) -> None:
-        value = torch.where(rows[:, None], value, self.value)
-        self.value = stored(self.value, value)
+    value: Tensor  # (rows, layers, width)
 
 
 class GRU(nn.Module):
@@ -122,15 +99,15 @@ class GRU(nn.Module):
 
     def empty_memory(self, rows: int) -> HiddenState:
         """A hidden state of zeros for ``rows`` rows."""
-        shape = (self.config.layers, rows, self.config.width)
+        shape = (rows, self.config.layers, self.config.width)
         return HiddenState(next(self.gru.parameters()).new_zeros(shape))
 
     def step(self, token: Tensor, memory: HiddenState) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
         # (rows, 1, width)
         inputs = self.embed(token)[:, None].to(next(self.gru.parameters()).dtype)
-        output, value = self.gru(inputs, memory.value)
-        memory.value = stored(memory.value, value)
+        output, value = self.gru(inputs, memory.value.transpose(0, 1).contiguous())
+        memory.value = stored(memory.value, value.transpose(0, 1))
         return self.head(output[:, 0])
 
 
@@ -144,16 +121,10 @@ TRANSFORMERS = {
     "paper": TransformerConfig(6, 192, 12),
     "paper-large": TransformerConfig(6, 384, 12),
 }
+MLPS = (1, 16), (1, 32), (2, 32), (2, 64), (4, 64), (4, 120), (4, 128), (4, 160)
 NETWORKS: dict[str, NetworkConfig] = {
     **TRANSFORMERS,
-    "mlp-1x16": MLPConfig(depth=1, width=16),
-    "mlp-1x32": MLPConfig(depth=1, width=32),
-    "mlp-2x32": MLPConfig(depth=2, width=32),
-    "mlp-2x64": MLPConfig(depth=2, width=64),
-    "mlp-4x64": MLPConfig(),
-    "mlp-4x120": MLPConfig(depth=4, width=120),
-    "mlp-4x128": MLPConfig(depth=4, width=128),
-    "mlp-4x160": MLPConfig(depth=4, width=160),
+    **{f"mlp-{depth}x{width}": MLPConfig(depth, width) for depth, width in MLPS},
     "gru": GRUConfig(),
 }
 """Kind, then depth x width; ``adaptive``: a transformer for hidden parameters."""

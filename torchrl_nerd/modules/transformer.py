@@ -4,7 +4,7 @@ NeRD section 3.4 recomputes its last ten tokens at every step, with absolute pos
 Here each layer sees a token and the ``band - 1`` before it, and positions are relative (a
 learned bias per head and offset). A token is written in its own base frame and never
 changes as time moves on, so its keys and values are kept in a ring. The output depends on
-``layers * (band - 1) + 1`` tokens. `modules.window` is the paper's way.
+``layers * (band - 1) + 1`` tokens. `WindowNetwork` is the paper's way.
 
 With ``pairs`` a token is embedded together with the one before it, which adds one token to
 those. What a torque did shows in the next token alone, so a pair is the least that tells
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_nerd.modules.history import History, replaced, stored
 from torchrl_nerd.modules.linear import FullLinear, InnerLinear
 
 MASKED = float("-inf")
@@ -42,16 +43,8 @@ class TransformerConfig:
         return CausalTransformer(self, num_inputs, num_outputs)
 
 
-def stored(old: Tensor, new: Tensor) -> Tensor:
-    """``new``, in the memory of ``old`` unless gradients are recorded.
-
-    A history that stays where it is can be part of a CUDA graph.
-    """
-    return new if torch.is_grad_enabled() else old.copy_(new)
-
-
 @dataclass
-class KeyValueCache:
+class KeyValueCache(History):
     """Keys and values of the last ``band`` tokens of every layer.
 
     ``last`` is what the last token adds to the embedding of the next one, of width zero
@@ -67,34 +60,30 @@ class KeyValueCache:
     last: Tensor  # (rows, width)
 
     def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
+        """See `History.clear`."""
         self.age.masked_fill_(rows, 0)
         self.slot.masked_fill_(rows.all(), 0)  # as in a new one
-        self.last = stored(self.last, self.last.masked_fill(rows[:, None], 0.0))
-        mask = rows[:, None, None, None]
+        self.last = replaced(self.last, rows, 0.0)
         # whatever stood there, a masked NaN would still spread
         for ring in (self.keys, self.values):
-            for layer, past in enumerate(ring):
-                ring[layer] = stored(past, past.masked_fill(mask, 0.0))
-
-    def __copy__(self) -> "KeyValueCache":
-        """Apart from the original, which is written to in place."""
-        keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
-        rest = (x.clone() for x in (self.age, self.slot, self.last))
-        return KeyValueCache(keys, values, *rest)
+            ring[:] = [replaced(layer, rows, 0.0) for layer in ring]
 
     def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
         """See `History.restore`: its rings turned to where the oldest token lies now."""
-        size, mask = self.keys[0].shape[2], rows[:, None, None, None]
+        size = self.keys[0].shape[2]
         slots = torch.arange(size, device=rows.device)
         turned = (slots + past.slot - self.slot) % size
-        for now, then in ((self.keys, past.keys), (self.values, past.values)):
-            for layer, ring in enumerate(then):
-                ring = ring.index_select(2, turned)
-                now[layer] = stored(now[layer], torch.where(mask, ring, now[layer]))
+        for ring, then in ((self.keys, past.keys), (self.values, past.values)):
+            for layer, old in enumerate(then):
+                ring[layer] = replaced(ring[layer], rows, old.index_select(2, turned))
         self.age.copy_(torch.where(rows, past.age, self.age))
-        last = torch.where(rows[:, None], past.last, self.last)
-        self.last = stored(self.last, last)
+        self.last = replaced(self.last, rows, past.last)
+
+    def __copy__(self) -> "KeyValueCache":
+        """See `History.__copy__`."""
+        keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
+        rest = (x.clone() for x in (self.age, self.slot, self.last))
+        return KeyValueCache(keys, values, *rest)
 
     def write(self, layer: int, key: Tensor, value: Tensor) -> Tensor:
         """Store one token ``(rows, heads, head width)``; with gradients, out of place.

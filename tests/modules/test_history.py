@@ -5,8 +5,8 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
+from torchrl_nerd.modules.history import WindowNetwork
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.modules.window import WindowNetwork
 
 INPUTS, OUTPUTS, ROWS, STEPS = 5, 3, 4, 24
 each_network = pytest.mark.parametrize("name", ["transformer-2x64", "mlp-4x64", "gru"])
