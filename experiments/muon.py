@@ -27,7 +27,6 @@ from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.optimizers import make_adamw, split_parameters
 from torchrl_nerd.training.trainer import Trainer
-from torchrl_nerd.training.validation import metrics
 
 COEFFICIENTS = (
     3.4445,
@@ -155,7 +154,9 @@ def train(options: Options, name: str, network: str, seed: int) -> dict[str, Any
         num_trajectories=TEST_ROLLOUTS,
         seed=TEST_SEED,
     )
-    return {**found, **metrics(errors)}
+    for horizon, by_name in errors.items():
+        found |= {f"{name}_{horizon}": error.mean for name, error in by_name.items()}
+    return found
 
 
 def update_ms(trainer: Trainer) -> float:

@@ -29,7 +29,7 @@ def model(scene, data) -> NeRD:
 
 @pytest.fixture
 def sequences(model, data) -> Sequences:
-    return Sequences(model, data, torch.device("cpu"))
+    return Sequences(model, data)
 
 
 @pytest.mark.parametrize("length", [1, 4, STEPS])

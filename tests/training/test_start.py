@@ -16,7 +16,7 @@ from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.training import validation
+from torchrl_nerd.training import trainer as module
 from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
@@ -137,7 +137,7 @@ ARGS = (
 
 def test_the_command_continues_from_several_data_sets(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(validation, "ROLLOUTS", 2)
+    monkeypatch.setattr(module, "ROLLOUTS", 2)
     for out, seed in (("a", "1"), ("b", "2")):
         sizes = ["--trajectories", "9", "--steps", "110", "--seed", seed, "--quiet"]
         assert main(["data", "cartpole", "--out", out, *sizes]) == 0

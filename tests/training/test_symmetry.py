@@ -125,7 +125,7 @@ def test_batches_show_images_of_the_data(scene, data, generator):
         MLPConfig(1, 4),
         symmetry.complete(data_stats(scene, data)),
     )
-    sequences = Sequences(model, data, torch.device("cpu"), symmetry)
+    sequences = Sequences(model, data, symmetry)
     qpos, qvel, torque, terrain, _ = sequences.rollout(32, 2, generator)
     dynamics = MujocoDynamics(scene, num_threads=1)
     state = data[:32, 0].empty().update({QPOS: qpos[:, 0], QVEL: qvel[:, 0]})

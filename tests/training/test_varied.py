@@ -108,7 +108,7 @@ def test_a_trained_model_comes_back_with_its_variation(is_told, data, tmp_path):
 def test_rollouts_are_of_one_robot_where_robots_change(length, generator):
     data = strategy(SCENE, "changing")(24, 48, generator)
     data = data[is_sound(data)]
-    sequences = Sequences(model_of(data), data, torch.device("cpu"))
+    sequences = Sequences(model_of(data), data)
     for batch in (sequences.rollout(200, length, generator) for _ in range(3)):
         qpos, qvel, torques, _, own = batch
         state = TensorDict({QPOS: qpos[:, 0], QVEL: qvel[:, 0], PARAMETERS: own}, [200])

@@ -1,12 +1,10 @@
 """What training minimises: one step ahead, then several."""
 
-from typing import cast
-
 import torch
 from torch import Tensor
 
 from torchrl_nerd.geometry.manifold import differentiate_pos
-from torchrl_nerd.modules.nerd import TARGET, NeRD, Network
+from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.scenes.commands import drive, drive_of
 
 RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root smooth
@@ -60,8 +58,7 @@ def rollout_loss(
     """
     delta, layout = model.state_delta, model.scene.layout
     scale = model.normalize.std(TARGET)[: layout.nv]
-    network = cast(Network, model.network)
-    memory = network.empty_memory(len(qpos))
+    memory = model.network.empty_memory(len(qpos))
     position, velocity = qpos[:, 0], qvel[:, 0]
     errors, told = [], model.scene_features.told(parameters)
     for step in range(command.shape[1]):
@@ -72,7 +69,7 @@ def rollout_loss(
             (position, velocity),
             drive_of(*driven, told),
             terrain,
-            lambda token: network.step(token, memory),
+            lambda token: model.network.step(token, memory),
         )
         slip = differentiate_pos(layout, qpos[:, step + 1], position)
         slip = slip / (scale * delta.step_size)

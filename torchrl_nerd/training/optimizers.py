@@ -36,6 +36,17 @@ def make_adamw(weights: list[Tensor], lr: float, device: torch.device) -> AdamW:
     return AdamW(weights, lr=lr, capturable=device.type == "cuda", **how)
 
 
+def make_optimizers(
+    network: nn.Module, config: TrainConfig, device: torch.device
+) -> dict[str, Optimizer]:
+    """Muon for the weights of linear layers, AdamW for all others."""
+    matrices, others = split_parameters(network)
+    return {
+        "muon": make_muon(matrices, config.lr),
+        "adamw": make_adamw(others, config.adamw_lr, device),
+    }
+
+
 def follow_gradient(
     weights: list[nn.Parameter],
     optimizers: Mapping[str, Optimizer],

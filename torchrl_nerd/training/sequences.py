@@ -54,26 +54,19 @@ class Inputs(NamedTuple):
 
 
 class Sequences:
-    """Batches of sequences from a data set ``[trajectories, steps]``, on a device.
+    """Batches of sequences from a data set ``[trajectories, steps]``, on its device.
 
     With ``symmetry`` each sample of a learned model is shown as a random one of its images.
     """
 
     def __init__(
-        self,
-        model: NeRD,
-        data: TensorDict,
-        device: torch.device,
-        symmetry: Symmetry | None = None,
+        self, model: NeRD, data: TensorDict, symmetry: Symmetry | None = None
     ) -> None:
-        features, targets = normalised(model, data)
-        self.features, self.targets = features, targets.to(device)
-        self.inputs = Inputs(*(x.to(device) for x in Inputs.of(model, data, features)))
-        self.data = data.to(device)
-        self.symmetry = symmetry.to(device) if symmetry else None
+        self.features, self.targets = normalised(model, data)
+        self.inputs, self.data = Inputs.of(model, data, self.features), data
+        self.symmetry = symmetry.to(self.targets.device) if symmetry else None
         self.scene, self.steps = model.scene, data.batch_size[1]
-        change = change_times(data)
-        self.change = None if change is None else change.to(device)
+        self.change = change_times(data)
 
     def pick(
         self, rows: int, length: int, generator: Generator

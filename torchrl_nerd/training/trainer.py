@@ -16,6 +16,8 @@ from tqdm import tqdm
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
 from torchrl_nerd.files import check_writable, read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
@@ -29,17 +31,16 @@ from torchrl_nerd.training.optimizers import (
     RunState,
     follow_gradient,
     learning_rate_ratio,
-    make_adamw,
-    make_muon,
-    split_parameters,
+    make_optimizers,
 )
 from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Inputs, Sequences
 from torchrl_nerd.training.start import begin_from, fingerprint, make_model
-from torchrl_nerd.training.validation import Errors, for_card, metrics, score, validate
 
 STATE = "state.json"  # card of a run that can be resumed
+SEED = 1_000_003  # of validation starts, which no test uses: they choose the best model
+ROLLOUTS = 256  # of a validation
 
 
 class Trainer:
@@ -92,7 +93,7 @@ class Trainer:
         self.scene, self.source, self.config = scene, source, config
         check_writable(folder / STATE)
         self.folder, self.device = folder, torch.device(device)
-        self.validation = source, horizons, random_actions, config.rollout_history
+        self.horizons, self.random_actions = list(horizons), random_actions
         self.quiet = quiet
         self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
@@ -103,48 +104,50 @@ class Trainer:
         self.state = RunState(self.model.network, self.average, self.optimizers)
         one = torch.ones((), device=self.device)
         self.lr_ratio, self.ema_share = one, one.clone()
-        self.losses = self._make_losses(compile)
+        coarse = torch.autocast(self.device.type, torch.bfloat16)(self._one_step)
+        losses = {"one_step": self._one_step, "bfloat16": coarse}
+        if compile:
+            how = {"warmup": 0, "dynamic": False}
+            losses = {name: Compiled(x, **how) for name, x in losses.items()}
+        self.losses = {**losses, "rollout": self._rollout}
         self._follow = {k: partial(self.follow, x) for k, x in self.losses.items()}
         if self.device.type == "cuda" and self.model.kind == "learned":
             written = self.state.tensors
             self._follow = {k: Captured(x, written) for k, x in self._follow.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
-        self.errors: Errors = {}  # of the last validation
+        # of the last validation, by horizon in control steps and by quantity
+        self.errors: dict[int, dict[str, ErrorSummary]] = {}
         if (self.folder / STATE).exists():
             self._resume()
 
     def _build(self, data: TensorDict, init_from: NeRD | None) -> None:
         """The model, its statistics and its batches."""
         data = data.to(self.device)  # which makes all of what follows of them
-        symmetry = None
+        symmetry, self.init_from = None, None
         if self.config.use_symmetry:
             symmetry = Symmetry(self.scene, self.config.features)
         if init_from is None:
             model = self.make_model(data, symmetry)
         else:
             model = begin_from(init_from, self.scene, self.config, symmetry)
-        self.init_from = None if init_from is None else fingerprint(init_from)
+            self.init_from = fingerprint(init_from)
         self.model = model.to(self.device)
-        self.sequences = Sequences(model, data, self.device, symmetry)
-        self.resting = resting(self.sequences.data)
-        samples = self.sequences.features, self.sequences.targets
-        cover(self.model, self.sequences.data, samples)
+        self.sequences = Sequences(model, data, symmetry)
+        self.resting = resting(data)
+        cover(model, data, (self.sequences.features, self.sequences.targets))
         if init_from is not None:
-            self.model.training_range.widen(init_from.training_range)
+            model.training_range.widen(init_from.training_range)
 
     def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
         """The configured model with fresh weights."""
         stats = data_stats(self.scene, data, self.config.features)
-        stats = stats if symmetry is None else symmetry.complete(stats)
+        if symmetry is not None:
+            stats = symmetry.complete(stats)
         return make_model(self.scene, self.config, stats)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Muon for the weights of linear layers, AdamW for all others."""
-        matrices, others = split_parameters(self.model.network)
-        return {
-            "muon": make_muon(matrices, self.config.lr),
-            "adamw": make_adamw(others, self.config.adamw_lr, self.device),
-        }
+        return make_optimizers(self.model.network, self.config, self.device)
 
     def run(self, until: int | None = None) -> NeRD:
         """Train to the end, or to update ``until``; returns the averaged model."""
@@ -190,28 +193,17 @@ class Trainer:
         is_coarse = self.step < config.bf16_fraction * config.steps
         return self._follow["bfloat16" if is_coarse else "one_step"](*inputs, targets)
 
-    def _make_losses(self, compile: bool) -> dict[str, Callable[..., Tensor]]:
-        """Of a batch of sequences, in two precisions, and of the model's own rollouts."""
-        loss_eps, history = self.config.loss_eps, self.config.rollout_history
+    def _one_step(self, *batch: Tensor) -> Tensor:
+        """Loss of a batch of sequences."""
+        inputs, targets = Inputs(*batch[:-1]), batch[-1]
+        changes = inputs.change(self.model.network(inputs.token).float())
+        return one_step_loss(changes, targets, self.config.loss_eps)
 
-        def one_step(*batch: Tensor) -> Tensor:
-            inputs, targets = Inputs(*batch[:-1]), batch[-1]
-            changes = inputs.change(self.model.network(inputs.token).float())
-            return one_step_loss(changes, targets, loss_eps)
-
-        def coarse(*batch: Tensor) -> Tensor:
-            with torch.autocast(self.device.type, torch.bfloat16):
-                return one_step(*batch)
-
-        def rollout(*batch: Any) -> Tensor:
-            how = {"loss_eps": loss_eps, "parameters": batch[-1], "history": history}
-            return rollout_loss(self.model, *batch[:-1], **how)
-
-        losses = {"one_step": one_step, "bfloat16": coarse}
-        if compile:
-            how = {"warmup": 0, "dynamic": False}
-            losses = {name: Compiled(x, **how) for name, x in losses.items()}
-        return losses | {"rollout": rollout}
+    def _rollout(self, *batch: Any) -> Tensor:
+        """Loss of the model's own rollouts."""
+        how = {"parameters": batch[-1], "loss_eps": self.config.loss_eps}
+        history = self.config.rollout_history
+        return rollout_loss(self.model, *batch[:-1], **how, history=history)
 
     def follow(self, loss_of: Callable[..., Tensor], *batch: Tensor | None) -> Tensor:
         """Follow the gradient of a batch's loss ``()``, which is returned."""
@@ -236,14 +228,24 @@ class Trainer:
         return model
 
     def validate(self) -> dict[str, float]:
-        """Mean errors of the averaged model; the best model so far is saved."""
-        self.errors = validate(self.averaged_model(), *self.validation)
-        found = score(self.errors)
+        """Mean errors of the averaged model by ``quantity_horizon``; the best one is saved.
+
+        Models are compared by the sum of their errors at the longest horizon.
+        """
+        both = NeRDDynamics(self.averaged_model()), MujocoDynamics(self.scene)
+        how = self.horizons, ROLLOUTS, SEED, self.device, self.random_actions
+        history = self.config.rollout_history
+        self.errors = passive_errors(self.source, *both, *how, history)
+        found = sum(error.mean for error in self.errors[max(self.horizons)].values())
         # the first model is saved even if its rollouts diverge
         if found < self.best or not (self.folder / "best").exists():
             self._save_model("best")
         self.best = min(self.best, found)
-        return metrics(self.errors)
+        return {
+            f"{name}_{horizon}": error.mean
+            for horizon, by_name in self.errors.items()
+            for name, error in by_name.items()
+        }
 
     def save(self) -> None:
         """Write all that a resumed run needs; the card is written last."""
@@ -261,7 +263,11 @@ class Trainer:
             "trajectories": len(self.sequences.targets),
             "init_from": self.init_from,
         }
-        about = {"training": training, "validation_error": for_card(self.errors)}
+        errors = {
+            str(horizon): {name: asdict(error) for name, error in by_name.items()}
+            for horizon, by_name in self.errors.items()
+        }
+        about = {"training": training, "validation_error": errors}
         model = self.averaged_model()
         save_checkpoint(model, self.folder / name, make_card(model, about))
 
