@@ -10,8 +10,8 @@ from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.optimizers import make_adamw
+from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import Trainer
 
 from .variants import Variant

@@ -17,9 +17,9 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training import trainer as module
-from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
+from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import Trainer
 
 CONFIG = TrainConfig(

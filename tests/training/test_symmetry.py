@@ -13,11 +13,10 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import NETWORKS, MLPConfig
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.training.augmentation import SignedPermutations, Symmetry
 from torchrl_nerd.training.losses import rollout_loss
 from torchrl_nerd.training.samples import data_stats, raw_tokens
 from torchrl_nerd.training.sequences import Sequences
-from torchrl_nerd.training.symmetry import find_isometries
+from torchrl_nerd.training.symmetry import SignedPermutations, Symmetry, find_isometries
 from torchrl_nerd.training.trainer import Trainer
 from torchrl_nerd.transforms import StateDelta
 

@@ -18,8 +18,8 @@ from torchrl_nerd.keys import (
 )
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes.commands import command_of
-from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.samples import normalised
+from torchrl_nerd.training.symmetry import Symmetry
 
 FEW = 32  # trajectories that an analytic step takes at a time: fits the cache
 

@@ -12,7 +12,7 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import look_up
-from torchrl_nerd.training.augmentation import Symmetry
+from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.transforms import Stats
 
 

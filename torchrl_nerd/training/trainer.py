@@ -23,7 +23,6 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
-from torchrl_nerd.training.augmentation import Symmetry
 from torchrl_nerd.training.capture import Captured
 from torchrl_nerd.training.log import LoggerName, TrainingLog, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
@@ -37,6 +36,7 @@ from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Inputs, Sequences
 from torchrl_nerd.training.start import begin_from, fingerprint, make_model
+from torchrl_nerd.training.symmetry import Symmetry
 
 STATE = "state.json"  # card of a run that can be resumed
 SEED = 1_000_003  # of validation starts, which no test uses: they choose the best model
