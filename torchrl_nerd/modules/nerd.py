@@ -49,8 +49,8 @@ class Encoded(NamedTuple):
 
     features: Tensor  # (*batch, F), normalised, as they are
     token: Tensor  # (*batch, token_size), the network's input
-    base: Tensor  # (*batch, D) or (): normalised change without the network
-    gate: Tensor  # (*batch, 1) or (): share of the network's output that counts
+    base: Tensor | float  # (*batch, D): normalised change without the network
+    gate: Tensor | float  # (*batch, 1): share of the network's output that counts
 
 
 class NeRD(nn.Module):
@@ -68,8 +68,6 @@ class NeRD(nn.Module):
 
     kind: ClassVar[str] = "learned"
     network: Any  # a module that is a `Network`
-    zero: Tensor
-    one: Tensor
     compile_single_threaded: ClassVar[bool] = False
 
     def __init__(
@@ -93,9 +91,6 @@ class NeRD(nn.Module):
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
         self.network = network.build(self.token_size, num_outputs)
-        zero = torch.zeros((), dtype=torch.float64)
-        self.register_buffer("zero", zero, persistent=False)
-        self.register_buffer("one", zero + 1.0, persistent=False)
 
     @property
     def token_size(self) -> int:
@@ -115,14 +110,14 @@ class NeRD(nn.Module):
         """The network's input for float64 states and drives, and what it adds to."""
         features = self.features(qpos, qvel, drive, terrain)
         token = self.training_range.clamp_features(features).to(self.dtype)
-        return Encoded(features, token, self.zero, self.one)
+        return Encoded(features, token, 0.0, 1.0)
 
     def decode(self, state: State, encoded: Encoded, output: Tensor) -> State:
         """The next state from the network's output ``(*batch, D)``.
 
         change = base + gate * output, denormalised, clamped and integrated.
         """
-        change = encoded.base + encoded.gate * output.to(encoded.base.dtype)
+        change = encoded.base + encoded.gate * output.to(state[0].dtype)
         change = self.bounded(change)  # (*batch, D)
         limit = self.training_range.limit_motion
         after = self.state_delta.integrate(*state, change, limit)
@@ -196,7 +191,6 @@ class NeRD(nn.Module):
 
         for part in self.children():
             part._apply(fn if part is self.network else move, recurse)
-        self.zero, self.one = move(self.zero), move(self.one)
         return self
 
     @property

@@ -36,12 +36,12 @@ class Inputs(NamedTuple):
     def of(cls, model: NeRD, data: TensorDict, features: Tensor) -> "Inputs":
         """Those of a whole data set, unclamped; a learned model's are its features."""
         if model.kind == "learned":
-            return cls(features, model.zero.float(), model.one.float())
+            return cls(features, features.new_zeros(()), features.new_ones(()))
         parts = []
         for part in data.split(FEW):
             state, terrain = (part[QPOS], part[QVEL]), part.get(TERRAIN, None)
             found = model.encode(*state, part[JOINT_TORQUE], terrain)
-            parts.append([x.float() for x in found[1:]])
+            parts.append([torch.as_tensor(x).float() for x in found[1:]])
         return cls(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
     def each(self, function: Callable[[Tensor], Tensor]) -> "Inputs":
