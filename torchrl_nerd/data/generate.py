@@ -41,17 +41,12 @@ MOST_DROPPED = 0.05  # share of trajectories; more, and the data are not the rob
 Draw = Callable[[int, int, Generator], TensorDict]
 """``(rows, steps, generator) -> trajectories [rows, steps]``, diverged ones included."""
 
-Chunk = tuple[int, int]
-"""Number of a chunk, and how many trajectories it draws."""
-
-Mapper = Callable[
-    [Callable[[Chunk], TensorDict], Iterable[Chunk]], Iterable[TensorDict]
-]
+Mapper = Callable[..., Iterable[TensorDict]]
 """Python's ``map`` or a parallel version of it that keeps the order."""
 
 
-def draw_chunk(draw: Draw, config: DataConfig, chunk: Chunk) -> TensorDict:
-    """The trajectories of one chunk; seed and number alone decide them."""
+def draw_chunk(draw: Draw, config: DataConfig, chunk: tuple[int, int]) -> TensorDict:
+    """The trajectories of a chunk (number, count); seed and number alone decide them."""
     number, rows = chunk
     return draw(rows, config.steps, fold_in(config.seed, number))
 

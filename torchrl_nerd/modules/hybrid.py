@@ -30,12 +30,8 @@ class HybridNeRD(NeRD):
     no influence. The analytic change stays float64. It may exceed all changes in the
     data, so the sum is bounded by the largest speeds alone.
 
-    Args:
-        scene: the robot and its ground.
-        step: of that scene, or of its reference solver.
-        features: as for `NeRD`.
-        network: as for `NeRD`; its last layer is zero at first.
-        stats: as for `NeRD`.
+    ``step`` is one of the scene or of its reference solver; all else as for `NeRD`. The
+    network's last layer is zero at first.
     """
 
     kind: ClassVar[str] = "hybrid"

@@ -92,10 +92,12 @@ class GRU(nn.Module):
         self.gru = nn.GRU(config.width, config.width, config.layers, batch_first=True)
         self.head = FullLinear(config.width, num_outputs)
 
+    def _embedded(self, tokens: Tensor) -> Tensor:
+        return self.embed(tokens).to(next(self.gru.parameters()).dtype)
+
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
-        inputs = self.embed(tokens).to(next(self.gru.parameters()).dtype)
-        return self.head(self.gru(inputs)[0])
+        return self.head(self.gru(self._embedded(tokens))[0])
 
     def empty_memory(self, rows: int) -> HiddenState:
         """A hidden state of zeros for ``rows`` rows."""
@@ -104,8 +106,7 @@ class GRU(nn.Module):
 
     def step(self, token: Tensor, memory: HiddenState) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
-        # (rows, 1, width)
-        inputs = self.embed(token)[:, None].to(next(self.gru.parameters()).dtype)
+        inputs = self._embedded(token[:, None])  # (rows, 1, width)
         output, value = self.gru(inputs, memory.value.transpose(0, 1).contiguous())
         memory.value = stored(memory.value, value.transpose(0, 1))
         return self.head(output[:, 0])

@@ -8,7 +8,6 @@ from torch import Tensor
 
 Output = TypeVar("Output")
 WARMUP = 3  # calls before a capture, in which libraries make their own memory
-Key = tuple[tuple[int, ...] | None, ...]
 Graph = tuple[torch.cuda.CUDAGraph, list[Tensor | None], Tensor]
 
 
@@ -44,7 +43,7 @@ class Captured:
         self, function: Callable[..., Tensor], state: Callable[[], Mapping[str, Tensor]]
     ) -> None:
         self.function, self.state = function, state
-        self._graphs: dict[Key, Graph] = {}
+        self._graphs: dict[tuple, Graph] = {}
 
     def __call__(self, *given: Tensor | None) -> Tensor:
         """What the function returns; a copy, as the next replay overwrites it.

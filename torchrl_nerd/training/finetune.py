@@ -158,17 +158,17 @@ class FineTuner:
         config, waited = self.config, 0
         total = max(1, round(config.epochs * self.updates_per_epoch))
         generator = Generator().manual_seed(config.seed)
-        order = torch.zeros(0, dtype=torch.long)
+        batches: list[Tensor] = []
         with self._bar(total, self.updates_per_epoch) as bar:
             for update in range(1, total + 1):
-                if len(order) == 0:
+                if not batches:
                     order = torch.randperm(len(self.starts), generator=generator)
-                pick, order = order[: config.batch_size], order[config.batch_size :]
+                    batches = list(self.starts[order].split(config.batch_size))
                 is_short = update <= config.short_history_fraction * total
                 length = config.sequence_length // (2 if is_short else 1)
                 rate = min(1.0, update / WARMUP) * (1.0 - (update - 1) / total)
                 self.optimizer.param_groups[0]["lr"] = config.lr * rate
-                loss = self._step(self.starts[pick], max(1, length))
+                loss = self._step(batches.pop(0), max(1, length))
                 bar.update()
                 if update % config.validate_every == 0 or update == total:
                     is_better = self._consider(update / self.updates_per_epoch, loss)

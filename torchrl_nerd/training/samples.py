@@ -40,23 +40,23 @@ def raw_tokens(
 def data_stats(
     scene: Scene, data: TensorDict, config: FeatureConfig = NO_PREDICTIONS
 ) -> dict[NestedKey, Stats]:
-    """Exact statistics of a scene's features and targets over a data set.
-
-    Computed where the data are, and given on the CPU.
-    """
-    device = data[QPOS].device
-    tokens, state_delta = SceneFeatures(scene, config), StateDelta(scene)
-    found = stats_of(tokens.to(device), cast(StateDelta, state_delta.to(device)), data)
-    return {k: Stats(x.count, x.mean.cpu(), x.m2.cpu()) for k, x in found.items()}
+    """Exact statistics of a scene's features and targets over a data set."""
+    return stats_of(SceneFeatures(scene, config), StateDelta(scene), data)
 
 
 def stats_of(
     tokens: SceneFeatures, state_delta: StateDelta, data: TensorDict
 ) -> dict[NestedKey, Stats]:
-    """Exact statistics of tokens and targets over a data set."""
-    parts = (raw_tokens(tokens, state_delta, part) for part in data.split(PART))
-    stats = ([Stats.of(values) for values in part] for part in parts)
-    token, target = map(Stats.merge_all, zip(*stats, strict=True))
+    """Exact statistics of tokens and targets over a data set.
+
+    Computed where the data are, and given on the CPU.
+    """
+    device = data[QPOS].device
+    encode = tokens.to(device), cast(StateDelta, state_delta.to(device))
+    parts = (raw_tokens(*encode, part) for part in data.split(PART))
+    both = ([Stats.of(values) for values in part] for part in parts)
+    found = map(Stats.merge_all, zip(*both, strict=True))
+    token, target = (Stats(x.count, x.mean.cpu(), x.m2.cpu()) for x in found)
     return {TOKEN: token, TARGET: target}
 
 
