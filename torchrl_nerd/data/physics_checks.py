@@ -17,6 +17,7 @@ from torchrl_nerd.data.recorded import (
     free_fall,
     is_free_body,
 )
+from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.geometry.rotations import quat_normalize, rotate
 from torchrl_nerd.scenes import Scene
 
@@ -47,9 +48,8 @@ class Check:
         return self.low <= self.value <= self.high
 
     def __str__(self) -> str:
-        limits = f"{self.low:.3g} to {self.high:.3g}"
-        if self.low == -float("inf"):
-            limits = f"at most {self.high:.3g}"
+        low = "at most" if self.low == -float("inf") else f"{self.low:.3g} to"
+        limits = f"{low} {self.high:.3g}"
         return f"{self.name}: {self.value:.3g} {self.unit}, expected {limits}"
 
 
@@ -106,8 +106,9 @@ def _free_body_checks(log: Recording, scene: Scene) -> Iterator[Check]:
         name = "linear velocity against differences of positions"
         speeds = (float(_length(x).median()) for x in (moved, linear))
         advice = "positions move at {:.3g} m/s (median), velocities say {:.3g} m/s"
-        advice, other = advice.format(*speeds), (rotate(quat, linear), moved)
-        readings = {"they are read in body axes: give them in world axes": other}
+        advice = advice.format(*speeds)
+        other = "they are read in body axes: give them in world axes"
+        readings = {other: (rotate(quat, linear), moved)}
         yield _velocity(name, linear, moved, log, advice, readings)
     if not angular.isnan().any():
         name = "angular velocity in body axes against differences of quaternions"
@@ -154,10 +155,8 @@ def _gravity(fall: Tensor, scene: Scene) -> Check:
 def _depth(log: Recording, swapped: Recording, scene: Scene) -> Check:
     """How deep the lowest contact point ever lies in the ground."""
     found, if_swapped = (
-        float(
-            -scene.clearances(torch.cat((x[:, :3], quat_normalize(x[:, 3:])), 1)).min()
-        )
-        for x in (log.qpos, swapped.qpos)
+        -float(scene.clearances(normalize_pos(scene.layout, x.qpos)).min())
+        for x in (log, swapped)
     )
     limit = DEEPEST * float(abs(scene.contacts.positions).max())
     advice = "sizes, or the ground's height, differ from the scene's"

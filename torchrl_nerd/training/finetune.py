@@ -102,11 +102,11 @@ class FineTuner:
         self.checks = recording.starts(config.states, validation)[::VALIDATION_STRIDE]
         self.curve: list[dict[str, float]] = []
         if isinstance(self.model, NeRD):
-            chosen = []
-            for name, weight in self.model.network.named_parameters():
-                weight.requires_grad_(self.update == "all" or "head" in name)
-                chosen += [weight] if weight.requires_grad else []
-            self.optimizer = torch.optim.Adam(chosen, lr=config.lr)
+            network = self.model.network
+            chosen = network if self.update == "all" else network.head
+            network.requires_grad_(False)
+            weights = chosen.requires_grad_(True).parameters()
+            self.optimizer = torch.optim.Adam(weights, lr=config.lr)
 
     @property
     def updates_per_epoch(self) -> int:

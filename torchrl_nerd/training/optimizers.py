@@ -1,7 +1,4 @@
-"""Optimizers, their learning rates, and the state of a run that can be resumed.
-
-Muon trains the weight matrices of linear layers, AdamW all other weights.
-"""
+"""Optimizers, their learning rates, and the state of a run that can be resumed."""
 
 from collections.abc import Mapping
 from pathlib import Path
