@@ -37,7 +37,6 @@ from torchrl_nerd.training.physics_fit import WINDOWS, fit_flight, fit_parameter
 VALIDATION_STRIDE = 5  # of the validation windows, which overlap
 ANALYTIC = "analytic"  # name of a step without weights, where models are named
 WARMUP = 10  # updates over which the step size rises
-CAN_LEARN = (NeRD, FreeBodyPenaltyStep)
 SCALES = {"m": 0.05, "rad": 1.0}  # errors that weigh alike
 BAR = "epochs {n:.2f}/{total:.2f} |{bar}| {elapsed}<{remaining}{postfix}"
 
@@ -90,7 +89,8 @@ class FineTuner:
         torch.manual_seed(config.seed)
         is_fit = isinstance(model, FreeBodyPenaltyStep)
         self.update = config.update or ("physics" if is_fit else "all")
-        if (self.update == "physics") != is_fit or not isinstance(model, CAN_LEARN):
+        can_learn = is_fit or isinstance(model, NeRD)
+        if (self.update == "physics") != is_fit or not can_learn:
             raise SettingError(
                 "expected update 'physics' for a free body's analytic step, 'all' or "
                 f"'head' for a network, got '{self.update}' for {type(model).__name__}"

@@ -274,8 +274,8 @@ class Symmetry(nn.Module):
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
         """Statistics of tokens and targets with all their images."""
-        tokens = self.tokens.complete(stats[TOKEN])
-        return {TOKEN: tokens, TARGET: self.targets.complete(stats[TARGET])}
+        both = (TOKEN, self.tokens), (TARGET, self.targets)
+        return {key: images.complete(stats[key]) for key, images in both}
 
     def keeps(self, normalize: Normalize) -> bool:
         """Whether images of normalised tokens and targets are those of raw ones."""
