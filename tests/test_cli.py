@@ -218,6 +218,18 @@ def test_an_unknown_scene_is_refused(command, capsys):
         ("train cartpole --save-every 0", "save_every of at least 1"),
         ("train cartpole --lr nan", "lr of at least 0, got nan"),
         ("eval cartpole --split test", "expected --data with --baselines, --split"),
+        (
+            "eval cube --data a.npz --reference rk4",
+            "expected --reference without --data",
+        ),
+        (
+            "eval cube --data a.npz --variants bf16",
+            "expected --variants without --data",
+        ),
+        ("eval cube --data a.npz --history 5", "expected --history without --data"),
+        ("eval cartpole --vary motor=0.5:2 motor=0.5:2", "expected 'motor' once"),
+        ("eval cartpole --vary motor=0.5:2 motor=0.6:1", "expected 'motor' once"),
+        ("eval cartpole --vary preset preset", "expected 'preset' once"),
         ("train cartpole --threads -1", "threads"),
         ("train cartpole --device nowhere", "nowhere"),
         ("eval cartpole --num-trajectories 1", "at least 2, got 1"),

@@ -137,6 +137,15 @@ def test_other_robots_and_splits_are_refused(network, tmp_path, capsys):
     assert "analytic" in refusal(capsys, *argv)
 
 
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_a_log_too_short_to_split_is_refused(dry, generator, tmp_path, capsys):
+    write_cartpole_log(log := tmp_path / "log.npz", generator, trajectories=2)
+    out = str(tmp_path / "run")
+    argv = ["finetune", "cartpole", "--from", str(log), "--states", "10", "--out", out]
+    argv += ["--model", "cartpole-mlp", *TINY, *dry]
+    assert "got a log of 2 with none for validation" in refusal(capsys, *argv)
+
+
 def test_training_on_recorded_trajectories_is_told_of_finetune(
     generator, tmp_path, monkeypatch, capsys
 ):

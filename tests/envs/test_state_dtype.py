@@ -16,6 +16,7 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.robots import TASKS
+from torchrl_nerd.settings import expect_device
 
 STEPS, ROWS = 5, 8
 DYNAMICS = ("nerd", "analytic", "mujoco")
@@ -107,3 +108,10 @@ def test_another_precision_is_refused():
         ValueError, match=r"float32 or torch\.float64, got torch\.int64"
     ):
         make_env("cartpole/swingup", state_dtype=torch.int64)
+
+
+def test_a_device_without_float64_takes_float32_alone(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    assert expect_device("mps", has_float64=False) == torch.device("mps")
+    with pytest.raises(ValueError, match=r"that torch finds here .*, got 'mps'"):
+        expect_device("mps")

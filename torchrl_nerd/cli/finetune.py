@@ -39,7 +39,9 @@ class Finetune(DeviceCommand):
 
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""
-        _, split = load_recording(self.recorded, recorded_scene(self.scene))
+        recording, split = load_recording(self.recorded, recorded_scene(self.scene))
+        recording.starts(2, split["train"])
+        recording.starts(self.config.states, split["validation"])
         return [f"{name}: {len(part)} trajectories" for name, part in split.items()]
 
     def run(self) -> dict[str, Any]:

@@ -42,7 +42,11 @@ def varied_ranges(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
         ValueError: not ``NAME=LOW:HIGH``, a name that is given twice, or no preset.
     """
     ranges = dict[str, Sequence[float]]()
-    for given in vary:
+    names = [given.partition("=")[0] for given in vary]
+    for parameter in names:
+        if names.count(parameter) > 1:
+            raise ValueError(f"expected '{parameter}' once, got it several times")
+    for parameter, given in zip(names, vary, strict=True):
         if given == "preset":
             if not (preset := preset_of(name).variation):
                 raise ValueError(
@@ -50,13 +54,10 @@ def varied_ranges(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
                 )
             ranges |= preset
             continue
-        parameter, _, ends = given.partition("=")
         try:
-            low, high = map(float, ends.split(":"))
+            low, high = map(float, given.partition("=")[2].split(":"))
         except ValueError:
             raise ValueError(f"expected NAME=LOW:HIGH, got '{given}'") from None
-        if parameter in {x.partition("=")[0] for x in vary if x != given}:
-            raise ValueError(f"expected '{parameter}' once, got it several times")
         ranges[parameter] = low, high
     return ranges
 

@@ -120,7 +120,7 @@ class NeRDEnv(SceneEnv):
         if state_dtype == torch.float32:
             kept = {id(model.scene): model.scene}
             model = cast_constants(copy.deepcopy(model, kept), state_dtype)
-        model = model.to(expect_device(str(device)))
+        model = model.to(expect_device(str(device), state_dtype == torch.float64))
         how = {"differentiable": differentiable, "inference": inference}
         dynamics = dynamics_of(model, **how)
         if not isinstance(dynamics, NeRDDynamics):
