@@ -289,32 +289,37 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
     return "\n\n".join(parts)
 
 
+SOURCES = {"shared": "MuJoCo Menagerie"}
+"""Sources whose folder has another name."""
+
+
 def robots_table(folder: Path = RESULTS) -> str:
     """Third-party robots: how many load, each that does, and why others do not."""
     record = one("robots_that_load", folder)
     if record is None:
         return ""
     found, refused = record["results"], []
-    table = [["robot", "contact points", "beyond them (mm)", "against mj_step"]]
-    table[0] += ["dropped (%)", "99% slower than (rad/s)"]
+    head = ["robot", "points", "beyond them", "from mj_step", "dropped", "speed"]
+    tables: dict[str, list[list[str]]] = {}
     for row in found:
-        name = f"{row['source']}: {row['robot']}"
+        name, source = row["robot"], SOURCES.get(row["source"], row["source"])
         if not row["loads"]:
-            refused.append(f"- {name}: {row['why'].partition(': ')[2]}.")
+            refused.append(f"- {source}: {name}: {row['why'].partition(': ')[2]}.")
             continue
+        table = tables.setdefault(source, [head])
         points, error = row["contact_points"], 1e3 * row["contact_error_m"]
         speed = number(row["speed_p99"].get("rad_per_s"))
-        share = f"{100.0 * row['dropped']:.0f}"
+        share = f"{100.0 * row['dropped']:.0f}%"
         same = number(row["difference"])
-        table.append([name, str(points), f"{error:.1f}", same, share, speed])
-    sources = dict.fromkeys(row["source"] for row in found)
+        table.append([name, str(points), f"{error:.1f} mm", same, share, speed])
     loads = [["source", "robots", "load"]]
-    for source in sources:
+    for source in dict.fromkeys(row["source"] for row in found):
         own = [row["loads"] for row in found if row["source"] == source]
-        loads.append([source, str(len(own)), str(sum(own))])
-    loads.append(["all", str(len(found)), str(len(table) - 1)])
+        loads.append([SOURCES.get(source, source), str(len(own)), str(sum(own))])
+    loads.append(["all", str(len(found)), str(len(found) - len(refused))])
     why = "Refused:\n\n" + "\n".join(refused) if refused else ""
-    return "\n\n".join((rows(loads), rows(table), why, made_by(record)))
+    each = (f"**{source}**\n\n{rows(table)}" for source, table in tables.items())
+    return "\n\n".join((rows(loads), *each, why, made_by(record)))
 
 
 def policies_table(folder: Path = RESULTS) -> str:

@@ -408,7 +408,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "| ant | x, 5 | 0.1 | 0.2 | 3.0 | 1.5 |" in shown
     assert "| a | x | 0.123 | 0.123 | 0.123 |" in shown
     assert "| suite | 2 | 1 |" in shown and "- suite: dog: muscles." in shown
-    assert "| suite: cat | 5 | 2.1 | 0 | 4 | 12 |" in shown
+    assert "**suite**" in shown and "| cat | 5 | 2.1 mm | 0 | 4% | 12 |" in shown
     assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
 
 
