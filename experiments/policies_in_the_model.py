@@ -18,6 +18,7 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from math import ceil
 from multiprocessing import get_context
 from pathlib import Path
 from typing import cast
@@ -63,8 +64,8 @@ class Config:
     trajectories: int = 1000  # random ones of 100 control steps
     updates: int = 4000  # of the model, on them
     rounds: int = 10  # of PPO in the model; data are added between two of them
-    along: int = 64  # trajectories along the policy before a round
-    length: int = 1000  # control steps of each, until the robot falls
+    along: int = 64  # trajectories along the policy before a round, more where it falls
+    length: int = 1000  # control steps of each
     more_updates: int = 1000  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     network: str = "mlp-4x64"
@@ -200,6 +201,22 @@ def pieces_along(
     return cast(TensorDict, pieces[begins])
 
 
+def data_along(
+    cfg: Config, task: Task, actor: Actor, draw: Generator
+) -> list[TensorDict]:
+    """As many pieces as `along` trajectories to the end have, of a robot that falls too."""
+    left, rows, length = cfg.along * (cfg.length // SEGMENT), cfg.along, cfg.length
+    parts: list[TensorDict] = []
+    while left > 0 and rows:
+        found = pieces_along(task, actor, rows, length, draw, cfg.noise)
+        parts.append(cast(TensorDict, found[:left]))
+        left -= len(found)
+        each = len(found) / rows  # pieces until it falls
+        rows = ceil(left / each) if each else 0
+        length = min(cfg.length, SEGMENT * ceil(2.0 * each))  # most fall before
+    return parts
+
+
 def train_model(
     task: Task, data: TensorDict, cfg: Config, number: int, start: NeRD | None
 ) -> NeRD:
@@ -228,9 +245,9 @@ def in_the_model(cfg: Config) -> dict:
     data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
     learner = Learner(cfg, make_env(task, "mujoco", 8, cfg.seed))
     for number in range(cfg.rounds):
-        draw, about = fold_in(cfg.seed, 1 + number), (cfg.along, cfg.length)
-        more = pieces_along(task, learner.actor, *about, draw, cfg.noise)
-        data = cast(TensorDict, TensorDict.cat((data, more)))
+        draw = fold_in(cfg.seed, 1 + number)
+        more = data_along(cfg, task, learner.actor, draw)
+        data = cast(TensorDict, TensorDict.cat((data, *more)))
         clock.note("data")
         model = train_model(task, data, cfg, number, model)
         clock.note("model")

@@ -5,7 +5,14 @@ import json
 import pytest
 import tables
 import torch
-from policies_in_the_model import SEGMENT, Config, Trusted, main, pieces_along
+from policies_in_the_model import (
+    SEGMENT,
+    Config,
+    Trusted,
+    data_along,
+    main,
+    pieces_along,
+)
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
@@ -51,6 +58,15 @@ def test_pieces_begin_before_the_robot_fell():
     assert not task.terminated({key: start[key] for key in (QPOS, QVEL)}).any()
     assert isinstance(found, TensorDict)
     torch.testing.assert_close(found[:, 1:][QPOS], found[:, :-1]["next", QPOS])
+
+
+def test_a_robot_that_falls_gives_as_much_data():
+    task = make_task("gymnasium/Hopper-v5")
+    actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
+    cfg = Config("gymnasium/Hopper-v5", along=4, length=5 * SEGMENT, noise=1.0)
+    parts = data_along(cfg, task, actor, fold_in(0, 1))
+    assert len(parts) > 1 and len(parts[0]) < 20
+    assert sum(len(x) for x in parts) == 20
 
 
 @pytest.mark.slow
