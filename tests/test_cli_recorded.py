@@ -142,7 +142,7 @@ def test_a_log_too_short_to_split_is_refused(dry, generator, tmp_path, capsys):
     write_cartpole_log(log := tmp_path / "log.npz", generator, trajectories=2)
     out = str(tmp_path / "run")
     argv = ["finetune", "cartpole", "--from", str(log), "--states", "10", "--out", out]
-    argv += ["--model", "cartpole-mlp", *TINY, *dry]
+    argv += [*TINY, *dry, "--model", "cartpole-mlp"]
     assert "got a log of 2 with none for validation" in refusal(capsys, *argv)
 
 
