@@ -148,19 +148,21 @@ class Learner:
         self.batch = cfg.num_envs * cfg.horizon
         self.updates, self.done = max(1, cfg.frames // self.batch), 0
 
-    def learn(self, env: EnvBase, share: float) -> float:
-        """A share of all frames in an env; the mean reward of the last batch."""
+    def learn(self, env: EnvBase, share: float) -> dict[str, float]:
+        """A share of all frames in an env; of the last batch: reward, share of failures."""
         count, optimizer = max(1, round(share * self.updates)), self.parts[2]
-        how, reward = replace(self.cfg, total_frames=count * self.batch), 0.0
+        how, found = replace(self.cfg, total_frames=count * self.batch), {}
         for batch in ppo.collect(how, env, self.actor):
-            reward = float(batch["next", "reward"].mean())
+            after = batch["next"]
+            found = {"reward": float(after["reward"].mean())}
+            found["failed"] = float(after["terminated"].float().mean())
             for group in optimizer.param_groups:
                 left = 1.0 - self.done / self.updates
                 group["lr"] = self.cfg.lr * max(0.0, left)
             ppo.update(batch, *self.parts, self.cfg)
             self.policy.standardize.fit(batch["observation"])
             self.done += 1
-        return reward
+        return found
 
 
 def task_of(cfg: Config) -> Task:
@@ -253,11 +255,11 @@ def in_the_model(cfg: Config) -> dict:
         clock.note("model")
         inner = NeRDEnv(task, model, cfg.num_envs, cfg.seed + number, guard="flag")
         env = TransformedEnv(inner, Trusted(cfg.trust))
-        reward = learner.learn(env, 1.0 / cfg.rounds)
+        last = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
         found = watched(cfg, learner.actor)
         frames = SEGMENT * len(data)
-        point = {"robot_frames": frames, "return": found, "reward": reward}
+        point = {"robot_frames": frames, "return": found, **last}
         curve.append(point | {"seconds": clock.spent()})
         print(f"model, round {number + 1}: {curve[-1]}", flush=True)
         clock.note("watching")  # no part of the method
