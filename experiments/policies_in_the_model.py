@@ -13,9 +13,11 @@
 The two ways take a processor each at the same time, and each counts what it took of it.
 """
 
+import copy
 import os
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil
@@ -78,6 +80,7 @@ class Config:
     gamma: float = 0.99
     widths: tuple[int, ...] = (128, 128)
     episodes: int = 256  # of the report, in each dynamics
+    device: str = "cpu"  # of the model, and of PPO in it
     seed: int = 0
     out: Path = Path("runs/policies")
     json: Path | None = None
@@ -119,14 +122,17 @@ class Trusted(Transform):
 
 @dataclass
 class Clock:
-    """Processor time of each kind of work, s: on one free core that is the wall time."""
+    """Time of each kind of work, s: of the processor, which on a free core is wall time."""
 
+    read: Callable[[], float] = time.process_time
     seconds: dict[str, float] = field(default_factory=dict)
-    _began: float = field(default_factory=time.process_time)
+
+    def __post_init__(self) -> None:
+        self._began = self.read()
 
     def note(self, kind: str) -> None:
         """Count the time since the last note, or the beginning, as that of a kind."""
-        now = time.process_time()
+        now = self.read()
         self.seconds[kind] = self.seconds.get(kind, 0.0) + now - self._began
         self._began = now
 
@@ -148,14 +154,19 @@ class Learner:
         self.batch = cfg.num_envs * cfg.horizon
         self.updates, self.done = max(1, cfg.frames // self.batch), 0
 
+    def on_the_processor(self) -> Actor:
+        """Its policy, to act in MuJoCo: itself where it is there."""
+        if self.policy.standardize.mean.device.type == "cpu":
+            return self.actor
+        return make_actor(copy.deepcopy(self.policy).cpu())
+
     def learn(self, env: EnvBase, share: float) -> dict[str, float]:
         """A share of all frames in an env; of the last batch: reward, share of failures."""
         count, optimizer = max(1, round(share * self.updates)), self.parts[2]
         how, found = replace(self.cfg, total_frames=count * self.batch), {}
         for batch in ppo.collect(how, env, self.actor):
-            after = batch["next"]
-            found = {"reward": float(after["reward"].mean())}
-            found["failed"] = float(after["terminated"].float().mean())
+            found = {"reward": float(batch["next", "reward"].mean())}
+            found["failed"] = float(batch["next", "terminated"].float().mean())
             for group in optimizer.param_groups:
                 left = 1.0 - self.done / self.updates
                 group["lr"] = self.cfg.lr * max(0.0, left)
@@ -171,12 +182,13 @@ def task_of(cfg: Config) -> Task:
     return SuiteTask(cfg.name, cfg.hold) if isinstance(task, SuiteTask) else task
 
 
-def begin(cfg: Config) -> tuple[Task, Clock]:
-    """One processor for this process, and the task."""
+def begin(cfg: Config, device: str = "cpu") -> tuple[Task, Clock]:
+    """One processor for this process, and the task; with a GPU wall time counts."""
     torch.set_num_threads(1)
     os.environ["NERD_THREADS"] = "1"
     torch.manual_seed(cfg.seed)
-    return task_of(cfg), Clock()
+    read = time.process_time if device == "cpu" else time.monotonic
+    return task_of(cfg), Clock(read)
 
 
 def returns_of(cfg: Config, actor: Actor, count: int, seed: int) -> Tensor:
@@ -237,27 +249,29 @@ def train_model(
     )
     folder = cfg.folder / f"model_{number}"
     given = {"quiet": True, "logger": "csv", "init_from": start, "horizons": (20, 100)}
-    return Trainer(task.scene, data, task.scene, how, folder, **given).run().eval()
+    about = task.scene, data, task.scene, how, folder, cfg.device
+    return Trainer(*about, **given).run().eval()
 
 
 def in_the_model(cfg: Config) -> dict:
     """A policy learned in models alone, what it took, and how it does."""
-    task, clock = begin(cfg)
+    task, clock = begin(cfg, cfg.device)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
     data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
-    learner = Learner(cfg, make_env(task, "mujoco", 8, cfg.seed))
+    learner = Learner(cfg, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     for number in range(cfg.rounds):
         draw = fold_in(cfg.seed, 1 + number)
-        more = data_along(cfg, task, learner.actor, draw)
+        more = data_along(cfg, task, learner.on_the_processor(), draw)
         data = cast(TensorDict, TensorDict.cat((data, *more)))
         clock.note("data")
         model = train_model(task, data, cfg, number, model)
         clock.note("model")
-        inner = NeRDEnv(task, model, cfg.num_envs, cfg.seed + number, guard="flag")
+        about = cfg.num_envs, cfg.seed + number, cfg.device
+        inner = NeRDEnv(task, model, *about, guard="flag")
         env = TransformedEnv(inner, Trusted(cfg.trust))
         last = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
-        found = watched(cfg, learner.actor)
+        found = watched(cfg, learner.on_the_processor())
         frames = SEGMENT * len(data)
         point = {"robot_frames": frames, "return": found, **last}
         curve.append(point | {"seconds": clock.spent()})
@@ -265,9 +279,9 @@ def in_the_model(cfg: Config) -> dict:
         clock.note("watching")  # no part of the method
     assert model is not None
     save_policy(learner.policy, cfg.folder / "policy", {})
-    seed, count = cfg.seed + 10_000, cfg.episodes
-    promised = policy_returns(NeRDEnv(task, model, count, seed), learner.actor)
-    reached = returns_of(cfg, learner.actor, count, seed)
+    seed, count, actor = cfg.seed + 10_000, cfg.episodes, learner.on_the_processor()
+    promised = policy_returns(NeRDEnv(task, model, count, seed), actor)
+    reached = returns_of(cfg, actor, count, seed)
     return {
         "curve": curve,
         "seconds": clock.seconds,
