@@ -311,6 +311,7 @@ def robots_table(folder: Path = RESULTS) -> str:
         speed = number(row["speed_p99"].get("rad_per_s"))
         share = f"{100.0 * row['dropped']:.0f}%"
         same = number(row["difference"])
+        name = name.replace("_", "_<wbr>")  # where a long one may be broken
         table.append([name, str(points), f"{error:.1f} mm", same, share, speed])
     loads = [["source", "robots", "load"]]
     for source in dict.fromkeys(row["source"] for row in found):
