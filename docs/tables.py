@@ -298,11 +298,13 @@ def robots_table(folder: Path = RESULTS) -> str:
     record = one("robots_that_load", folder)
     if record is None:
         return ""
-    found, refused = record["results"], []
+    found, refused = [], []
+    for row in record["results"]:
+        found.append(row | {"source": SOURCES.get(row["source"], row["source"])})
     head = ["robot", "points", "beyond them", "from mj_step", "dropped", "speed"]
     tables: dict[str, list[list[str]]] = {}
     for row in found:
-        name, source = row["robot"], SOURCES.get(row["source"], row["source"])
+        name, source = row["robot"], row["source"]
         if not row["loads"]:
             refused.append(f"- {source}: {name}: {row['why'].partition(': ')[2]}.")
             continue
@@ -316,7 +318,7 @@ def robots_table(folder: Path = RESULTS) -> str:
     loads = [["source", "robots", "load"]]
     for source in dict.fromkeys(row["source"] for row in found):
         own = [row["loads"] for row in found if row["source"] == source]
-        loads.append([SOURCES.get(source, source), str(len(own)), str(sum(own))])
+        loads.append([source, str(len(own)), str(sum(own))])
     loads.append(["all", str(len(found)), str(len(found) - len(refused))])
     why = "Refused:\n\n" + "\n".join(refused) if refused else ""
     each = (f"**{source}**\n\n{rows(table)}" for source, table in tables.items())

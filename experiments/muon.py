@@ -23,7 +23,7 @@ from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.evaluation.rollout_error import passive_errors
+from torchrl_nerd.evaluation.rollout_error import means_by_horizon, passive_errors
 from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.optimizers import make_adamw, split_parameters
 from torchrl_nerd.training.trainer import Trainer
@@ -154,9 +154,7 @@ def train(options: Options, name: str, network: str, seed: int) -> dict[str, Any
         num_trajectories=TEST_ROLLOUTS,
         seed=TEST_SEED,
     )
-    for horizon, by_name in errors.items():
-        found |= {f"{name}_{horizon}": error.mean for name, error in by_name.items()}
-    return found
+    return {**found, **means_by_horizon(errors)}
 
 
 def update_ms(trainer: Trainer) -> float:

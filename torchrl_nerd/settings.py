@@ -45,17 +45,17 @@ def look_up(what: str, name: str, known: Mapping[str, Value]) -> Value:
     return known[name]
 
 
-def expect_device(name: str, has_float64: bool = True) -> torch.device:
+def expect_device(name: str, dtype: torch.dtype = torch.float64) -> torch.device:
     """The device of that name: ``cpu``, ``cuda``, or ``cuda:1`` for the second of several.
 
-    ``has_float64``: whether it has to; ``mps`` has none.
+    ``dtype``: of the numbers that it has to compute with; ``mps`` has no float64.
 
     Raises:
         SettingError: naming the devices that this machine has, if it is none of them.
     """
     count = torch.cuda.device_count()
     found = ["cpu", *["cuda"][:count], *(f"cuda:{index}" for index in range(count))]
-    if not has_float64 and torch.backends.mps.is_available():
+    if dtype != torch.float64 and torch.backends.mps.is_available():
         found.append("mps")
     if name not in found:
         raise SettingError(

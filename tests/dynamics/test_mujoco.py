@@ -1,6 +1,7 @@
 """The batched rollout is a plain loop of mj_step, one MjData per row."""
 
 import copy
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -13,6 +14,7 @@ from dynamics_helpers import (
     stand_on_feet,
     unequal_keys,
 )
+from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd import load_scene
@@ -23,23 +25,21 @@ ROWS, STEPS = 16, 8
 
 
 def plain_loop(
-    scene: Scene, qpos: Tensor, qvel: Tensor, torques: Tensor, plane: Tensor | None
-) -> np.ndarray:
-    """States ``(steps, nq + nv)`` of one row."""
+    scene: Scene, start: TensorDict, torques: Tensor, plane: Tensor | None = None
+) -> Iterator[mujoco.MjData]:
+    """MuJoCo's own data of one row after each control step."""
     model = copy.copy(scene.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
+    data.qpos[:], data.qvel[:] = start["qpos"], start["qvel"]
     if plane is not None:
         normal, offset = plane[:3].numpy(), float(plane[3])
         data.mocap_pos[0] = normal * offset
         mujoco.mju_quatZ2Vec(data.mocap_quat[0], normal)
-    states = []
     for torque in torques:
         data.qfrc_applied[scene.actuated] = torque
         mujoco.mj_step(model, data, scene.substeps)
-        states.append(np.concatenate((data.qpos, data.qvel)))
-    return np.array(states)
+        yield data
 
 
 def assert_is_plain_loop(scene: Scene, generator: Generator) -> None:
@@ -49,8 +49,8 @@ def assert_is_plain_loop(scene: Scene, generator: Generator) -> None:
     path = torch.cat((path["qpos"], path["qvel"]), -1).numpy()
     for row in range(ROWS):
         plane = None if terrain is None else terrain[row]
-        given = (start[row]["qpos"], start[row]["qvel"], torques[:, row], plane)
-        expected = plain_loop(scene, *given)
+        loop = plain_loop(scene, start[row], torques[:, row], plane)
+        expected = np.array([np.concatenate((x.qpos, x.qvel)) for x in loop])
         atol = 0.0 if plane is None else 1e-12 * np.abs(expected).max()
         np.testing.assert_allclose(path[row], expected, rtol=0, atol=atol)
 
@@ -69,13 +69,9 @@ def test_sensors_feel_from_the_first_step_on(generator):
     start, torques, _ = random_drive(scene, 2, 3, generator)
     stand_on_feet(scene, start)
     engine, state = MujocoDynamics(scene, 1), start
-    model, data = copy.copy(scene.model), mujoco.MjData(scene.model)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    data.qpos[:] = start["qpos"][0]
-    for torque in torques:
+    loop = plain_loop(scene, start[0], torques[:, 0])
+    for torque, data in zip(torques, loop, strict=True):
         state = engine.step(state, torque)
-        data.qfrc_applied[scene.actuated] = torque[0]
-        mujoco.mj_step(model, data, scene.substeps)
         felt = state["sensordata"][0].numpy()
         np.testing.assert_array_equal(felt, data.sensordata)
         assert felt[-2:].any()  # toe and heel

@@ -112,6 +112,6 @@ def test_another_precision_is_refused():
 
 def test_a_device_without_float64_takes_float32_alone(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
-    assert expect_device("mps", has_float64=False) == torch.device("mps")
+    assert expect_device("mps", torch.float32) == torch.device("mps")
     with pytest.raises(ValueError, match=r"that torch finds here .*, got 'mps'"):
         expect_device("mps")

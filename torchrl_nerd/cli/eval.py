@@ -1,7 +1,7 @@
 """``nerd eval``: open-loop error against MuJoCo or recorded trajectories."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,7 +90,10 @@ class Eval(MeasuringCommand):
     def run(self) -> dict[str, Any]:
         """Print the tables and return their rows; bad input raises ValueError."""
         if self.data is not None:
-            self._expect_recorded()
+            for name in SIMULATED:
+                if getattr(self, name) != getattr(type(self), name):
+                    flag = name.replace("_", "-")
+                    raise ValueError(f"expected --{flag} without --data")
             return self.run_recorded(self.data)
         if self.baselines or self.split != "all" or self.states != STATES:
             raise ValueError("expected --data with --baselines, --split or --states")
@@ -148,14 +151,6 @@ class Eval(MeasuringCommand):
             for horizon in protocol.horizons:
                 published = protocol.published
                 yield error_rows(chosen.scene, case, horizon, errors, published)
-
-    def _expect_recorded(self) -> None:
-        """Refuse options of simulated trajectories."""
-        for field in fields(self):
-            is_given = getattr(self, field.name) != field.default
-            if field.name in SIMULATED and is_given:
-                name = field.name.replace("_", "-")
-                raise ValueError(f"expected --{name} without --data")
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
         """The same for recorded trajectories; a split that is none raises ValueError."""

@@ -40,6 +40,7 @@ class Finetune(DeviceCommand):
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""
         recording, split = load_recording(self.recorded, recorded_scene(self.scene))
+        # which refuse a log too short to learn from
         recording.starts(2, split["train"])
         recording.starts(self.config.states, split["validation"])
         return [f"{name}: {len(part)} trajectories" for name, part in split.items()]

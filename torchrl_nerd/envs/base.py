@@ -86,7 +86,7 @@ class SceneEnv(RenderedEnv):
                 f"the task is for scene '{task.scene.name}', the dynamics for "
                 f"'{dynamics.scene.name}'"
             )
-        place = expect_device(str(device), state_dtype == torch.float64)
+        place = expect_device(str(device), state_dtype)
         super().__init__(device=place, batch_size=torch.Size([num_envs]))
         self.scene, self.task, self.dynamics = task.scene, task, dynamics
         self.model_name: str | None = None

@@ -64,7 +64,7 @@ class GroundTruthEnv(SceneEnv):
     ) -> None:
         make = look_up("engine", engine, ENGINES)
         task = task if isinstance(task, Task) else make_task(task)
-        dynamics = make(task.scene, expect_device(str(device)))
+        dynamics = make(task.scene, expect_device(str(device), state_dtype))
         super().__init__(task, dynamics, num_envs, seed, device, dump_dir, state_dtype)
 
 
@@ -120,7 +120,7 @@ class NeRDEnv(SceneEnv):
         if state_dtype == torch.float32:
             kept = {id(model.scene): model.scene}
             model = cast_constants(copy.deepcopy(model, kept), state_dtype)
-        model = model.to(expect_device(str(device), state_dtype == torch.float64))
+        model = model.to(expect_device(str(device), state_dtype))
         how = {"differentiable": differentiable, "inference": inference}
         dynamics = dynamics_of(model, **how)
         if not isinstance(dynamics, NeRDDynamics):

@@ -255,6 +255,15 @@ def summarize(
     return summaries
 
 
+def means_by_horizon(errors: dict[int, dict[str, ErrorSummary]]) -> dict[str, float]:
+    """Mean errors of `passive_errors` by ``quantity_horizon``, for a log."""
+    return {
+        f"{name}_{horizon}": error.mean
+        for horizon, by_name in errors.items()
+        for name, error in by_name.items()
+    }
+
+
 def passive_errors(
     source: Source,
     other: Dynamics,

@@ -17,7 +17,11 @@ from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.compiled import Compiled
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import ErrorSummary, passive_errors
+from torchrl_nerd.evaluation.rollout_error import (
+    ErrorSummary,
+    means_by_horizon,
+    passive_errors,
+)
 from torchrl_nerd.files import check_writable, read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
@@ -241,11 +245,7 @@ class Trainer:
         if found < self.best or not (self.folder / "best").exists():
             self._save_model("best")
         self.best = min(self.best, found)
-        return {
-            f"{name}_{horizon}": error.mean
-            for horizon, by_name in self.errors.items()
-            for name, error in by_name.items()
-        }
+        return means_by_horizon(self.errors)
 
     def save(self) -> None:
         """Write all that a resumed run needs; the card is written last."""
