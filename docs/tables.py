@@ -2,7 +2,8 @@
 
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
 ``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
-``gpu_errors``, ``hidden_parameters``, ``robots_that_load``, ``policies`` or ``open_loop``.
+``gpu_errors``, ``hidden_parameters``, ``robots_that_load``, ``policies``, ``open_loop``,
+``time_to_policy`` or ``unmet_policies``.
 """
 
 import json
@@ -350,6 +351,37 @@ def policies_table(folder: Path = RESULTS) -> str:
     return with_sources([[*head, "in the model"], *lines.values()], records)
 
 
+def time_to_policy_table(folder: Path = RESULTS) -> str:
+    """What PPO took in each dynamics until its policy had earned enough in MuJoCo."""
+    table = [["task", "learned in", "return wanted", "minutes to it", "minutes in all"]]
+    table[0].append("last return")
+    records = read("time_to_policy", folder).values()
+    for record in records:
+        found = record["results"]
+        for name, curve in found["curves"].items():
+            taken = found["seconds"][name]
+            to_it = "not reached" if taken is None else f"{taken / 60:.1f}"
+            about = found["configuration"]["task"], name, f"{found['wanted']:,.0f}"
+            last = f"{curve[-1]['seconds'] / 60:.1f}", f"{curve[-1]['return']:,.0f}"
+            table.append([*about, to_it, *last])
+    return with_sources(table, records)
+
+
+def unmet_policies_table(folder: Path = RESULTS) -> str:
+    """Models by their return differences for policies that learned elsewhere."""
+    table = [["task", "model", "kind", "policies", "mean (%)", "worst (%)"]]
+    table[0] += ["mean (% of the best)", "worst (% of the best)"]
+    records = read("unmet_policies", folder).values()
+    for record in records:
+        found = record["results"]
+        for model in found["models"]:
+            names = "mean", "worst", "mean_of_best", "worst_of_best"
+            shares = (f"{100.0 * model[name]:.1f}" for name in names)
+            about = found["task"], model["model"], model["kind"]
+            table.append([*about, str(model["policies"]), *shares])
+    return with_sources(table, records)
+
+
 def open_loop_table(folder: Path = RESULTS) -> str:
     """Third-party robots: a network beside MuJoCo at few substeps, and their rates."""
     head = [
@@ -427,6 +459,8 @@ TABLES = {
     "robots_that_load": robots_table,
     "policies": policies_table,
     "open_loop": open_loop_table,
+    "time_to_policy": time_to_policy_table,
+    "unmet_policies": unmet_policies_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -437,6 +471,9 @@ COMMANDS |= {"robots_that_load": ROBOTS}
 POLICIES = "python experiments/policies_in_the_model.py TASK --json FILE"
 COMMANDS |= {"policies": POLICIES}
 COMMANDS |= {"open_loop": "python experiments/open_loop.py ROBOT --json FILE"}
+TIMES = "python experiments/time_to_policy.py TASK --json FILE"
+UNMET = "python experiments/unmet_policies.py TASK --policies FOLDER --json FILE"
+COMMANDS |= {"time_to_policy": TIMES, "unmet_policies": UNMET}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

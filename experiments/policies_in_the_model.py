@@ -13,13 +13,11 @@
 The two ways take a processor each at the same time, and each counts what it took of it.
 """
 
-import copy
 import os
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from math import ceil
 from multiprocessing import get_context
 from pathlib import Path
@@ -34,6 +32,7 @@ from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
+from learner import Clock, Learner, processor_time
 
 from torchrl_nerd import NeRDEnv, make_env
 from torchrl_nerd.checkpoint import load_checkpoint
@@ -41,7 +40,7 @@ from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import GuardedDynamics, NeRDDynamics
 from torchrl_nerd.envs.actor import Actor
-from torchrl_nerd.evaluation.policy import make_actor, save_policy
+from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TRUST
@@ -91,6 +90,13 @@ class Config:
         """Of models and policies."""
         return self.out / self.name.replace("/", "-")
 
+    @property
+    def ppo(self) -> ppo.Run:
+        """Settings of PPO, the same in all dynamics."""
+        names = ("num_envs", "horizon", "minibatch", "lr", "gamma", "widths", "seed")
+        kept = {name: getattr(self, name) for name in names}
+        return ppo.Run(total_frames=self.frames, **kept)
+
 
 class Trusted(Transform):
     """Ends an episode as failed where a model is asked for what it has no data of.
@@ -120,62 +126,6 @@ class Trusted(Transform):
         return next_tensordict
 
 
-@dataclass
-class Clock:
-    """Time of each kind of work, s: of the processor, which on a free core is wall time."""
-
-    read: Callable[[], float] = time.process_time
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._began = self.read()
-
-    def note(self, kind: str) -> None:
-        """Count the time since the last note, or the beginning, as that of a kind."""
-        now = self.read()
-        self.seconds[kind] = self.seconds.get(kind, 0.0) + now - self._began
-        self._began = now
-
-    def spent(self) -> float:
-        """All of it so far, without what is no part of the method."""
-        return sum(s for kind, s in self.seconds.items() if kind != "watching")
-
-
-class Learner:
-    """PPO that keeps its policy, critic and step size when it changes envs."""
-
-    def __init__(self, cfg: Config, env: EnvBase) -> None:
-        names = ("num_envs", "horizon", "minibatch", "lr", "gamma", "widths", "seed")
-        kept = {name: getattr(cfg, name) for name in names}
-        self.cfg = ppo.Run(total_frames=cfg.frames, **kept)
-        self.policy, critic = ppo.make_policy_and_critic(env, self.cfg)
-        self.actor = make_actor(self.policy)
-        self.parts = ppo.make_learning(self.actor, critic, self.cfg)
-        self.batch = cfg.num_envs * cfg.horizon
-        self.updates, self.done = max(1, cfg.frames // self.batch), 0
-
-    def on_the_processor(self) -> Actor:
-        """Its policy, to act in MuJoCo: itself where it is there."""
-        if self.policy.standardize.mean.device.type == "cpu":
-            return self.actor
-        return make_actor(copy.deepcopy(self.policy).cpu())
-
-    def learn(self, env: EnvBase, share: float) -> dict[str, float]:
-        """A share of all frames in an env; of the last batch: reward, share of failures."""
-        count, optimizer = max(1, round(share * self.updates)), self.parts[2]
-        how, found = replace(self.cfg, total_frames=count * self.batch), {}
-        for batch in ppo.collect(how, env, self.actor):
-            found = {"reward": float(batch["next", "reward"].mean())}
-            found["failed"] = float(batch["next", "terminated"].float().mean())
-            for group in optimizer.param_groups:
-                left = 1.0 - self.done / self.updates
-                group["lr"] = self.cfg.lr * max(0.0, left)
-            ppo.update(batch, *self.parts, self.cfg)
-            self.policy.standardize.fit(batch["observation"])
-            self.done += 1
-        return found
-
-
 def task_of(cfg: Config) -> Task:
     """The task; actions of the suite's are held, as is usual there."""
     task = make_task(cfg.name)
@@ -187,7 +137,7 @@ def begin(cfg: Config, device: str = "cpu") -> tuple[Task, Clock]:
     torch.set_num_threads(1)
     os.environ["NERD_THREADS"] = "1"
     torch.manual_seed(cfg.seed)
-    read = time.process_time if device == "cpu" else time.monotonic
+    read = processor_time if device == "cpu" else time.monotonic
     return task_of(cfg), Clock(read)
 
 
@@ -258,7 +208,7 @@ def in_the_model(cfg: Config) -> dict:
     task, clock = begin(cfg, cfg.device)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
     data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
-    learner = Learner(cfg, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
+    learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     for number in range(cfg.rounds):
         draw = fold_in(cfg.seed, 1 + number)
         more = data_along(cfg, task, learner.on_the_processor(), draw)
@@ -297,7 +247,7 @@ def in_mujoco(cfg: Config, is_judged: bool = False) -> dict:
     """
     task, clock = begin(cfg)
     env: EnvBase = make_env(task, "mujoco", cfg.num_envs, cfg.seed)
-    learner, curve = Learner(cfg, env), []
+    learner, curve = Learner(cfg.ppo, env), []
     for number in range(cfg.rounds):
         if is_judged:
             model = cast(NeRD, load_checkpoint(cfg.folder / f"model_{number}" / "last"))

@@ -1,0 +1,151 @@
+"""How long PPO takes in each dynamics until its policy earns enough in MuJoCo.
+
+    python experiments/time_to_policy.py ant/run --json results/time_to_policy_ant_run.json
+
+The same PPO, with the same seed, learns in each dynamics alone. On the way its policy plays
+whole episodes in MuJoCo and is saved. Time is the processor's, of one thread: compilation
+counts, MuJoCo's episodes of the curve do not, and nor does what a model took to learn.
+Dynamics are those of `make_env`, and `mujoco-N` is MuJoCo with N substeps.
+"""
+
+import copy
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+import tyro
+from tyro.conf import Positional
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+import ppo
+from learner import Clock, Learner
+
+from torchrl_nerd import make_env
+from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.evaluation.policy import save_policy
+from torchrl_nerd.evaluation.policy_transfer import policy_returns
+from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.robots import PPO_CONFIGS, make_task
+from torchrl_nerd.tasks import Task
+
+FEW = "mujoco-"  # and a number of substeps
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to learn, where, and how."""
+
+    task: Positional[str]
+    dynamics: tuple[str, ...] = ("nerd", "analytic", "mujoco")
+    points: int = 10  # of a curve, after the first
+    wanted: float | None = None  # return in MuJoCo; None: see `wanted_of`
+    frames: int | None = None  # actions; None: as the task's PPO has it
+    num_envs: int | None = None  # so are these
+    horizon: int | None = None
+    minibatch: int | None = None
+    lr: float | None = None
+    episodes: int = 128  # of a point, in MuJoCo
+    seed: int = 0
+    out: Path = Path("runs/time_to_policy")
+    json: Path | None = None
+    """Write the results to this file."""
+
+    @property
+    def folder(self) -> Path:
+        """Of policies."""
+        return self.out / self.task.replace("/", "-")
+
+    @property
+    def ppo(self) -> ppo.Run:
+        """Settings of PPO, the same in all dynamics."""
+        kept = PPO_CONFIGS.get(self.task, ppo.PPOConfig())
+        given = {"total_frames": self.frames, "seed": self.seed}
+        for name in ("num_envs", "horizon", "minibatch", "lr"):
+            given[name] = getattr(self, name)
+        given = {name: value for name, value in given.items() if value is not None}
+        return replace(ppo.Run(**vars(kept), task=self.task), **given)
+
+
+def with_substeps(task: Task, substeps: int) -> Task:
+    """The same task whose scene has another number of MuJoCo's substeps."""
+    twin = copy.copy(task)
+    vars(twin)["scene"] = task.scene.with_substeps(substeps)
+    return twin
+
+
+def env_of(name: str, task: str, num_envs: int, seed: int) -> SceneEnv:
+    """Of a dynamics; steps of models are compiled."""
+    if name.startswith(FEW):
+        few = with_substeps(make_task(task), int(name.removeprefix(FEW)))
+        return make_env(few, "mujoco", num_envs, seed)
+    is_model = name not in ("mujoco", "dm_control")
+    return make_env(task, name, num_envs, seed, compile=is_model)
+
+
+def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
+    """The curve of one dynamics, with a policy in the folder for each point."""
+    torch.set_num_threads(1)
+    os.environ["NERD_THREADS"] = "1"
+    torch.manual_seed(cfg.seed)
+    how, clock, curve = cfg.ppo, Clock(), []
+    env = env_of(name, cfg.task, how.num_envs, cfg.seed)
+    learner = Learner(how, env)
+    while learner.done < learner.updates:
+        if curve:
+            learner.learn(env, 1.0 / cfg.points)
+        clock.note("learning")
+        judge = make_env(cfg.task, "mujoco", cfg.episodes, cfg.seed + 100)
+        reached = float(policy_returns(judge, learner.actor).mean())
+        about = {"learned_in": name, "task": cfg.task, "return": reached}
+        save_policy(learner.policy, cfg.folder / name / f"{len(curve)}", about)
+        frames = learner.done * learner.batch
+        point = {"frames": frames, "seconds": clock.spent(), "return": reached}
+        curve.append(point)
+        print(f"{name}: {curve[-1]}", flush=True)
+        clock.note("watching")
+    return curve
+
+
+def time_to(curve: list[dict[str, Any]], wanted: float) -> float | None:
+    """Seconds until a curve reaches a return and stays there; None: it does not."""
+    found = None
+    for point in curve:
+        if point["return"] < wanted:
+            found = None
+        elif found is None:
+            found = point["seconds"]
+    return found
+
+
+def wanted_of(curve: list[dict[str, Any]]) -> float:
+    """Nine tenths of the way from a curve's first return to its last."""
+    first, last = curve[0]["return"], curve[-1]["return"]
+    return first + 0.9 * (last - first)
+
+
+def main(cfg: Config) -> None:
+    """Two dynamics at a time, then the time of each to a return that MuJoCo's reached."""
+    with ProcessPoolExecutor(2, get_context("spawn"), max_tasks_per_child=1) as pool:
+        runs = {name: pool.submit(learn_in, name, cfg) for name in cfg.dynamics}
+        curves = {name: run.result() for name, run in runs.items()}
+    wanted = wanted_of(curves["mujoco"]) if cfg.wanted is None else cfg.wanted
+    times = {name: time_to(curve, wanted) for name, curve in curves.items()}
+    print(f"seconds to a return of {wanted:.0f} in MuJoCo: {times}")
+    if cfg.json is not None:
+        how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
+        found = {"configuration": how, "ppo": asdict(cfg.ppo) | {"out": ""}}
+        found |= {"wanted": wanted, "seconds": times, "curves": curves}
+        write_results(cfg.json, found, cfg.seed)
+
+
+if __name__ == "__main__":
+    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # so that it is counted
+    with TemporaryDirectory() as nothing_compiled:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = nothing_compiled
+        main(tyro.cli(Config))

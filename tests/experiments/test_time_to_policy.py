@@ -1,0 +1,99 @@
+"""PPO in several dynamics against time, and its policies in models they never met."""
+
+import json
+import math
+
+import pytest
+import tables
+import time_to_policy
+import torch
+import unmet_policies
+from plot_time_to_policy import draw
+from time_to_policy import env_of, time_to, wanted_of
+
+from torchrl_nerd import make_env
+from torchrl_nerd.robots import make_task
+
+
+def curve(*returns):
+    return [{"seconds": 10.0 * i, "return": r} for i, r in enumerate(returns)]
+
+
+def test_time_counts_until_a_return_is_reached_for_good():
+    assert time_to(curve(0, 5, 3, 5, 6), 4.0) == 30.0
+    assert time_to(curve(5, 6), 4.0) == 0.0
+    assert time_to(curve(0, 5, 3), 4.0) is None
+
+
+def test_a_return_below_zero_can_be_wanted():
+    assert wanted_of(curve(-200, -150, -100)) == pytest.approx(-110)
+    assert wanted_of(curve(0, 50)) == pytest.approx(45)
+
+
+def test_fewer_substeps_are_those_of_the_scene():
+    """The same start and actions as MuJoCo with that scene, by itself."""
+    few = make_task("cartpole/swingup").scene.with_substeps(1)
+    env = env_of("mujoco-1", "cartpole/swingup", 4, 0)
+    own = make_env("cartpole/swingup", "mujoco", 4, 0)
+    assert env.task.scene.hash == few.hash != own.task.scene.hash
+    start, same = env.reset(), own.reset()
+    torch.testing.assert_close(start["qpos"], same["qpos"], rtol=0, atol=0)
+    action = env.rand_action(start)["action"]
+    moved = [x.step(s.set("action", action)) for x, s in ((env, start), (own, same))]
+    first, second = (x["next", "qvel"] for x in moved)
+    assert 0 < (first - second).abs().max() < 1.0
+
+
+def test_models_are_judged_by_what_they_do_to_others():
+    rows = [
+        {"model": "a", "kind": "learned", "return": 10.0, "difference": 2.0},
+        {"model": "a", "kind": "learned", "return": 100.0, "difference": -5.0},
+        {"model": "b", "kind": "learned", "return": 100.0, "difference": 0.0},
+    ]
+    rows = [row | {"share": row["difference"] / row["return"]} for row in rows]
+    first, second = unmet_policies.summaries(rows)
+    assert (first["policies"], second["policies"]) == (2, 1)
+    assert first["mean"] == pytest.approx(0.125) and first["worst"] == pytest.approx(
+        0.2
+    )
+    assert first["mean_of_best"] == pytest.approx(0.035)
+    assert second["worst_of_best"] == 0.0
+
+
+def test_a_folder_without_policies_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="expected policies"):
+        unmet_policies.found_policies(tmp_path)
+
+
+@pytest.mark.slow
+def test_both_scripts_with_tables_and_a_picture(tmp_path):
+    sizes = {"frames": 4096, "num_envs": 64, "horizon": 16, "minibatch": 512}
+    sizes |= {"points": 2, "episodes": 4}
+    path = tmp_path / "time_to_policy_cartpole.json"
+    dynamics = ("cartpole-mlp", "mujoco", "mujoco-1")
+    how = time_to_policy.Config(
+        "cartpole/swingup", dynamics, out=tmp_path, json=path, **sizes
+    )
+    time_to_policy.main(how)
+    found = json.loads(path.read_text())["results"]
+    assert found["curves"].keys() == set(dynamics)
+    for points in found["curves"].values():
+        assert [p["frames"] for p in points] == [0, 2048, 4096]
+        assert all(math.isfinite(p["return"]) for p in points)
+        times = [p["seconds"] for p in points]
+        assert times == sorted(times)
+    draw(path, tmp_path / "picture.svg")
+    assert "<svg" in (tmp_path / "picture.svg").read_text()
+    assert "mujoco-1" in tables.time_to_policy_table(tmp_path)
+
+    path = tmp_path / "unmet_policies_cartpole.json"
+    models = ("cartpole-mlp", "analytic")
+    unmet_policies.main(
+        unmet_policies.Config(
+            "cartpole/swingup", how.folder, models, episodes=4, json=path
+        )
+    )
+    found = json.loads(path.read_text())["results"]
+    counts = {m["model"]: m["policies"] for m in found["models"]}
+    assert counts == {"cartpole-mlp": 6, "analytic": 9}  # its own three are left out
+    assert "analytic" in tables.unmet_policies_table(tmp_path)
