@@ -1,4 +1,4 @@
-"""Policies that never met a model, in that model and in MuJoCo, from the same starts.
+"""Policies that did not learn in a model, in that model and in MuJoCo, from the same starts.
 
     python experiments/unmet_policies.py ant/run --policies runs/time_to_policy/ant-run \
         --json results/unmet_policies_ant_run.json
@@ -71,10 +71,10 @@ def play(cfg: Config, policy: Path) -> list[dict[str, Any]]:
     unmet = [name for name in cfg.names() if name != learned_in]
     actor = make_actor(load_policy(policy, task))
     found = transfer(task, actor, unmet, cfg.episodes, seed=cfg.seed)
-    truth = found[GROUND_TRUTH].mean
-    about = {"learned_in": learned_in, "number": int(policy.name), "return": truth}
+    reached = found[GROUND_TRUTH].mean
+    about = {"learned_in": learned_in, "number": int(policy.name), "return": reached}
     shown = (
-        {"model": name, "kind": s.kind, "difference": s.mean - truth}
+        {"model": name, "kind": s.kind, "difference": s.mean - reached}
         | {"share": s.difference, "interval": s.difference_interval}
         for name, s in found.items()
         if name != GROUND_TRUTH

@@ -1,4 +1,4 @@
-"""PPO in several dynamics against time, and its policies in models they never met."""
+"""PPO in several dynamics against time, and its policies in the models of others."""
 
 import json
 import math
