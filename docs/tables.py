@@ -116,22 +116,40 @@ def bench_tables(folder: Path = RESULTS) -> str:
 
 
 def stability_tables(folder: Path = RESULTS) -> str:
-    """One row per case, one column per robot: pass or fail."""
-    found = {
-        robot: {
-            k: v for k, v in record.get("results", record).items() if "passes" in str(v)
-        }
-        for robot, record in read("stability", folder).items()
+    """One row per case, one column per model; then what failed, and by how much."""
+    records = read("stability", folder).values()
+    found = {record["results"]["model"]: record["results"] for record in records}
+    tried = {
+        model: {case: trial for case, trial in results.items() if is_trial(trial)}
+        for model, results in found.items()
     }
-    if not found:
-        return ""
-    cases = dict.fromkeys(case for results in found.values() for case in results)
-    words = {True: "pass", False: "**fail**", None: "-"}
-    table = [["case", *found]]
+    cases = dict.fromkeys(case for trials in tried.values() for case in trials)
+    table = [["case", *(f"{model}, {x['kind']}" for model, x in found.items())]]
+    failed = [["model", "case", "metric", "model's", "MuJoCo's", "tolerance"]]
     for case in cases:
-        verdicts = [results.get(case, {}).get("passes") for results in found.values()]
+        verdicts = [trials.get(case, {}).get("passes") for trials in tried.values()]
+        words = {True: "pass", False: "**fail**", None: "-"}
         table.append([case, *(words[verdict] for verdict in verdicts)])
-    return rows(table)
+        for model, trials in tried.items():
+            failed += [[model, case, *line] for line in beyond(trials.get(case, {}))]
+    if not cases:
+        return ""
+    parts = [rows(table), with_sources(failed, records)]
+    return "\n\n".join(parts if failed[1:] else [*parts[:1], *map(made_by, records)])
+
+
+def is_trial(value: Any) -> bool:
+    """Whether it is what a hard case found."""
+    return isinstance(value, dict) and "passes" in value
+
+
+def beyond(trial: dict[str, Any]) -> Iterator[list[str]]:
+    """The metrics of a hard case that are beyond their tolerance, with MuJoCo's."""
+    for metric, limit in trial.get("tolerances", {}).items():
+        value = trial["tested"].get(metric)
+        if value is not None and not value <= limit:
+            exact = number(trial["ground_truth"].get(metric))
+            yield [metric, number(value), exact, number(limit)]
 
 
 def env_table(folder: Path = RESULTS) -> str:

@@ -1,4 +1,4 @@
-"""Policies that did not learn in a model, in that model and in MuJoCo, from the same starts.
+"""Policies that did not learn in a model, in it and in MuJoCo, from the same starts.
 
     python experiments/unmet_policies.py ant/run --policies runs/time_to_policy/ant-run \
         --json results/unmet_policies_ant_run.json

@@ -374,6 +374,8 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     precise = {"steps": 5, "float64": {"x": 0.1}, "float32": {"x": 0.2}}
     precise |= {"float64_us": 3.0, "float32_us": 1.5}
     chain |= {"positions_ms": 0.123, "with_velocities_ms": 1.5}
+    fell = {"passes": False, "tolerances": {"lowest, m": 0.01}}
+    fell |= {"tested": {"lowest, m": 0.25}, "ground_truth": {"lowest, m": 0.002}}
     robot = {"source": "suite", "robot": "dog"}
     loaded = {"source": "suite", "robot": "cat", "loads": True, "contact_points": 5}
     loaded |= {"contact_error_m": 0.0021, "difference": 0.0, "dropped": 0.04}
@@ -381,7 +383,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     for name, results in (
         ("eval_robot", {"errors": errors}),
         ("bench_robot", {"errors": errors, "rates": [rate], "steps": 100}),
-        ("stability_robot", {"drop": {"passes": False}}),
+        ("stability_robot", {"model": "robot-mlp", "kind": "learned", "drop": fell}),
         ("kinematics_libraries", [chain]),
         ("transfer_franka_reach_osc_x", {"policy": "runs/p", "returns": [earned]}),
         ("state_dtype", {"ant": precise}),
@@ -402,6 +404,7 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "| b | learned | diverges | diverges | diverges |" in shown
     assert "| a | learned | 0.12 | 0.12 | 0.12 | 12,346 |" in shown
     assert "| drop | **fail** |" in shown
+    assert "| robot-mlp | drop | lowest, m | 0.25 | 0.002 | 0.01 |" in shown
     assert "| p | nerd | learned | 10.0 | -2.0 |" in shown
     assert "| ant | own | compiled | 0.12 | 1.5 |" in shown
     assert "| tiny | graph | 2 | - |" in shown and "| ant | MJX | - | 0.05 |" in shown

@@ -131,7 +131,9 @@ def test_the_command_writes_table_and_json(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "| hinge_turns |" in shown and "| batching |" in shown
     named = {"scene", "seed", "scale", "hinge_turns", "batching"}
-    assert named <= set(read_results(out)["results"])
+    found = read_results(out)["results"]
+    assert named <= set(found)
+    assert (found["model"], found["kind"]) == ("cartpole", "learned")
 
 
 def test_results_outlive_an_interruption(tmp_path, monkeypatch):

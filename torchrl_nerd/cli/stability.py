@@ -5,7 +5,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.checkpoint import from_pretrained, model_name
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import ModelName, Positional, SceneName
 from torchrl_nerd.dynamics import dynamics_of
@@ -42,11 +42,13 @@ class Stability(MeasuringCommand):
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
         cases = [look_up("case", name, CASES) for name in self.cases or CASES]
         scene = load_scene(self.scene)
-        model = from_pretrained(self.model or self.scene, scene).to(self.device)
+        name = self.model or self.scene
+        model = from_pretrained(name, scene).to(self.device)
         tested = dynamics_of(model, compile=self.compile)
         results, count = [], sum(case.supports(tested) for case in cases)
-        found: dict[str, Any] = {"scene": self.scene, "seed": self.seed}
-        found["scale"] = self.scale
+        found: dict[str, Any] = {"scene": self.scene, "kind": model.kind}
+        found["model"] = model_name(name, scene)
+        found |= {"seed": self.seed, "scale": self.scale}
         trials = run_cases(tested, cases, self.seed, self.scale)
         for result in tqdm(trials, "cases", count, leave=False, disable=self.quiet):
             verdict = "pass" if result.passes else "FAIL"
