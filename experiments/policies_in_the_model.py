@@ -3,8 +3,9 @@
     python experiments/policies_in_the_model.py dm_control/walker-walk --json FILE
 
 1. Random trajectories of the robot in MuJoCo, and a network that learns from them.
-2. In rounds: PPO in the model alone, where an episode fails as soon as a step is unlike the
-   data; trajectories along the policy in MuJoCo, from which the model goes on learning.
+2. In rounds: PPO in the model alone, where steps err as they do on motion that the model
+   has not seen, and an episode fails as soon as a step is unlike the data; trajectories
+   along the policy in MuJoCo, from which the model goes on learning.
 3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
    policy had in the model, one for as many as the model's data cost the robot, and one
    whose episodes fail where those in the model do.
@@ -32,14 +33,16 @@ from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
+from erring import ErringDynamics, relative_errors
 from learner import Clock, Learner, processor_time
 
-from torchrl_nerd import NeRDEnv, make_env
+from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import GuardedDynamics, NeRDDynamics
 from torchrl_nerd.envs.actor import Actor
+from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
@@ -53,6 +56,9 @@ from torchrl_nerd.training.policy_data import policy_data
 from torchrl_nerd.training.trainer import Trainer
 
 SEGMENT = 100  # control steps of a training trajectory
+HELD_OUT = (
+    10  # one in so many new trajectories measures the model before it learns from it
+)
 WATCHED = 64  # episodes of a point of the learning curves
 
 
@@ -69,6 +75,7 @@ class Config:
     length: int = 1000  # control steps of each
     more_updates: int = 1000  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
+    errors: float = 0.5  # share of the model's own errors that steps in it are given
     network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
@@ -203,26 +210,38 @@ def train_model(
     return Trainer(*about, **given).run().eval()
 
 
+def env_in(
+    cfg: Config, task: Task, model: NeRD, errors: Tensor, num_envs: int, seed: int
+) -> SceneEnv:
+    """The task in a model that errs."""
+    dynamics = GuardedDynamics(ErringDynamics(model, errors, cfg.errors))
+    return SceneEnv(task, dynamics, num_envs, seed, cfg.device)
+
+
 def in_the_model(cfg: Config) -> dict:
     """A policy learned in models alone, what it took, and how it does."""
     task, clock = begin(cfg, cfg.device)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
-    data, curve, model = cast(TensorDict, data[is_sound(data)]), [], None
+    data, curve = cast(TensorDict, data[is_sound(data)]), []
+    model, errors, unseen = None, torch.zeros(1, task.scene.model.nv), []
     learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     for number in range(cfg.rounds):
         draw = fold_in(cfg.seed, 1 + number)
         more = data_along(cfg, task, learner.on_the_processor(), draw)
-        data = cast(TensorDict, TensorDict.cat((data, *more)))
+        more = cast(TensorDict, TensorDict.cat(more))
+        is_kept = torch.arange(len(more)) % HELD_OUT == 0  # for the round after
+        data = cast(TensorDict, TensorDict.cat((data, *unseen, more[~is_kept])))
+        unseen = [more[is_kept]]
         clock.note("data")
         model = train_model(task, data, cfg, number, model)
+        errors = relative_errors(model, unseen[0].to(cfg.device))
         clock.note("model")
-        about = cfg.num_envs, cfg.seed + number, cfg.device
-        inner = NeRDEnv(task, model, *about, guard="flag")
-        env = TransformedEnv(inner, Trusted(cfg.trust))
+        about = task, model, errors, cfg.num_envs, cfg.seed + number
+        env = TransformedEnv(env_in(cfg, *about), Trusted(cfg.trust))
         last = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
         found = watched(cfg, learner.on_the_processor())
-        frames = SEGMENT * len(data)
+        frames = SEGMENT * (len(data) + len(unseen[0]))
         point = {"robot_frames": frames, "return": found, **last}
         curve.append(point | {"seconds": clock.spent()})
         print(f"model, round {number + 1}: {curve[-1]}", flush=True)
@@ -230,7 +249,8 @@ def in_the_model(cfg: Config) -> dict:
     assert model is not None
     save_policy(learner.policy, cfg.folder / "policy", {})
     seed, count, actor = cfg.seed + 10_000, cfg.episodes, learner.on_the_processor()
-    promised = policy_returns(NeRDEnv(task, model, count, seed), actor)
+    how = replace(cfg, device="cpu"), task, model.cpu(), errors.cpu(), count, seed
+    promised = policy_returns(env_in(*how), actor)
     reached = returns_of(cfg, actor, count, seed)
     return {
         "curve": curve,
