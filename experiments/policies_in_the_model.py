@@ -3,9 +3,9 @@
     python experiments/policies_in_the_model.py dm_control/walker-walk --json FILE
 
 1. Random trajectories of the robot in MuJoCo, and a network that learns from them.
-2. In rounds: PPO in the model alone, where steps err as they do on motion that the model
-   has not seen, and an episode fails as soon as a step is unlike the data; trajectories
-   along the policy in MuJoCo, from which the model goes on learning.
+2. In rounds: PPO in the model alone, where steps have errors like those on motion that the
+   model has not seen, and an episode fails as soon as a step is unlike the data;
+   trajectories along the policy in MuJoCo, from which the model goes on learning.
 3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
    policy had in the model, one for as many as the model's data cost the robot, and one
    whose episodes fail where those in the model do.
@@ -33,8 +33,8 @@ from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
-from erring import ErringDynamics, relative_errors
 from learner import Clock, Learner, processor_time
+from noisy_dynamics import NoisyDynamics, relative_errors
 
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import load_checkpoint
@@ -75,7 +75,7 @@ class Config:
     length: int = 1000  # control steps of each
     more_updates: int = 1000  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
-    errors: float = 0.5  # share of the model's own errors that steps in it are given
+    model_noise: float = 0.5  # share of the model's own errors that its steps are given
     network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
@@ -213,8 +213,8 @@ def train_model(
 def env_in(
     cfg: Config, task: Task, model: NeRD, errors: Tensor, num_envs: int, seed: int
 ) -> SceneEnv:
-    """The task in a model that errs."""
-    dynamics = GuardedDynamics(ErringDynamics(model, errors, cfg.errors))
+    """The task in a model with its errors as noise."""
+    dynamics = GuardedDynamics(NoisyDynamics(model, errors, cfg.model_noise))
     return SceneEnv(task, dynamics, num_envs, seed, cfg.device)
 
 

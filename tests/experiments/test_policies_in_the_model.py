@@ -5,7 +5,7 @@ import json
 import pytest
 import tables
 import torch
-from erring import ErringDynamics, relative_errors
+from noisy_dynamics import NoisyDynamics, relative_errors
 from policies_in_the_model import (
     SEGMENT,
     Config,
@@ -70,15 +70,15 @@ def test_a_robot_that_falls_gives_as_much_data():
     assert sum(len(x) for x in parts) == 20
 
 
-def test_a_model_errs_by_shares_of_its_change():
-    """By none of them it is the model; an error is of the length of the change."""
+def test_noise_is_a_share_of_the_change():
+    """With none it is the model; an error has the length of the change."""
     model = from_pretrained("cartpole-mlp")
     start = make_env("cartpole/swingup", "mujoco", 4, 0).rollout(9)[:, -1]
     state, torque = start.select(QPOS, QVEL), torch.full((4, 1), 5.0)
     exact = NeRDDynamics(model).step(state, torque)
     error = torch.tensor([[0.3, -0.1]])
     for share in (0.0, 0.5):
-        found = ErringDynamics(model, error, share).step(state, torque)
+        found = NoisyDynamics(model, error, share).step(state, torque)
         change = torch.linalg.vector_norm(exact[QVEL] - state[QVEL], dim=1)
         expected = exact[QVEL] + share * change[:, None] * error
         torch.testing.assert_close(found[QVEL], expected)
@@ -94,7 +94,7 @@ def test_errors_are_those_of_one_step():
     errors = relative_errors(model, data)
     assert len(errors) == 36 and errors.abs().max() > 1e-5
     one, found = data.reshape(-1)[:1], relative_errors(model, data[:1, :1])
-    step = ErringDynamics(model, found, 1.0).step
+    step = NoisyDynamics(model, found, 1.0).step
     after = step(one.select(QPOS, QVEL), one["next", "joint_torque"])
     torch.testing.assert_close(after[QVEL], one["next", QVEL], rtol=1e-3, atol=1e-5)
 

@@ -1,4 +1,4 @@
-"""A learned model whose steps err as much as they do on recorded motion.
+"""A learned model with its own errors as noise.
 
 A network trained on the mean of what may happen is smoother than the robot: it seldom falls
 where the robot falls. Chua et al., 2018, https://arxiv.org/abs/1805.12114, let an ensemble
@@ -32,7 +32,7 @@ def relative_errors(model: NeRD, data: TensorDictBase) -> Tensor:
     return errors[errors.isfinite().all(-1)]
 
 
-class ErringDynamics(NeRDDynamics):
+class NoisyDynamics(NeRDDynamics):
     """A model; each step adds a random one of ``errors``, times ``share``, to qvel.
 
     Args:
