@@ -96,17 +96,16 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
     how, clock, curve = cfg.ppo, Clock(), []
     env = env_of(name, cfg.task, how.num_envs, cfg.seed)
     learner = Learner(how, env)
-    while learner.done < learner.updates:
-        if curve:
+    for point in range(cfg.points + 1):
+        if point:
             learner.learn(env, 1.0 / cfg.points)
         clock.note("learning")
         judge = make_env(cfg.task, "mujoco", cfg.episodes, cfg.seed + 100)
         reached = float(policy_returns(judge, learner.actor).mean())
         about = {"learned_in": name, "task": cfg.task, "return": reached}
-        save_policy(learner.policy, cfg.folder / name / f"{len(curve)}", about)
+        save_policy(learner.policy, cfg.folder / name / f"{point}", about)
         frames = learner.done * learner.batch
-        point = {"frames": frames, "seconds": clock.spent(), "return": reached}
-        curve.append(point)
+        curve.append({"frames": frames, "seconds": clock.spent(), "return": reached})
         print(f"{name}: {curve[-1]}", flush=True)
         clock.note("watching")
     return curve
