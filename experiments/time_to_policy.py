@@ -31,6 +31,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns
 from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.robots import PPO_CONFIGS, make_task
 from torchrl_nerd.tasks import Task
 
@@ -72,6 +73,13 @@ class Config:
         return replace(ppo.Run(**vars(kept), task=self.task), **given)
 
 
+def json_of(cfg: Config) -> dict[str, Any]:
+    """What a curve depends on, as JSON has it."""
+    names = ("task", "points", "episodes", "seed")
+    settings = asdict(cfg.ppo) | {"out": None, "widths": list(cfg.ppo.widths)}
+    return {name: getattr(cfg, name) for name in names} | {"ppo": settings}
+
+
 def with_substeps(task: Task, substeps: int) -> Task:
     """The same task whose scene has another number of MuJoCo's substeps."""
     twin = copy.copy(task)
@@ -89,7 +97,13 @@ def env_of(name: str, task: str, num_envs: int, seed: int) -> SceneEnv:
 
 
 def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
-    """The curve of one dynamics, with a policy in the folder for each point."""
+    """The curve of one dynamics, with a policy in the folder for each point.
+
+    A curve that is in the folder already, with the same settings, is not made again.
+    """
+    kept, same = cfg.folder / name / "curve.json", json_of(cfg)
+    if kept.exists() and (found := read_json(kept))["configuration"] == same:
+        return found["curve"]
     torch.set_num_threads(1)
     os.environ["NERD_THREADS"] = "1"
     torch.manual_seed(cfg.seed)
@@ -108,6 +122,7 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
         curve.append({"frames": frames, "seconds": clock.spent(), "return": reached})
         print(f"{name}: {curve[-1]}", flush=True)
         clock.note("watching")
+    write_json(kept, {"configuration": same, "curve": curve})
     return curve
 
 
@@ -137,9 +152,8 @@ def main(cfg: Config) -> None:
     times = {name: time_to(curve, wanted) for name, curve in curves.items()}
     print(f"seconds to a return of {wanted:.0f} in MuJoCo: {times}")
     if cfg.json is not None:
-        how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
-        found = {"configuration": how, "ppo": asdict(cfg.ppo) | {"out": ""}}
-        found |= {"wanted": wanted, "seconds": times, "curves": curves}
+        found = {"configuration": json_of(cfg), "wanted": wanted}
+        found |= {"seconds": times, "curves": curves}
         write_results(cfg.json, found, cfg.seed)
 
 

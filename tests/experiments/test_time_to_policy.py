@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 
 import pytest
 import tables
@@ -82,6 +83,9 @@ def test_both_scripts_with_tables_and_a_picture(tmp_path):
         assert all(math.isfinite(p["return"]) for p in points)
         times = [p["seconds"] for p in points]
         assert times == sorted(times)
+    began = time.monotonic()
+    again = {name: time_to_policy.learn_in(name, how) for name in dynamics}
+    assert again == found["curves"] and time.monotonic() - began < 1.0
     draw(path, tmp_path / "picture.svg")
     assert "<svg" in (tmp_path / "picture.svg").read_text()
     assert "mujoco-1" in tables.time_to_policy_table(tmp_path)
