@@ -73,7 +73,7 @@ class Config:
     rounds: int = 10  # of PPO in the model; data are added between two of them
     along: int = 64  # trajectories along the policy before a round, more where it falls
     length: int = 1000  # control steps of each
-    more_updates: int = 1000  # of the model, after the first round
+    more_updates: int = 2500  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     model_noise: float = 0.5  # share of the model's own errors that its steps are given
     network: str = "mlp-4x64"
