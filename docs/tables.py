@@ -387,15 +387,16 @@ def time_to_policy_table(folder: Path = RESULTS) -> str:
 
 def unmet_policies_table(folder: Path = RESULTS) -> str:
     """Models by their return differences for policies that learned elsewhere."""
-    table = [["task", "model", "kind", "policies", "mean (%)", "worst (%)"]]
-    table[0] += ["mean (% of the best)", "worst (% of the best)"]
+    table = [["task", "model", "policies", "mean, worst (%)", "of the best (%)"]]
     records = read("unmet_policies", folder).values()
     for record in records:
         found = record["results"]
         for model in found["models"]:
-            names = "mean", "worst", "mean_of_best", "worst_of_best"
-            shares = (f"{100.0 * model[name]:.1f}" for name in names)
-            about = found["task"], model["model"], model["kind"]
+            pairs = ("mean", "worst"), ("mean_of_best", "worst_of_best")
+            shares = (
+                ", ".join(f"{100.0 * model[x]:.1f}" for x in pair) for pair in pairs
+            )
+            about = found["task"], f"{model['model']}, {model['kind']}"
             table.append([*about, str(model["policies"]), *shares])
     return with_sources(table, records)
 
