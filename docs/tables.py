@@ -124,18 +124,16 @@ def stability_tables(folder: Path = RESULTS) -> str:
         for model, results in found.items()
     }
     cases = dict.fromkeys(case for trials in tried.values() for case in trials)
+    words = {True: "pass", False: "**fail**", None: "-"}
     table = [["case", *(f"{model}, {x['kind']}" for model, x in found.items())]]
     failed = [["model", "case", "metric", "model's", "MuJoCo's", "tolerance"]]
     for case in cases:
         verdicts = [trials.get(case, {}).get("passes") for trials in tried.values()]
-        words = {True: "pass", False: "**fail**", None: "-"}
         table.append([case, *(words[verdict] for verdict in verdicts)])
         for model, trials in tried.items():
             failed += [[model, case, *line] for line in beyond(trials.get(case, {}))]
-    if not cases:
-        return ""
-    parts = [rows(table), with_sources(failed, records)]
-    return "\n\n".join(parts if failed[1:] else [*parts[:1], *map(made_by, records)])
+    shown = [rows(found) for found in (table, failed) if found[1:]]
+    return "\n\n".join((*shown, *map(made_by, records)))
 
 
 def is_trial(value: Any) -> bool:

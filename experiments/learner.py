@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import torch
 from torchrl.envs import EnvBase
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
@@ -14,6 +15,12 @@ import ppo
 
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation.policy import make_actor
+
+
+def use_one_thread() -> None:
+    """Of this process, for torch and for MuJoCo."""
+    torch.set_num_threads(1)
+    os.environ["NERD_THREADS"] = "1"
 
 
 def processor_time() -> float:
@@ -43,7 +50,12 @@ class Clock:
 
 
 class Learner:
-    """Its settings and the env whose specs its policy has; learning may be elsewhere."""
+    """Learns in any env, one after another, with the same policy, critic and step size.
+
+    Args:
+        cfg: settings of PPO; the step size falls to zero over all of its frames.
+        env: whose specs policy and critic have; it need not be one that is learned in.
+    """
 
     def __init__(self, cfg: ppo.Run, env: EnvBase) -> None:
         self.cfg = cfg

@@ -14,7 +14,6 @@
 The two ways take a processor each at the same time, and each counts what it took of it.
 """
 
-import os
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -33,7 +32,7 @@ from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
-from learner import Clock, Learner, processor_time
+from learner import Clock, Learner, processor_time, use_one_thread
 from noisy_dynamics import NoisyDynamics, relative_errors
 
 from torchrl_nerd import make_env
@@ -56,9 +55,7 @@ from torchrl_nerd.training.policy_data import policy_data
 from torchrl_nerd.training.trainer import Trainer
 
 SEGMENT = 100  # control steps of a training trajectory
-HELD_OUT = (
-    10  # one in so many new trajectories measures the model before it learns from it
-)
+HELD_OUT = 10  # one in so many new trajectories is kept for a round, to measure errors
 WATCHED = 64  # episodes of a point of the learning curves
 
 
@@ -141,8 +138,7 @@ def task_of(cfg: Config) -> Task:
 
 def begin(cfg: Config, device: str = "cpu") -> tuple[Task, Clock]:
     """One processor for this process, and the task; with a GPU wall time counts."""
-    torch.set_num_threads(1)
-    os.environ["NERD_THREADS"] = "1"
+    use_one_thread()
     torch.manual_seed(cfg.seed)
     read = processor_time if device == "cpu" else time.monotonic
     return task_of(cfg), Clock(read)
@@ -223,30 +219,30 @@ def in_the_model(cfg: Config) -> dict:
     task, clock = begin(cfg, cfg.device)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
     data, curve = cast(TensorDict, data[is_sound(data)]), []
-    model, errors, unseen = None, torch.zeros(1, task.scene.model.nv), []
+    model, errors, unseen = None, None, data[:0]
     learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     for number in range(cfg.rounds):
         draw = fold_in(cfg.seed, 1 + number)
         more = data_along(cfg, task, learner.on_the_processor(), draw)
         more = cast(TensorDict, TensorDict.cat(more))
         is_kept = torch.arange(len(more)) % HELD_OUT == 0  # for the round after
-        data = cast(TensorDict, TensorDict.cat((data, *unseen, more[~is_kept])))
-        unseen = [more[is_kept]]
+        data = cast(TensorDict, TensorDict.cat((data, unseen, more[~is_kept])))
+        unseen = more[is_kept]
         clock.note("data")
         model = train_model(task, data, cfg, number, model)
-        errors = relative_errors(model, unseen[0].to(cfg.device))
+        errors = relative_errors(model, unseen.to(cfg.device))
         clock.note("model")
         about = task, model, errors, cfg.num_envs, cfg.seed + number
         env = TransformedEnv(env_in(cfg, *about), Trusted(cfg.trust))
         last = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
         found = watched(cfg, learner.on_the_processor())
-        frames = SEGMENT * (len(data) + len(unseen[0]))
+        frames = SEGMENT * (len(data) + len(unseen))
         point = {"robot_frames": frames, "return": found, **last}
         curve.append(point | {"seconds": clock.spent()})
         print(f"model, round {number + 1}: {curve[-1]}", flush=True)
         clock.note("watching")  # no part of the method
-    assert model is not None
+    assert model is not None and errors is not None
     save_policy(learner.policy, cfg.folder / "policy", {})
     seed, count, actor = cfg.seed + 10_000, cfg.episodes, learner.on_the_processor()
     how = replace(cfg, device="cpu"), task, model.cpu(), errors.cpu(), count, seed

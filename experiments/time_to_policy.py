@@ -8,7 +8,6 @@ counts, MuJoCo's episodes of the curve do not, and nor does what a model took to
 Dynamics are those of `make_env`, and `mujoco-N` is MuJoCo with N substeps.
 """
 
-import copy
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -24,16 +23,16 @@ from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
-from learner import Clock, Learner
+from learner import Clock, Learner, use_one_thread
 
 from torchrl_nerd import make_env
+from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.robots import PPO_CONFIGS, make_task
-from torchrl_nerd.tasks import Task
 
 FEW = "mujoco-"  # and a number of substeps
 
@@ -80,20 +79,13 @@ def json_of(cfg: Config) -> dict[str, Any]:
     return {name: getattr(cfg, name) for name in names} | {"ppo": settings}
 
 
-def with_substeps(task: Task, substeps: int) -> Task:
-    """The same task whose scene has another number of MuJoCo's substeps."""
-    twin = copy.copy(task)
-    vars(twin)["scene"] = task.scene.with_substeps(substeps)
-    return twin
-
-
 def env_of(name: str, task: str, num_envs: int, seed: int) -> SceneEnv:
     """Of a dynamics; steps of models are compiled."""
     if name.startswith(FEW):
-        few = with_substeps(make_task(task), int(name.removeprefix(FEW)))
-        return make_env(few, "mujoco", num_envs, seed)
-    is_model = name not in ("mujoco", "dm_control")
-    return make_env(task, name, num_envs, seed, compile=is_model)
+        own = make_task(task)
+        few = own.scene.with_substeps(int(name.removeprefix(FEW)))
+        return make_env(own.with_scene(few), "mujoco", num_envs, seed)
+    return make_env(task, name, num_envs, seed, compile=name not in ENGINES)
 
 
 def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
@@ -104,8 +96,7 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
     kept, same = cfg.folder / name / "curve.json", json_of(cfg)
     if kept.exists() and (found := read_json(kept))["configuration"] == same:
         return found["curve"]
-    torch.set_num_threads(1)
-    os.environ["NERD_THREADS"] = "1"
+    use_one_thread()
     torch.manual_seed(cfg.seed)
     how, clock, curve = cfg.ppo, Clock(), []
     env = env_of(name, cfg.task, how.num_envs, cfg.seed)
@@ -144,7 +135,15 @@ def wanted_of(curve: list[dict[str, Any]]) -> float:
 
 
 def main(cfg: Config) -> None:
-    """Two dynamics at a time, then the time of each to a return that MuJoCo's reached."""
+    """Two dynamics at a time, then the time of each to a return that MuJoCo's reached.
+
+    Raises:
+        ValueError: neither a return is wanted nor does a policy learn in MuJoCo.
+    """
+    if cfg.wanted is None and "mujoco" not in cfg.dynamics:
+        raise ValueError(
+            f"expected --wanted, or mujoco among {', '.join(cfg.dynamics)}"
+        )
     with ProcessPoolExecutor(2, get_context("spawn"), max_tasks_per_child=1) as pool:
         runs = {name: pool.submit(learn_in, name, cfg) for name in cfg.dynamics}
         curves = {name: run.result() for name, run in runs.items()}

@@ -9,7 +9,6 @@ learned in. Return differences are paired, as shares of the policy's own return 
 and of the best policy's: one that falls at once earns nearly nothing to be a share of.
 """
 
-import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -19,8 +18,8 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-import torch
 import tyro
+from learner import use_one_thread
 from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import shipped_models
@@ -65,8 +64,7 @@ def found_policies(folder: Path) -> list[Path]:
 
 def play(cfg: Config, policy: Path) -> list[dict[str, Any]]:
     """A row for each model that the policy did not learn in."""
-    torch.set_num_threads(1)
-    os.environ["NERD_THREADS"] = "1"
+    use_one_thread()
     task, learned_in = make_task(cfg.task), policy.parent.name
     unmet = [name for name in cfg.names() if name != learned_in]
     actor = make_actor(load_policy(policy, task))

@@ -31,6 +31,13 @@ def test_a_return_below_zero_can_be_wanted():
     assert wanted_of(curve(0, 50)) == pytest.approx(45)
 
 
+def test_a_wanted_return_has_to_be_known():
+    """Before anything is learned."""
+    how = time_to_policy.Config("cartpole/swingup", ("cartpole-mlp",))
+    with pytest.raises(ValueError, match="expected --wanted"):
+        time_to_policy.main(how)
+
+
 def test_fewer_substeps_are_those_of_the_scene():
     """The same start and actions as MuJoCo with that scene, by itself."""
     few = make_task("cartpole/swingup").scene.with_substeps(1)
@@ -54,9 +61,8 @@ def test_models_are_judged_by_what_they_do_to_others():
     rows = [row | {"share": row["difference"] / row["return"]} for row in rows]
     first, second = unmet_policies.summaries(rows)
     assert (first["policies"], second["policies"]) == (2, 1)
-    assert first["mean"] == pytest.approx(0.125) and first["worst"] == pytest.approx(
-        0.2
-    )
+    assert first["mean"] == pytest.approx(0.125)
+    assert first["worst"] == pytest.approx(0.2)
     assert first["mean_of_best"] == pytest.approx(0.035)
     assert second["worst_of_best"] == 0.0
 

@@ -46,8 +46,8 @@ class Stability(MeasuringCommand):
         model = from_pretrained(name, scene).to(self.device)
         tested = dynamics_of(model, compile=self.compile)
         results, count = [], sum(case.supports(tested) for case in cases)
-        found: dict[str, Any] = {"scene": self.scene, "kind": model.kind}
-        found["model"] = model_name(name, scene)
+        about = {"model": model_name(name, scene), "kind": model.kind}
+        found: dict[str, Any] = {"scene": self.scene, **about}
         found |= {"seed": self.seed, "scale": self.scale}
         trials = run_cases(tested, cases, self.seed, self.scale)
         for result in tqdm(trials, "cases", count, leave=False, disable=self.quiet):

@@ -45,8 +45,12 @@ class Task(ABC):
 
         An env draws them for every episode.
         """
+        return self.with_scene(self.scene.vary(ranges))
+
+    def with_scene(self, scene: Scene) -> "Task":
+        """The same task in another scene of the same robot."""
         twin = copy.copy(self)
-        vars(twin)["scene"] = self.scene.vary(ranges)  # in place of `build_scene`'s
+        vars(twin)["scene"] = scene  # in place of `build_scene`'s
         return twin
 
     @property
