@@ -3,7 +3,7 @@
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
 ``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
 ``gpu_errors``, ``hidden_parameters``, ``robots_that_load``, ``policies``, ``open_loop``,
-``time_to_policy`` or ``unmet_policies``.
+``time_to_policy``, ``unmet_policies`` or ``falls``.
 """
 
 import json
@@ -399,6 +399,22 @@ def unmet_policies_table(folder: Path = RESULTS) -> str:
     return with_sources(table, records)
 
 
+def falls_table(folder: Path = RESULTS) -> str:
+    """Share of robots on their back along one policy, by the number of actions."""
+    shown, records = [], read("falls", folder).values()
+    for record in records:
+        found = record["results"]
+        head = [f"{found['task']}, actions"]
+        columns = len(found["on_their_back"]["MuJoCo"])
+        head += [f"to {found['every'] * (i + 1)}" for i in range(columns)]
+        body = [
+            [name, *(f"{100.0 * x:.0f}%" for x in shares)]
+            for name, shares in found["on_their_back"].items()
+        ]
+        shown += [rows([head, *body]), made_by(record)]
+    return "\n\n".join(shown)
+
+
 def open_loop_table(folder: Path = RESULTS) -> str:
     """Third-party robots: a network beside MuJoCo at few substeps, and their rates."""
     head = [
@@ -478,6 +494,7 @@ TABLES = {
     "open_loop": open_loop_table,
     "time_to_policy": time_to_policy_table,
     "unmet_policies": unmet_policies_table,
+    "falls": falls_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -491,6 +508,7 @@ COMMANDS |= {"open_loop": "python experiments/open_loop.py ROBOT --json FILE"}
 TIMES = "python experiments/time_to_policy.py TASK --json FILE"
 UNMET = "python experiments/unmet_policies.py TASK --policies FOLDER --json FILE"
 COMMANDS |= {"time_to_policy": TIMES, "unmet_policies": UNMET}
+COMMANDS |= {"falls": "python experiments/falls.py TASK FOLDER --json FILE"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -2,6 +2,7 @@
 
 import json
 
+import falls
 import pytest
 import tables
 import torch
@@ -11,11 +12,12 @@ from policies_in_the_model import (
     Config,
     Trusted,
     data_along,
+    in_the_model,
     main,
     pieces_along,
 )
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_nerd import NeRDEnv, from_pretrained, make_env
 from torchrl_nerd.dynamics import GuardedDynamics, NeRDDynamics
@@ -112,3 +114,31 @@ def test_a_round_of_seconds(tmp_path):
     assert found["model"][-1]["robot_frames"] >= 20 * SEGMENT
     assert {"data", "model", "policy"} == found["seconds"]["model"].keys()
     assert tables.policies_table(tmp_path).count("| gymnasium/Hopper-v5 |") == 4
+
+
+@pytest.mark.slow
+def test_falls_are_counted_in_mujoco_and_in_the_model(tmp_path):
+    """Of a run of seconds; and a robot whose base is fixed is refused."""
+    sizes = {"trajectories": 20, "updates": 20, "rounds": 1, "along": 4, "frames": 1024}
+    sizes |= {"length": SEGMENT, "num_envs": 64, "horizon": 16, "episodes": 4}
+    learned = Config("gymnasium/Ant-v5", out=tmp_path, minibatch=512, **sizes)
+    in_the_model(learned)
+    path, how = tmp_path / "falls_Ant.json", {"robots": 4, "actions": 20, "every": 10}
+    falls.main(falls.Config(learned.name, learned.folder, json=path, **how))
+    rows = json.loads(path.read_text())["results"]["on_their_back"]
+    assert len(rows) == 4
+    assert all(len(x) == 2 and all(0 <= y <= 1 for y in x) for x in rows.values())
+    assert "| MuJoCo |" in tables.falls_table(tmp_path)
+    with pytest.raises(ValueError, match="expected a robot whose base moves freely"):
+        falls.main(falls.Config("gymnasium/Hopper-v5", tmp_path))
+
+
+def test_a_robot_upside_down_is_on_its_back():
+    env = make_env("gymnasium/Ant-v5", "mujoco", 2, 0)
+    actor = make_actor(Policy.for_env(env, 4, (8,), 1.0, 1))
+    turned = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    assert falls.falls(env, actor, 2, 1) == [0.0, 0.0]
+    start = env.reset()
+    start[QPOS][1, 3:7] = turned
+    env.reset = lambda: EnvBase.reset(env, start, set_state=True)
+    assert falls.falls(env, actor, 2, 1) == [0.5, 0.5]
