@@ -14,7 +14,7 @@ from typing import cast
 import torch
 import tyro
 from learner import use_one_thread
-from noisy_dynamics import relative_errors
+from noisy_dynamics import step_errors
 from policies_in_the_model import Config as Learning
 from policies_in_the_model import env_in, pieces_along, task_of
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -71,7 +71,7 @@ def main(cfg: Config) -> None:
     actor = make_actor(load_policy(cfg.folder / "policy", task))
     draw, length = fold_in(cfg.seed, 0), learning.length
     data = pieces_along(task, actor, learning.along, length, draw, learning.noise)
-    errors, how = relative_errors(model, data), (cfg.actions, cfg.every)
+    errors, how = step_errors(model, data), (cfg.actions, cfg.every)
     rows = {
         "MuJoCo": falls(make_env(task, "mujoco", cfg.robots, cfg.seed), actor, *how)
     }
@@ -85,7 +85,7 @@ def main(cfg: Config) -> None:
     ]
     print(text_table(head, [[n, *(f"{x:.0%}" for x in r)] for n, r in rows.items()]))
     if cfg.json is not None:
-        sizes = torch.linalg.vector_norm(errors, dim=-1).double()
+        sizes = torch.linalg.vector_norm(errors.shares, dim=-1).double()
         at = torch.tensor([0.5, 0.9, 0.99], dtype=torch.float64)
         found = {"task": cfg.name, "every": cfg.every, "on_their_back": rows}
         found["errors"] = sizes.quantile(at).tolist()  # shares of the change

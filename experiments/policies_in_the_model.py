@@ -33,7 +33,7 @@ from tyro.conf import Positional
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
 from learner import Clock, Learner, processor_time, use_one_thread
-from noisy_dynamics import NoisyDynamics, relative_errors
+from noisy_dynamics import NoisyDynamics, StepErrors, step_errors
 
 from torchrl_nerd import make_env
 from torchrl_nerd.checkpoint import load_checkpoint
@@ -72,7 +72,7 @@ class Config:
     length: int = 1000  # control steps of each
     more_updates: int = 2500  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
-    model_noise: float = 0.5  # share of the model's own errors that its steps are given
+    model_noise: float = 1.0  # share of the model's own errors that its steps are given
     network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
@@ -207,7 +207,7 @@ def train_model(
 
 
 def env_in(
-    cfg: Config, task: Task, model: NeRD, errors: Tensor, num_envs: int, seed: int
+    cfg: Config, task: Task, model: NeRD, errors: StepErrors, num_envs: int, seed: int
 ) -> SceneEnv:
     """The task in a model with its errors as noise."""
     dynamics = GuardedDynamics(NoisyDynamics(model, errors, cfg.model_noise))
@@ -230,7 +230,7 @@ def in_the_model(cfg: Config) -> dict:
         unseen = more[is_kept]
         clock.note("data")
         model = train_model(task, data, cfg, number, model)
-        errors = relative_errors(model, unseen.to(cfg.device))
+        errors = step_errors(model, unseen.to(cfg.device))
         clock.note("model")
         about = task, model, errors, cfg.num_envs, cfg.seed + number
         env = TransformedEnv(env_in(cfg, *about), Trusted(cfg.trust))
@@ -245,7 +245,8 @@ def in_the_model(cfg: Config) -> dict:
     assert model is not None and errors is not None
     save_policy(learner.policy, cfg.folder / "policy", {})
     seed, count, actor = cfg.seed + 10_000, cfg.episodes, learner.on_the_processor()
-    how = replace(cfg, device="cpu"), task, model.cpu(), errors.cpu(), count, seed
+    errors = StepErrors(*(x.cpu() for x in errors))
+    how = replace(cfg, device="cpu"), task, model.cpu(), errors, count, seed
     promised = policy_returns(env_in(*how), actor)
     reached = returns_of(cfg, actor, count, seed)
     return {

@@ -6,7 +6,7 @@ import falls
 import pytest
 import tables
 import torch
-from noisy_dynamics import NoisyDynamics, relative_errors
+from noisy_dynamics import NoisyDynamics, StepErrors, step_errors
 from policies_in_the_model import (
     SEGMENT,
     Config,
@@ -73,15 +73,18 @@ def test_a_robot_that_falls_gives_as_much_data():
 
 
 def test_noise_is_a_share_of_the_change():
-    """With none it is the model; an error has the length of the change."""
+    """With none it is the model; at rest it is a share of the least change."""
     model = from_pretrained("cartpole-mlp")
     start = make_env("cartpole/swingup", "mujoco", 4, 0).rollout(9)[:, -1]
     state, torque = start.select(QPOS, QVEL), torch.full((4, 1), 5.0)
     exact = NeRDDynamics(model).step(state, torque)
     error = torch.tensor([[0.3, -0.1]])
     for share in (0.0, 0.5):
-        found = NoisyDynamics(model, error, share).step(state, torque)
         change = torch.linalg.vector_norm(exact[QVEL] - state[QVEL], dim=1)
+        least = change.median()
+        errors = StepErrors(error, least)
+        found = NoisyDynamics(model, errors, share).step(state, torque)
+        change = change.clamp(min=least)
         expected = exact[QVEL] + share * change[:, None] * error
         torch.testing.assert_close(found[QVEL], expected)
         torch.testing.assert_close(found[QPOS], exact[QPOS], rtol=0, atol=0)
@@ -91,11 +94,11 @@ def test_errors_are_those_of_one_step():
     """None on the model's own motion; on MuJoCo's they turn its step into MuJoCo's."""
     model = from_pretrained("cartpole-mlp")
     own = make_env("cartpole/swingup", "cartpole-mlp", 4, 0).rollout(9)
-    assert relative_errors(model, own).abs().max() < 1e-5
+    assert step_errors(model, own).shares.abs().max() < 1e-5
     data = make_env("cartpole/swingup", "mujoco", 4, 0).rollout(9)
-    errors = relative_errors(model, data)
+    errors = step_errors(model, data).shares
     assert len(errors) == 36 and errors.abs().max() > 1e-5
-    one, found = data.reshape(-1)[:1], relative_errors(model, data[:1, :1])
+    one, found = data.reshape(-1)[:1], step_errors(model, data[:1, :1])
     step = NoisyDynamics(model, found, 1.0).step
     after = step(one.select(QPOS, QVEL), one["next", "joint_torque"])
     torch.testing.assert_close(after[QVEL], one["next", QVEL], rtol=1e-3, atol=1e-5)
