@@ -39,7 +39,7 @@ class Config:
     name: Positional[str]  # a task whose base moves freely
     folder: Positional[Path]
     noise: tuple[float, ...] = (0.0, 0.5, 1.0)  # shares of the model's own errors
-    robots: int = 64
+    robots: int = 512
     actions: int = 500
     every: int = 100  # actions of a column
     seed: int = 100
