@@ -3,7 +3,8 @@
 A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
 ``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
 ``gpu_errors``, ``hidden_parameters``, ``robots_that_load``, ``policies``, ``open_loop``,
-``time_to_policy``, ``unmet_policies`` or ``falls``.
+``time_to_policy``, ``unmet_policies``, ``falls``, ``gallery``, ``returns`` or
+``network_off``.
 """
 
 import json
@@ -115,6 +116,45 @@ def bench_tables(folder: Path = RESULTS) -> str:
     return "\n\n".join(parts)
 
 
+def gallery_table(folder: Path = RESULTS) -> str:
+    """Shipped models: the first error of their longest test, and their rate."""
+    table = [["model", "kind", "quantity, steps", "mean error", "steps/s"]]
+    kinds = "learned", "hybrid", "analytic"
+    records, rated = read("eval", folder), read("bench", folder)
+    for robot, record in records.items():
+        rates = rated[robot]["results"]["rates"] if robot in rated else []
+        rates = {x["name"]: x["steps_per_s"] for x in rates if x["batch"] == BATCH}
+        errors = record["results"]["errors"]
+        first = errors[0]["case"], errors[0]["quantity"]
+        own = [x for x in errors if (x["case"], x["quantity"]) == first]
+        steps = max(entry["steps"] for entry in own)
+        for entry in own:
+            if entry["kind"] not in kinds or entry["steps"] != steps:
+                continue
+            name = entry["name"].replace("analytic", f"analytic, {robot}")
+            speed = rates.get(entry["name"])
+            mean = f"{number(entry['mean'])} {entry['unit']}"
+            line = [name, entry["kind"], f"{first[1]}, {steps}", mean]
+            table.append([*line, "-" if speed is None else f"{speed:,.0f}"])
+    return rows(table) if records else ""
+
+
+def network_off_table(folder: Path = RESULTS) -> str:
+    """Hybrids with their network and without, means over all terrains."""
+    record = one("network_off", folder)
+    if record is None:
+        return ""
+    found: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in record["results"]:
+        key = row["model"], row["drive"], row["quantity"]
+        found.setdefault(key, []).append(row)
+    table = [["hybrid", "motion", "quantity", "with network (rad)", "without (rad)"]]
+    for key, same in found.items():
+        pairs = ([row[way]["mean"] for row in same] for way in ("with", "without"))
+        table.append([*key, *(f"{sum(x) / len(x):.4f}" for x in pairs)])
+    return with_sources(table, [record])
+
+
 def stability_tables(folder: Path = RESULTS) -> str:
     """One row per case, one column per model; then what failed, and by how much."""
     records = read("stability", folder).values()
@@ -182,19 +222,33 @@ def kinematics_table(folder: Path = RESULTS) -> str:
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
-def transfer_table(folder: Path = RESULTS) -> str:
-    """Returns of the policies of franka/reach_osc in each dynamics."""
-    table = [["policy", "dynamics", "kind", "return", "difference (%)"]]
-    paths = sorted(folder.glob("transfer_franka_reach_osc*.json"))
-    records = [json.loads(path.read_text()) for path in paths]
+def returns_tables(pattern: str, folder: Path) -> str:
+    """Returns of shipped policies in each dynamics."""
+    table = [["task, policy", "dynamics", "kind", "return", "difference (%)"]]
+    records = [
+        json.loads(path.read_text())
+        for path in sorted(folder.glob(f"transfer_{pattern}.json"))
+    ]
     for record in records:
         results = record["results"]
+        policy = results["policy"].removeprefix("runs/")
         for row in results["returns"]:
-            line = results["policy"].removeprefix("runs/"), row["dynamics"], row["kind"]
-            share = f"{100.0 * row['difference']:.1f}"
-            table.append([*line, f"{row['mean']:.1f}", share])
-    lines = [f"{made_by(record)}" for record in records]
-    return "\n\n".join((rows(table), *lines)) if lines else ""
+            line = f"{results['task']}, {policy}", row["dynamics"], row["kind"]
+            half = f"{100.0 * row['difference_interval']:.2g}"
+            share = f"{100.0 * row['difference']:.2g} ± {half}"
+            table.append([*line, f"{row['mean']:,.4g}", share])
+    return with_sources(table, records)
+
+
+def transfer_table(folder: Path = RESULTS) -> str:
+    """Returns of the policies of franka/reach_osc in each dynamics."""
+    return returns_tables("franka_reach_osc*", folder)
+
+
+def returns_table(folder: Path = RESULTS) -> str:
+    """Returns of the shipped policies of ant/run and franka/reach."""
+    found = (returns_tables(x, folder) for x in ("ant_run*", "franka_reach"))
+    return "\n\n".join(x for x in found if x)
 
 
 def gpu_rates_table(folder: Path = RESULTS) -> str:
@@ -495,6 +549,9 @@ TABLES = {
     "time_to_policy": time_to_policy_table,
     "unmet_policies": unmet_policies_table,
     "falls": falls_table,
+    "gallery": gallery_table,
+    "returns": returns_table,
+    "network_off": network_off_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -509,6 +566,11 @@ TIMES = "python experiments/time_to_policy.py TASK --json FILE"
 UNMET = "python experiments/unmet_policies.py TASK --policies FOLDER --json FILE"
 COMMANDS |= {"time_to_policy": TIMES, "unmet_policies": UNMET}
 COMMANDS |= {"falls": "python experiments/falls.py TASK FOLDER --json FILE"}
+COMMANDS |= {
+    "network_off": "python experiments/network_off.py",
+    "gallery": "make results",
+}
+COMMANDS |= {"returns": "nerd transfer TASK --json results/transfer_TASK.json"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
 

@@ -38,7 +38,7 @@ STEPS: dict[str, StepConfig] = {
 
 
 def default_step(scene: Scene) -> StepConfig:
-    """The step of ``dynamics="analytic"``: accurate, and cheaper than MuJoCo.
+    """The step of ``dynamics="analytic"``, the most exact one.
 
     Unconstrained without a ground; else two stages, in two outer steps where the scene's
     substeps can be halved.

@@ -29,7 +29,7 @@ from torchrl_nerd.tasks import Task
 GROUND_TRUTH = "mujoco"
 NOTE = (
     "Return difference: to MuJoCo, over the initial states that both ran. "
-    "Behind ±: half of the 95% interval."
+    "Behind ±: half of the 95% interval. The paper's returns are of another simulator."
 )
 
 
