@@ -119,9 +119,14 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
         return load_checkpoint(Path(found), scene)
     if found in ENGINES:
         raise ValueError(f"expected a model, got the engine '{found}'")
-    asked = scene.name if scene is not None and found in KINDS else found
+    if scene is None and (found in KINDS or found in STEPS):
+        how = f"from_pretrained('{found}', load_scene('ant'))"
+        raise ValueError(f"expected a scene beside '{found}', such as {how}, got none")
+    own = () if scene is None else (*KINDS, f"{scene.name}-hybrid")
+    asked = scene.name if scene is not None and found in own else found
     if asked != found or is_import(found):
-        raise ValueError(_not_shipped(asked, scene if found == "hybrid" else None))
+        hybrid_of = scene if found.endswith("hybrid") else None
+        raise ValueError(_not_shipped(asked, hybrid_of))
     if Path(found).name != found:
         raise ValueError(_no_folder(Path(found)))
     meant = did_you_mean(str(found), (*RESERVED, *STEPS, *shipped_models()))

@@ -43,7 +43,7 @@ class PenaltyContactConfig:
     """A `PenaltyContactStep`; fields as its arguments."""
 
     num_stages: int = 2
-    num_outer_steps: int = 1
+    num_outer_steps: int = 2
     merged_substeps: int = 1
     precision: Precision = "float32"
 

@@ -30,10 +30,10 @@ __all__ = [
 
 STEPS: dict[str, StepConfig] = {
     "unconstrained": UnconstrainedConfig(),
-    "penalty-contact": PenaltyContactConfig(),
-    "penalty-contact-2-outer-steps": PenaltyContactConfig(num_outer_steps=2),
-    "penalty-contact-1-stage": PenaltyContactConfig(num_stages=1),
-    "penalty-contact-1-stage-merged": PenaltyContactConfig(1, merged_substeps=2),
+    "penalty-contact": PenaltyContactConfig(num_outer_steps=1),
+    "penalty-contact-2-outer-steps": PenaltyContactConfig(),
+    "penalty-contact-1-stage": PenaltyContactConfig(1, 1),
+    "penalty-contact-1-stage-merged": PenaltyContactConfig(1, 1, merged_substeps=2),
 }
 
 

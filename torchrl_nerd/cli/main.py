@@ -1,6 +1,7 @@
 """The ``nerd`` command: reads options and runs; bad input becomes one sentence."""
 
 import io
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -57,6 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.record is not None:  # refuse it before any work
             check_writable(command.record)
         command.keep(command.run())
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read its output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail((str(error) or repr(error)).splitlines()[0])
     except KeyboardInterrupt:  # Ctrl-C

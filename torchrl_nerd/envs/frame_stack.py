@@ -45,14 +45,14 @@ class _Frames(CatFrames):
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        moves, name = tensordict.get("_step", None), f"_cat_buffers_{OBSERVATION}"
+        moves = tensordict.get("_step", None)
         if moves is None:
             return super()._step(tensordict, next_tensordict)
-        before = self.get_buffer(name).clone()
+        (frames,) = self.buffers()  # (num_envs, frame_stack * D)
+        before = frames.clone()
         after = super()._step(tensordict, next_tensordict)
-        rows = moves.reshape(len(before), 1)
-        kept = torch.where(rows, self.get_buffer(name), before)
-        self.get_buffer(name).copy_(kept)
+        kept = torch.where(moves.reshape(len(before), 1), frames, before)
+        frames.copy_(kept)
         return after.set(OBSERVATION, kept)
 
 
