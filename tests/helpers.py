@@ -166,7 +166,7 @@ def in_ground(scene: Scene, rows: int, generator: Generator) -> TensorDict:
         state = {QPOS: drawn[QPOS], QVEL: drawn[QVEL]}
         scene.place_on_terrain(state, -depth)
         drawn[QPOS] = state[QPOS]
-    elif scene.terrain.is_per_row:
+    elif scene.terrain.is_per_env:
         gap = scene.clearances(drawn[QPOS], drawn[TERRAIN]).amin(-1)
         drawn[TERRAIN][:, 3] += gap + depth
     return drawn

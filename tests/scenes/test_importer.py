@@ -441,7 +441,7 @@ def test_a_ground_per_row_needs_somebody_to_draw_it(tmp_path):
     def level(qpos, generator):
         return torch.tensor([0.0, 0.0, 1.0, 0.0]).double().expand(len(qpos), 4)
 
-    assert Scene.from_mjcf(path, ground=level).terrain.is_per_row
+    assert Scene.from_mjcf(path, ground=level).terrain.is_per_env
 
 
 @pytest.mark.parametrize("control_step", [float("nan"), float("inf"), 0, -0.02, "a"])

@@ -50,8 +50,8 @@ class _Frames(CatFrames):
             return super()._step(tensordict, next_tensordict)
         before = self.get_buffer(name).clone()
         after = super()._step(tensordict, next_tensordict)
-        rows = moves.reshape(len(before), 1)
-        kept = torch.where(rows, self.get_buffer(name), before)
+        is_moving = moves.reshape(len(before), 1)
+        kept = torch.where(is_moving, self.get_buffer(name), before)
         self.get_buffer(name).copy_(kept)
         return after.set(OBSERVATION, kept)
 

@@ -113,7 +113,7 @@ def find_isometries(scene: Scene) -> list[Isometry]:
     """
     model, ground = scene.model, scene.terrain
     is_legged = scene.base.is_floating and model.nv == model.njnt + 5
-    is_varied = ground is not None and ground.is_per_row
+    is_varied = ground is not None and ground.is_per_env
     if not is_legged or is_varied or scene.servos is not None:
         raise ValueError(
             f"expected a floating base, hinges or slides, motors and one ground to train "

@@ -2,10 +2,11 @@
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
 zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out. Where
-the ground is one plane that all rows share, and it is level (gravity is normal to it) or a
-fixed base cannot turn against it, n follows from gravity and pose and is left out too. Of
-several surfaces each point sees the nearest, so that a model fits any number. Added are
-velocities and predictions, see `predicted_contact`; all fades to zero at the margin.
+the ground is one plane that all envs share, and it is level (gravity is normal to it)
+or a fixed base cannot turn against it, n follows from gravity and pose, and is left out
+too. Of several surfaces each point sees the nearest, so that a model fits any number.
+Added are velocities and predictions, see `predicted_contact`; all fades to zero at the
+margin.
 """
 
 import numpy as np
@@ -72,7 +73,7 @@ class ContactFeatures(FeatureTransform):
             in_keys = [QPOS, QVEL]
             sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
             sizes[CONTACT_DEPTH] = len(times_of(scene)) * count
-            if terrain.is_per_row:
+            if terrain.is_per_env:
                 in_keys.append(TERRAIN)
             if features.predicted_force:
                 sizes[CONTACT_FORCE] = scene.layout.nv

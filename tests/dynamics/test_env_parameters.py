@@ -1,4 +1,4 @@
-"""A varied row moves as a MuJoCo model of its own would, one `mj_step` after the other."""
+"""A varied env moves as a MuJoCo model of its own would, one `mj_step` after the other."""
 
 import mujoco
 import numpy as np
@@ -41,7 +41,7 @@ IDS = [f"{name}: {', '.join(ranges)}" for name, ranges in CASES]
 
 
 def alone(scene: Scene, start, torques, parameters) -> np.ndarray:
-    """States ``(steps, nq + nv)`` of one row, with a model of its own."""
+    """States ``(steps, nq + nv)`` of one env, with a model of its own."""
     variation = scene.variation
     model = varied_model(variation, parameters)
     model.opt.disableflags = engine_model(scene, False).opt.disableflags
