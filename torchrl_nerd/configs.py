@@ -86,8 +86,8 @@ class TrainConfig:
     """Settings of a training: one-step targets first, then rollouts of the model.
 
     Raises:
-        SettingError: a number that is too small, or symmetry images of a hybrid, whose
-            analytic change has none.
+        SettingError: a number that is too small, or symmetry augmentation of a hybrid,
+            whose analytic change has no symmetric copies.
     """
 
     network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width

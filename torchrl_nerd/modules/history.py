@@ -1,4 +1,4 @@
-"""What networks remember of every row, and the paper's way: the last tokens, recomputed."""
+"""Histories of networks, and the paper's: the last tokens, recomputed at every step."""
 
 from dataclasses import dataclass, fields
 from typing import Any

@@ -134,13 +134,14 @@ class ContactFeatures(FeatureTransform):
         gate = gate[..., None]  # (*batch, P, 1)
         speed = (velocity * normal).sum(-1)
         sliding = velocity - speed[..., None] * normal
-        gain = None
+        velocity_change = None  # of unconstrained motion over the step
         if self.rigid_body is not None:
             torque = None if drive is None else drive[..., : self.num_torques]
             given = qpos, qvel, torque, pose[1], places, self.step_size
-            gain = self.step_size * self.rigid_body(*given)
-        motion = qpos, qvel, terrain, gain, self.radii - distance, speed
-        depth = gate * self.predicted_penetration(*motion)  # (*batch, P, K)
+            velocity_change = self.step_size * self.rigid_body(*given)
+        motion = qpos, qvel, terrain, velocity_change
+        penetration = self.predicted_penetration(*motion, self.radii - distance, speed)
+        depth = gate * penetration  # (*batch, P, K)
         moving = gate * torch.cat((speed[..., None], sliding), -1)  # (*batch, P, 4)
         features = [beyond.clamp_max(0.0), moving.flatten(-2), depth.flatten(-2)]
         if self.force is not None:
