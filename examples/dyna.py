@@ -6,9 +6,9 @@
 Sutton's Dyna with the branches of Janner et al., "When to trust your model"
 (arxiv.org/abs/1906.08253): every round replays states of MuJoCo, sets them in NeRD
 (``env.reset(states, set_state=True)``), lets the policy act there for a few steps, and
-updates it on both. The learner is that of `sac.py`. Returns in MuJoCo after 4,096 of its
-transitions, two seeds, four minutes each on a busy core: 211 and 206 with branches, 47
-and 2 without.
+updates it on both. The learner is that of `sac.py`. Returns in MuJoCo after 4,096 of
+its transitions, two seeds, four minutes each on a busy core: 211 and 206 with branches,
+47 and 2 without.
 """
 
 from dataclasses import dataclass

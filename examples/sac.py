@@ -4,8 +4,8 @@
     python examples/sac.py --mujoco-fraction 0   # all transitions NeRD's; 1: MuJoCo's
 
 Both dynamics write the same keys, so their transitions lie side by side; ``is_mujoco``
-says which is which. The policy is measured in both: after 80,000 transitions, four minutes
-on a busy core, a return of 737.4 ± 42.6 in NeRD and 737.9 ± 42.6 in MuJoCo.
+says which is which. The policy is measured in both: after 80,000 transitions, four
+minutes on a busy core, a return of 737.4 ± 42.6 in NeRD and 737.9 ± 42.6 in MuJoCo.
 """
 
 import logging
