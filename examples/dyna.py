@@ -101,9 +101,8 @@ def main(cfg: Config) -> None:
     """Learn from the mix, measure in both dynamics."""
     torch.manual_seed(cfg.seed)
     agent, ground_truth, learned = train(cfg)
-    print(
-        f"{len(ground_truth)} transitions of MuJoCo; the last {len(learned)} learned ones"
-    )
+    total = f"{len(ground_truth)} transitions of MuJoCo"
+    print(f"{total}; the last {len(learned)} learned ones")
     returns = transfer(cfg.task, agent.actor, (cfg.dynamics,), cfg.episodes)
     print(transfer_table(returns))
 
