@@ -280,7 +280,7 @@ def random_actions(env: SceneEnv, steps: int, generator: Generator) -> Tensor:
 
 
 def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
-    """What the rows of an env with that seed draw at the start of these episodes."""
+    """What the envs of one with that seed draw at the start of these episodes."""
     return uniforms(env_keys(seed, len(episode)), episode, stream_offsets(count))
 
 
@@ -301,7 +301,7 @@ def reset_rows(env: SceneEnv, rows: Tensor, state: TensorDict | None = None):
 
 
 def start_at(env: SceneEnv, state: TensorDict) -> TensorDict:
-    """All rows reset to ``state``."""
+    """All envs reset to ``state``."""
     return env.reset(state.clone(), set_state=True)
 
 

@@ -1,4 +1,4 @@
-"""Small robots made for a test, random true transitions, and robots moved elsewhere."""
+"""Small robots made for a test, random transitions of MuJoCo, moved robots."""
 
 import copy
 from collections.abc import Iterable
@@ -310,7 +310,7 @@ def simulated(
 
 
 def varied_model(variation: Variation, parameters: Tensor) -> mujoco.MjModel:
-    """A model of its own for one row's parameters ``(size,)``."""
+    """A model of its own for one env's parameters ``(size,)``."""
     model = copy.copy(variation.model)
     for name, value in variation.fields(parameters.numpy()[None]).items():
         owner = model.opt if name.startswith("opt.") else model

@@ -1,4 +1,4 @@
-"""Data sets: true transitions in TorchRL's layout, the same bits for the same seed."""
+"""Data sets: MuJoCo's transitions in TorchRL's layout, the same bits for one seed."""
 
 from dataclasses import replace
 
@@ -220,7 +220,7 @@ def test_many_dropped_trajectories_are_refused_by_name(scene, generator):
 RANGES = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4), "delay": (0, 2)}
 
 
-def test_varied_data_are_steps_of_each_rows_own_robot(tmp_path, seed):
+def test_varied_data_are_steps_of_each_trajectorys_own_robot(tmp_path, seed):
     scene = SCENE.vary(RANGES)
     config = DataConfig(trajectories=9, steps=20, seed=seed)
     data = load_data(scene, generate(scene, config, tmp_path, quiet=True))

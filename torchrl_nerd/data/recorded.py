@@ -142,12 +142,12 @@ def complete(log: Recording, scene: Scene) -> Recording:
     log = replace(log, qpos=qpos)
     qvel = torch.where(log.qvel.isnan(), estimate_velocities(log, scene), log.qvel)
     if is_free_body(scene):
-        flies = scene.clearances(qpos).amin(-1) > CLEAR
-        steady = flies & log.inside
+        is_airborne = scene.clearances(qpos).amin(-1) > CLEAR
+        steady = is_airborne & log.inside
         if steady.any():
             mean = backward_differences(log, scene)[:, 2]
             now = mean + 0.5 * log.frame * float(free_fall(log)[2])
-            qvel[flies, 2] += (now - qvel[:, 2])[steady].median()
+            qvel[is_airborne, 2] += (now - qvel[:, 2])[steady].median()
     log = replace(log, qvel=qvel)
     if scene.servos is None or log.ctrl is None:
         return log
