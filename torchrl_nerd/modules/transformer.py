@@ -264,7 +264,7 @@ class CausalTransformer(nn.Module):
         return KeyValueCache(keys, values, age, age.new_zeros(1), last)
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
-        """The next token of all envs, ``(rows, F) -> (rows, D)``; advances ``memory``."""
+        """Next token of all envs, ``(rows, F) -> (rows, D)``; advances ``memory``."""
         x = self.embed(token)
         if self.embed_last is not None:
             x = x + memory.last
