@@ -48,7 +48,7 @@ class Options:
     """What to measure, for how long, and against what."""
 
     tasks: tuple[str, ...] = ("cartpole/swingup", "double_pendulum/passive", "ant/run")
-    rows: int = 512
+    num_envs: int = 512
     spread: float = 0.05
     """Rounds go on until every ratio's median is known to this share..."""
     rounds: int = 60
@@ -131,7 +131,7 @@ def candidates(scene: Scene, threads: int) -> list[Candidate]:
 
 def runners(task: Task, options: Options) -> dict[str, tuple[Runner, Runner]]:
     """Of every candidate, warm: its dynamics, and its env."""
-    state = mid_states(task, options.rows, options.seed)
+    state = mid_states(task, options.num_envs, options.seed)
     return {
         c.name: (
             Runner(stepper(c.make(task.scene), state)),
@@ -142,11 +142,11 @@ def runners(task: Task, options: Options) -> dict[str, tuple[Runner, Runner]]:
 
 
 def one_round(
-    found: Mapping[str, tuple[Runner, Runner]], rows: int
+    found: Mapping[str, tuple[Runner, Runner]], num_envs: int
 ) -> dict[str, Sample]:
     """One sample of each candidate, by its name."""
     return {
-        name: Sample(*(rows * runner.steps_per_s() for runner in both))
+        name: Sample(*(num_envs * runner.steps_per_s() for runner in both))
         for name, both in found.items()
     }
 
@@ -157,7 +157,7 @@ def _env_stepper(
     """Steps of an env with random actions, through TorchRL's collector."""
     dynamics, here = candidate.make(task.scene), copy.copy(task)
     here.scene = dynamics.scene  # of as many substeps
-    env = SceneEnv(here, dynamics, options.rows, options.seed)
+    env = SceneEnv(here, dynamics, options.num_envs, options.seed)
     if getattr(dynamics, "compile", False):
         env.compile()
     collectors: dict[int, Collector] = {}
@@ -171,7 +171,7 @@ def _env_stepper(
             collectors[steps] = Collector(
                 env,
                 act,  # TorchRL's own random policy takes five times as long
-                frames_per_batch=options.rows * steps,
+                frames_per_batch=options.num_envs * steps,
                 total_frames=-1,
                 track_traj_ids=False,
                 auto_register_policy_transforms=False,
@@ -190,7 +190,7 @@ def measure(options: Options) -> dict[str, Ratio]:
         rounds: list[dict[str, float]] = []
         known: dict[str, Ratio] = {}
         for _ in tqdm(range(options.rounds), task_id, disable=None):
-            rounds.append(ratios(one_round(chosen, options.rows)))
+            rounds.append(ratios(one_round(chosen, options.num_envs)))
             if len(rounds) < LEAST_ROUNDS:
                 continue
             known = {
@@ -213,7 +213,7 @@ def conditions(options: Options) -> dict[str, Any]:
             for name, dynamics in made.items()
             if isinstance(dynamics, NeRDDynamics)
         }
-    return {"rows": options.rows, "threads": options.threads, "networks": networks}
+    return {"rows": options.num_envs, "threads": options.threads, "networks": networks}
 
 
 def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, float]:
@@ -236,7 +236,7 @@ def main(options: Options) -> list[str]:
         ValueError: a setting out of range, or a baseline that does not fit.
     """
     expect_at_least(LEAST_ROUNDS, rounds=options.rounds)
-    expect_at_least(1, rows=options.rows, threads=options.threads)
+    expect_at_least(1, num_envs=options.num_envs, threads=options.threads)
     torch.set_num_threads(options.threads)
     about = conditions(options)
     before = {} if options.write else read_baseline(options.baseline, about)

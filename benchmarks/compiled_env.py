@@ -1,8 +1,8 @@
 """A whole env in learned dynamics, eager and compiled, beside the same in MuJoCo.
 
-    python benchmarks/compiled_env.py --tasks ant/run franka/reach --rows 512
+    python benchmarks/compiled_env.py --tasks ant/run franka/reach --num-envs 512
 
-They take turns on one thread; processor time of an action of one row, TorchRL's
+They take turns on one thread; processor time of an action of one env, TorchRL's
 bookkeeping and resets included. Actions are random and held, from the starts of episodes
 on, so robots that fall spend some steps in the air. Seconds of the first compiled step,
 reset included, are those of new processes: a cold one, and a warm one that finds its code
@@ -44,7 +44,7 @@ class Options:
 
     tasks: tuple[str, ...] = ()
     """All whose robot has a shipped model where none is given."""
-    rows: int = 512
+    num_envs: int = 512
     rounds: int = 7
     seed: int = 0
     json: Path | None = None
@@ -66,15 +66,15 @@ class Stepper:
 
     @torch.no_grad()
     def __call__(self, steps: int) -> None:
-        """So many actions of every row, resets where episodes end."""
+        """So many actions of every env, resets where episodes end."""
         for _ in range(steps):
             self.now.set("action", self.action)
             _, self.now = self.env.step_and_maybe_reset(self.now)
 
 
-def compare(task: str, rows: int, rounds: int, seed: int) -> dict[str, float]:
-    """Microseconds of an action of one row in each, and what compiling brings."""
-    envs = (make_env(task, x, rows, seed) for x in ("nerd", "nerd", "mujoco"))
+def compare(task: str, num_envs: int, rounds: int, seed: int) -> dict[str, float]:
+    """Microseconds of an action of one env in each, and what compiling brings."""
+    envs = (make_env(task, x, num_envs, seed) for x in ("nerd", "nerd", "mujoco"))
     eager, compiled, mujoco = (Stepper(env, seed) for env in envs)
     compiled.env.compile()
     compiled(2)
@@ -83,7 +83,9 @@ def compare(task: str, rows: int, rounds: int, seed: int) -> dict[str, float]:
     )
     fast, slow, ratio = two_in_turn(one, other, rounds)
     true, _, _ = two_in_turn(third, other, rounds)
-    eager_us, compiled_us, mujoco_us = (1e6 / (rows * x) for x in (slow, fast, true))
+    eager_us, compiled_us, mujoco_us = (
+        1e6 / (num_envs * x) for x in (slow, fast, true)
+    )
     return {
         "eager_us": eager_us,
         "compiled_us": compiled_us,
@@ -92,12 +94,12 @@ def compare(task: str, rows: int, rounds: int, seed: int) -> dict[str, float]:
     }
 
 
-def first_steps(task: str, rows: int, cache: str) -> dict[str, float]:
+def first_steps(task: str, num_envs: int, cache: str) -> dict[str, float]:
     """Seconds of the first compiled step: of all envs, with a cache empty and filled."""
     found = {}
     for name in ("cold_s", "warm_s"):
         done = subprocess.run(
-            [sys.executable, "-c", FIRST_STEP, task, str(rows)],
+            [sys.executable, "-c", FIRST_STEP, task, str(num_envs)],
             env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": cache},
             stdout=subprocess.PIPE,
             check=True,
@@ -106,12 +108,12 @@ def first_steps(task: str, rows: int, cache: str) -> dict[str, float]:
     return found
 
 
-def measure(task: str, rows: int, rounds: int, seed: int) -> dict[str, float]:
+def measure(task: str, num_envs: int, rounds: int, seed: int) -> dict[str, float]:
     """All of one task; what was compiled for the first step serves the others."""
     with tempfile.TemporaryDirectory() as cache:
-        found = first_steps(task, rows, cache)
+        found = first_steps(task, num_envs, cache)
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
-        return found | compare(task, rows, rounds, seed)
+        return found | compare(task, num_envs, rounds, seed)
 
 
 def main(options: Options) -> None:
@@ -121,12 +123,12 @@ def main(options: Options) -> None:
     shipped = shipped_models()
     learned = {x: model_name("nerd", make_task(x).scene) for x in TASKS}
     tasks = options.tasks or [x for x in TASKS if learned[x] in shipped]
-    print(f"{options.rows} rows, one thread, us of an action of one row")
+    print(f"{options.num_envs} envs, one thread, us of an action of one env")
     columns = f"{'task':<30}{'eager':>8}{'compiled':>10}{'MuJoCo':>8}{'ratio':>7}"
     print(f"{columns}{'cold':>8}{'warm, s':>9}")
     results = {}
     for task in tasks:
-        row = measure(task, options.rows, options.rounds, options.seed)
+        row = measure(task, options.num_envs, options.rounds, options.seed)
         results[task] = row
         rates = (
             f"{row['eager_us']:>8.1f}{row['compiled_us']:>10.1f}"
@@ -136,7 +138,7 @@ def main(options: Options) -> None:
             f"{task:<30}{rates}{row['cold_s']:>8.1f}{row['warm_s']:>9.1f}", flush=True
         )
         if options.json is not None:
-            found = {"rows": options.rows, "tasks": results}
+            found = {"rows": options.num_envs, "tasks": results}
             write_results(options.json, found, options.seed)
 
 

@@ -39,7 +39,7 @@ class Options:
     """What to generate, and how often."""
 
     scene: Positional[str] = "cartpole"
-    rows: int = 2048
+    trajectories: int = 2048
     steps: int = 50
     rounds: int = 7
     """The first is not counted."""
@@ -49,18 +49,18 @@ class Options:
 
 
 def seconds_of_rollout(
-    scene: Scene, rows: int, steps: int, seed: int, threads: int
+    scene: Scene, trajectories: int, steps: int, seed: int, threads: int
 ) -> float:
     """One bare call of MuJoCo."""
     generator = Generator().manual_seed(seed)
-    start, scale = scene.sample_initial(rows, generator)
+    start, scale = scene.sample_initial(trajectories, generator)
     model = engine_model(scene, has_actuators=False)
     data = [mujoco.MjData(model) for _ in range(threads)]
     state = np.concatenate(
-        (np.zeros((rows, 1)), start["qpos"].numpy(), start["qvel"].numpy()), -1
+        (np.zeros((trajectories, 1)), start["qpos"].numpy(), start["qvel"].numpy()), -1
     )
     torque = sample_commands(scene.sampling, scale, steps, generator)
-    control = np.zeros((rows, steps, mujoco.mj_stateSize(model, CONTROL)))
+    control = np.zeros((trajectories, steps, mujoco.mj_stateSize(model, CONTROL)))
     control[:, :, scene.actuated] = torque.numpy()
     if scene.terrain is not None and "terrain" in start:
         pose = scene.terrain.mocap_pose(start["terrain"]).numpy()
@@ -72,9 +72,11 @@ def seconds_of_rollout(
         return time.perf_counter() - began
 
 
-def seconds_of_generate(scene: Scene, rows: int, steps: int, seed: int) -> float:
+def seconds_of_generate(
+    scene: Scene, trajectories: int, steps: int, seed: int
+) -> float:
     """What `nerd data` does, on disk."""
-    config = DataConfig(trajectories=rows, steps=steps, seed=seed)
+    config = DataConfig(trajectories=trajectories, steps=steps, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         generate(scene, config, Path(folder), quiet=True)
@@ -86,10 +88,10 @@ def main(options: Options) -> float:
     scene, threads = load_scene(options.scene), os.cpu_count() or 1
     bare, whole = [], []
     for index in range(options.rounds):
-        draw = options.rows, options.steps, options.seed + index
+        draw = options.trajectories, options.steps, options.seed + index
         bare.append(seconds_of_rollout(scene, *draw, threads))
         whole.append(seconds_of_generate(scene, *draw))
-    count = options.rows * options.steps
+    count = options.trajectories * options.steps
     rates = [count / median(seconds[1:]) for seconds in (bare, whole)]
     ratio = rates[1] / rates[0]
     print(

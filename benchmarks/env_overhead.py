@@ -1,6 +1,6 @@
 """Where the time of a NeRDEnv step goes: TorchRL, task and bookkeeping, dynamics.
 
-    python benchmarks/env_overhead.py --rows 512
+    python benchmarks/env_overhead.py --num-envs 512
 
 Times `EnvBase.step` and, within the same calls, the env's own `_step`, the dynamics and,
 where there is contact, kinematics and collision; prints median shares. TorchRL's overhead
@@ -29,7 +29,7 @@ class Options:
     """What to time."""
 
     task: str = "cartpole/swingup"
-    rows: int = 512
+    num_envs: int = 512
     steps: int = 200
     threads: int | None = None
     json: Path | None = None
@@ -51,10 +51,10 @@ def timed(owner: object, name: str) -> list[float]:
 
 
 def step_times(
-    task: str, model: Model | str, rows: int, steps: int
+    task: str, model: Model | str, num_envs: int, steps: int
 ) -> dict[str, float]:
     """Median seconds of a step and of its dynamics, and the shares of the rest."""
-    env = NeRDEnv(task, model, num_envs=rows)
+    env = NeRDEnv(task, model, num_envs=num_envs)
     dynamics, own = timed(env.dynamics, "step"), timed(env, "_step")
     contact = env.dynamics.model.scene_features.contact  # pyright: ignore
     evaluations = [
@@ -92,20 +92,20 @@ def main(options: Options) -> None:
         for name in ("transformer-2x64", "transformer-4x128", "paper")
     }
     results = {}
-    print(f"{options.task}, {options.rows} rows, {torch.get_num_threads()} threads")
+    print(f"{options.task}, {options.num_envs} envs, {torch.get_num_threads()} threads")
     print(
         f"{'model':<10}{'step ms':>9}{'dynamics ms':>13}{'TorchRL':>9}{'task':>7}"
         f"{'steps/s':>10}  kinematics, collision (share of the dynamics)"
     )
     for name, model in models.items():
-        row = step_times(options.task, model, options.rows, options.steps)
+        row = step_times(options.task, model, options.num_envs, options.steps)
         results[name] = row
-        rate = options.rows / row["step_s"]
+        rate = options.num_envs / row["step_s"]
         line = f"{name:<10}{1e3 * row['step_s']:>9.2f}{1e3 * row['dynamics_s']:>13.2f}"
         shares = f"{row['torchrl_share']:>9.1%}{row['task_share']:>7.1%}"
         print(f"{line}{shares}{rate:>10.0f}{row['contact_share']:>9.1%}")
     if options.json is not None:
-        write_results(options.json, {"rows": options.rows, "models": results})
+        write_results(options.json, {"rows": options.num_envs, "models": results})
 
 
 if __name__ == "__main__":

@@ -40,10 +40,10 @@ class Options:
     tasks: tuple[str, ...] = ()
     """Those with a goal and a shipped model by default."""
     rounds: int = 3
-    rows: int | None = None
+    num_envs: int | None = None
     """The task's own by default."""
     compile: bool = True
-    """Have a compiled row."""
+    """Time the compiled env as well."""
     seed: int = 0
     json: Path | None = None
     """Write the results to this file."""
@@ -109,8 +109,8 @@ def default_tasks() -> list[str]:
 def speeds(task: str, options: Options) -> dict[str, Speed]:
     """Speed in each dynamics, by its name."""
     cfg = Run(**asdict(PPO_CONFIGS[task]), task=task, seed=options.seed)
-    if options.rows is not None:
-        cfg = replace(cfg, num_envs=options.rows)
+    if options.num_envs is not None:
+        cfg = replace(cfg, num_envs=options.num_envs)
     true = replace(cfg, dynamics="mujoco")
     learners = {MUJOCO: Learner(true), "NeRD": Learner(cfg)}
     if options.compile:
@@ -138,7 +138,7 @@ def main(options: Options) -> dict[str, dict[str, Speed]]:
     Raises:
         ValueError: a task without settings of PPO, or a setting out of range.
     """
-    expect_at_least(1, rounds=options.rounds, rows=options.rows or 1)
+    expect_at_least(1, rounds=options.rounds, num_envs=options.num_envs or 1)
     unknown = [task for task in options.tasks if task not in default_tasks()]
     if unknown:
         raise ValueError(

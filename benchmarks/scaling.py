@@ -34,7 +34,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 
 HEAVY = "dm_control/humanoid-run"
-LOOKED_AT = 64  # rows whose contacts are counted
+LOOKED_AT = 64  # envs whose contacts are counted
 
 
 @dataclass
@@ -62,9 +62,9 @@ class Point:
     | ``dofs``, ``substeps`` | of the scene |
     | ``points`` | contact points that the network is told of |
     | ``contacts`` | mean number that MuJoCo found in the states that were stepped |
-    | ``mujoco_us``, ``learned_us`` | processor time of a control step of one row, medians |
+    | ``mujoco_us``, ``learned_us`` | processor time of one env's control step, median |
     | ``ratio`` | learned rate over MuJoCo's, median over rounds |
-    | ``state_bytes`` | of a row |
+    | ``state_bytes`` | of an env |
     """
 
     scene: str
@@ -80,12 +80,12 @@ class Point:
 
 
 def mean_contacts(scene: Scene, state: TensorDict) -> float:
-    """Contacts that MuJoCo finds, mean over the first rows."""
+    """Contacts that MuJoCo finds, mean over the first envs."""
     data, counts = mujoco.MjData(scene.model), []
-    for row in cast(TensorDict, state[:LOOKED_AT]).unbind(0):
-        data.qpos[:] = row[QPOS].numpy()
-        if TERRAIN in row.keys() and scene.terrain is not None:
-            pose = scene.terrain.mocap_pose(row[TERRAIN][None])[0].numpy()
+    for env in cast(TensorDict, state[:LOOKED_AT]).unbind(0):
+        data.qpos[:] = env[QPOS].numpy()
+        if TERRAIN in env.keys() and scene.terrain is not None:
+            pose = scene.terrain.mocap_pose(env[TERRAIN][None])[0].numpy()
             data.mocap_pos[:] = pose[: data.mocap_pos.size].reshape(-1, 3)
             data.mocap_quat[:] = pose[data.mocap_pos.size :].reshape(-1, 4)
         mujoco.mj_fwdPosition(scene.model, data)
@@ -123,7 +123,7 @@ def measure(scene: Scene, batch: int, options: Options) -> Point:
 
 
 def memory_table() -> dict[str, int]:
-    """Bytes of history that one row adds, by preset: the same in every scene."""
+    """Bytes of history that one env adds, by preset: the same in every scene."""
     scene = load_scene("cartpole")
     networks = {
         name: NeRDDynamics(NeRD(scene, NO_PREDICTIONS, config)).network
@@ -156,7 +156,7 @@ def main(options: Options) -> list[Point]:
             print(f"{p.scene:<26}{p.rows:>6}{sizes}{times}", flush=True)
     memory = memory_table()
     print(
-        "history of a row, bytes: " + ", ".join(f"{k} {v}" for k, v in memory.items())
+        "history of an env, bytes: " + ", ".join(f"{k} {v}" for k, v in memory.items())
     )
     if options.json is not None:
         results: dict[str, Any] = {"points": [asdict(p) for p in points]}

@@ -32,7 +32,7 @@ class Options:
 
     models: tuple[str, ...] = ("cartpole", "double_pendulum", "ant", "franka", "cube")
     trajectories: int = 256
-    rows: int = 512
+    num_envs: int = 512
     rounds: int = 7
     seed: int = 0
     json: Path | None = None
@@ -47,7 +47,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
     protocol = protocol_of(model.scene)
     case, source = next(iter(protocol.cases.items()))
     horizon, is_random = max(protocol.horizons), case in protocol.random_actions
-    state, runners = mid_states(model.scene, options.rows, options.seed), []
+    state, runners = mid_states(model.scene, options.num_envs, options.seed), []
     for dtype in (torch.float64, torch.float32):
         dynamics = NeRDDynamics(cast_constants(copy.deepcopy(model), dtype))
         given = source, dynamics, MujocoDynamics(model.scene), [horizon]
@@ -60,7 +60,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
     fine, coarse = runners
     rates = two_in_turn(fine, coarse, options.rounds)
     for kind, rate in zip(("float64", "float32"), rates, strict=False):
-        found[f"{kind}_us"] = 1e6 / (options.rows * rate)
+        found[f"{kind}_us"] = 1e6 / (options.num_envs * rate)
     return {"case": case, "steps": horizon, **found}
 
 

@@ -1,7 +1,7 @@
 """One token a step against the paper's window of ten, recomputed, by preset.
 
     python benchmarks/streaming.py
-    python benchmarks/streaming.py cartpole --presets tiny --rows 64 --no-compile
+    python benchmarks/streaming.py cartpole --presets paper --num-envs 64 --no-compile
 
 Untrained networks of the scene's sizes, since their speed does not depend on weights; that
 both have the same error is seen with trained ones: `nerd bench cartpole --variants window`.
@@ -32,10 +32,10 @@ class Options:
 
     scene: Positional[str] = "ant"
     presets: tuple[str, ...] = ("transformer-2x64", "transformer-4x128", "paper")
-    rows: int = 512
+    num_envs: int = 512
     rounds: int = 5
     compile: bool = True
-    """Have compiled rows."""
+    """Time compiled models as well."""
     threads: int = 2
     seed: int = 0
     json: Path | None = None
@@ -55,22 +55,22 @@ class Speed:
 
 def measure(scene: Scene, preset: str, is_compiled: bool, options: Options) -> Speed:
     """Both ways of one network."""
-    state = mid_states(scene, options.rows, options.seed)
+    state = mid_states(scene, options.num_envs, options.seed)
     model = NeRD(scene, NO_PREDICTIONS, network_config(preset))
     streaming, window = (
         Runner(stepper(NeRDDynamics(model, way, compile=is_compiled), state))
         for way in ("streaming", "window")
     )
     fast, slow, ratio = two_in_turn(streaming, window, options.rounds)
-    rows = options.rows
-    return Speed(preset, is_compiled, rows * fast, rows * slow, ratio)
+    num_envs = options.num_envs
+    return Speed(preset, is_compiled, num_envs * fast, num_envs * slow, ratio)
 
 
 def main(options: Options) -> list[Speed]:
     """Print a row for every preset, eager and compiled."""
     torch.set_num_threads(options.threads)
     scene, found = load_scene(options.scene), []
-    print(f"{scene.name}, {options.rows} rows, {options.threads} threads, steps/s")
+    print(f"{scene.name}, {options.num_envs} envs, {options.threads} threads, steps/s")
     print(f"{'preset':<22}{'streaming':>11}{'window':>9}{'ratio':>7}")
     for preset in options.presets:
         for is_compiled in (False, True)[: 1 + options.compile]:
@@ -80,7 +80,11 @@ def main(options: Options) -> list[Speed]:
             print(f"{name:<22}{rates}", flush=True)
             found.append(x)
     if options.json is not None:
-        about = {"scene": scene.name, "rows": options.rows, "threads": options.threads}
+        about = {
+            "scene": scene.name,
+            "rows": options.num_envs,
+            "threads": options.threads,
+        }
         speeds = [asdict(x) for x in found]
         write_results(options.json, {**about, "speeds": speeds}, options.seed)
     return found

@@ -40,8 +40,8 @@ class Config:
     """The defaults are for minutes on one core, most of it the start of processes."""
 
     task: str = "cartpole/swingup"
-    num_envs: int = 256  # rows of every env
-    horizon: int = 32  # steps of every row in a batch
+    num_envs: int = 256  # of every way
+    horizon: int = 32  # steps of every env in a batch
     batches: int = 4  # of which the first is not timed
     seed: int = 0
 
@@ -124,7 +124,7 @@ def measure(name: str, dynamics: Sequence[str], collector: BaseCollector) -> Non
 
 
 def main(cfg: Config) -> None:
-    """Every way, with learned dynamics, with true ones, and with one of each."""
+    """Every way, with learned dynamics, with MuJoCo, and with one of each."""
     torch.manual_seed(cfg.seed)
     for name in ("nerd", "mujoco"):
         measure("Collector", [name], one_process(cfg, [name]))

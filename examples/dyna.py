@@ -1,14 +1,14 @@
-"""Dyna: few true transitions, many short learned branches that start from them.
+"""Dyna: few transitions of MuJoCo, many short learned branches that start from them.
 
-    python examples/dyna.py                # batches of 3 learned transitions to 1 true
+    python examples/dyna.py                # 3 learned transitions to 1 of MuJoCo
     python examples/dyna.py --branch 0     # the same without the learned ones
 
 Sutton's Dyna with the branches of Janner et al., "When to trust your model"
 (arxiv.org/abs/1906.08253): every round replays states of MuJoCo, sets them in NeRD
 (``env.reset(states, set_state=True)``), lets the policy act there for a few steps, and
-updates it on both. The learner is that of `sac.py`. Returns in MuJoCo after 4,096 true
-transitions, two seeds, four minutes each on a busy core: 211 and 206 with branches, 47 and
-2 without.
+updates it on both. The learner is that of `sac.py`. Returns in MuJoCo after 4,096 of
+its transitions, two seeds, four minutes each on a busy core: 211 and 206 with branches,
+47 and 2 without.
 """
 
 from dataclasses import dataclass
@@ -32,15 +32,15 @@ class Config:
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # of the branches: nerd or a checkpoint folder
-    frames: int = 4096  # true transitions
-    num_envs: int = 8  # true rows
-    horizon: int = 8  # true transitions of every row in a round
+    frames: int = 4096  # transitions of MuJoCo
+    num_envs: int = 8  # of MuJoCo
+    horizon: int = 8  # transitions of every env of MuJoCo in a round
     branch: int = 5  # learned steps from every replayed state; 0 for none
     starts: int = 128  # replayed states a round
     kept: int = 50  # rounds of learned transitions in the buffer
-    learned_share: float = 0.75  # of a batch
+    learned_fraction: float = 0.75  # of a batch
     updates: int = 72  # gradient steps a round
-    batch_size: int = 256  # transitions of a gradient step, true and learned
+    batch_size: int = 256  # transitions of a gradient step, MuJoCo's and learned
     episodes: int = 256  # of the evaluation
     seed: int = 0
 
@@ -48,9 +48,9 @@ class Config:
 def branches(
     env: SceneEnv, agent: Agent, states: TensorDictBase, steps: int
 ) -> TensorDictBase:
-    """What the policy does in ``env`` from given states, ``[rows, steps]``.
+    """What the policy does in ``env`` from given states, ``[num_envs, steps]``.
 
-    A row that ends on the way begins anew at a start of the task's own.
+    An env that ends on the way begins anew at a start of the task's own.
     """
     start = env.reset(states.select(*env.state.keys()), set_state=True)
     with torch.no_grad():
@@ -69,13 +69,13 @@ def make_buffer(size: int, batch_size: int) -> TensorDictReplayBuffer:
 
 
 def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer, TensorDictReplayBuffer]:
-    """An agent, the true transitions and the learned ones."""
+    """An agent, the transitions of MuJoCo and the learned ones."""
     env = make_env(cfg.task, "mujoco", cfg.num_envs, seed=cfg.seed)
     model = make_env(cfg.task, cfg.dynamics, cfg.starts)
     agent, frames = Agent(env), cfg.num_envs * cfg.horizon
-    share = cfg.learned_share if cfg.branch else 0.0
-    num_learned = round(share * cfg.batch_size)
-    true = make_buffer(cfg.frames, cfg.batch_size - num_learned)
+    fraction = cfg.learned_fraction if cfg.branch else 0.0
+    num_learned = round(fraction * cfg.batch_size)
+    ground_truth = make_buffer(cfg.frames, cfg.batch_size - num_learned)
     learned = make_buffer(cfg.kept * cfg.starts * max(cfg.branch, 1), num_learned)
     collector = Collector(
         env,
@@ -86,22 +86,23 @@ def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer, TensorDictReplayB
         auto_register_policy_transforms=False,
     )
     for batch in tqdm(collector, total=-(-cfg.frames // frames), unit="round"):
-        true.extend(transitions(batch, is_true=True))
+        ground_truth.extend(transitions(batch, is_mujoco=True))
         if num_learned:
-            states = true.sample(cfg.starts)
+            states = ground_truth.sample(cfg.starts)
             ahead = branches(model, agent, states, cfg.branch)
-            learned.extend(transitions(ahead, is_true=False))
+            learned.extend(transitions(ahead, is_mujoco=False))
         for _ in range(cfg.updates):
-            mix = [true.sample()] + ([learned.sample()] if num_learned else [])
+            mix = [ground_truth.sample()] + ([learned.sample()] if num_learned else [])
             agent.update(torch.cat(mix))  # pyright: ignore[reportArgumentType]
-    return agent, true, learned
+    return agent, ground_truth, learned
 
 
 def main(cfg: Config) -> None:
     """Learn from the mix, measure in both dynamics."""
     torch.manual_seed(cfg.seed)
-    agent, true, learned = train(cfg)
-    print(f"{len(true)} true transitions; the last {len(learned)} learned ones")
+    agent, ground_truth, learned = train(cfg)
+    total = f"{len(ground_truth)} transitions of MuJoCo"
+    print(f"{total}; the last {len(learned)} learned ones")
     returns = transfer(cfg.task, agent.actor, (cfg.dynamics,), cfg.episodes)
     print(transfer_table(returns))
 

@@ -48,9 +48,9 @@ class Config:
     dynamics: str = "nerd"  # what to learn in: nerd, hybrid, analytic, a model's name
     start: Path | None = None  # folder of a policy to go on from, as PPO leaves it
     compile: bool = False  # steps and their gradients: minutes at first, then faster
-    num_envs: int = 64  # rows that it learns from together
+    num_envs: int = 64  # that it learns from together
     window: int = 16  # actions that the gradient goes through
-    episode: int = 128  # actions before all rows begin anew
+    episode: int = 128  # actions before all envs begin anew
     updates: int = 300  # gradient steps, one a window
     lr: float = 3e-3  # Adam's step size at the start; falls linearly to almost zero
     evaluate_every: int = 25  # updates between two points of the learning curve
@@ -149,17 +149,17 @@ def window_reward(
         recent = append_frame(recent, now["observation"], policy.frame_stack)
         mean, _ = policy(recent)
         if mean.requires_grad:
-            mean.register_hook(bound_rows)
+            mean.register_hook(bound_gradients)
         now = env.step(now.set("action", mean.tanh()))["next"]
         total = total + now["reward"].mean()
     return total / steps, None if recent is None else recent.detach()
 
 
-def bound_rows(gradient: Tensor, times: float = 4.0) -> Tensor:
-    """Gradients ``(num_envs, num_actions)``, no row longer than ``times`` the median one.
+def bound_gradients(gradient: Tensor, times: float = 4.0) -> Tensor:
+    """Gradients ``(num_envs, num_actions)``, none longer than ``times`` the median one.
 
     Where motion is nearly chaotic its gradient grows with every step that it goes back
-    through, and one such row would point the whole batch its way. What is no number
+    through, and one such env would point the whole batch its way. What is no number
     counts nothing.
     """
     gradient = gradient.nan_to_num(0.0, 0.0, 0.0)
@@ -171,7 +171,7 @@ def bound_rows(gradient: Tensor, times: float = 4.0) -> Tensor:
 def go_on(
     env: NeRDEnv, recent: Tensor | None, frame_stack: int, ended: Tensor
 ) -> tuple[TensorDictBase, Tensor | None]:
-    """Where the window ended, without its graph; rows ``ended (num_envs,)`` begin anew."""
+    """Where the window ended, without its graph; ``ended (num_envs,)`` begin anew."""
     state = env.state.detach()
     if ended.any():
         env.reset()

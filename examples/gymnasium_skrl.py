@@ -4,7 +4,7 @@
     python examples/gymnasium_skrl.py --env TorchrlNerd/AntRun-v0 --dynamics mujoco
 
 skrl takes the batched env as it takes any `gymnasium.vector.VectorEnv`: one call of the
-dynamics steps all of its rows. The policy is then measured in MuJoCo.
+dynamics steps all of its envs. The policy is then measured in MuJoCo.
 """
 
 from dataclasses import dataclass
@@ -35,9 +35,9 @@ class Config:
 
     env: str = "TorchrlNerd/CartpoleSwingup-v0"  # any id of ours
     dynamics: str = "nerd"  # where it learns: nerd, mujoco, a checkpoint folder
-    num_envs: int = 256  # rows that it learns from together
+    num_envs: int = 256  # that it learns from together
     rollout: int = 32  # steps of each between two updates
-    steps: int = 4800  # of each row
+    steps: int = 4800  # of each env
     episode: int = 300  # steps of an episode in the report
     seed: int = 0
 

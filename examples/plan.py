@@ -1,4 +1,4 @@
-"""Plan in learned dynamics, act in true ones: no policy, TorchRL's own planner.
+"""Plan in learned dynamics, act in MuJoCo: no policy, TorchRL's own planner.
 
     python examples/plan.py                      # swing up cart-poles of MuJoCo by NeRD
     python examples/plan.py --dynamics mujoco    # by MuJoCo itself
@@ -52,17 +52,17 @@ class HeldSwingup(CartpoleSwingup):
 def make_planner(cfg: Config) -> CEMPlanner:
     """A TorchRL policy that plans.
 
-    Its candidates are a batch dimension of its own, which an env of fixed rows refuses:
-    `StatelessEnv` takes any batch and sets its rows to the states in it.
+    Its candidates are a batch dimension of its own, which an env of fixed size refuses:
+    `StatelessEnv` takes any batch and sets its envs to the states in it.
     """
-    rows = cfg.num_envs * cfg.candidates
-    model = StatelessEnv(make_env(HeldSwingup(), cfg.dynamics, rows))
+    size = cfg.num_envs * cfg.candidates
+    model = StatelessEnv(make_env(HeldSwingup(), cfg.dynamics, size))
     return CEMPlanner(model, cfg.horizon, cfg.rounds, cfg.candidates, cfg.best)
 
 
 @torch.no_grad()
 def play(policy: Actor, cfg: Config) -> Tensor:
-    """Rewards of true episodes, ``(num_envs, actions)``; none after an early end."""
+    """Rewards in MuJoCo, ``(num_envs, actions)``; none after an early end."""
     env = make_env(HeldSwingup(), "mujoco", cfg.num_envs, seed=cfg.seed)
     tensordict, rewards = env.reset(), []
     is_running = torch.ones(cfg.num_envs, dtype=torch.bool)

@@ -84,8 +84,8 @@ def update(
     steps = advantage(batch).select(*keys).reshape(-1)
     for _ in range(cfg.epochs):
         order = torch.randperm(len(steps), device=steps.device)
-        for rows in order.split(cfg.minibatch):
-            losses = loss(steps[rows])
+        for chosen in order.split(cfg.minibatch):
+            losses = loss(steps[chosen])
             optimizer.zero_grad()
             (losses["loss_objective"] + losses["loss_critic"]).backward()
             nn.utils.clip_grad_norm_(loss.parameters(), 1.0)

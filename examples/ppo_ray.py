@@ -3,7 +3,7 @@
     python examples/ppo_ray.py                      # two workers on this machine
     python examples/ppo_ray.py --address auto --workers 32 --task ant/run
 
-As `examples/ppo.py` in all else. Every worker steps its share of the rows. Where one is
+As `examples/ppo.py` in all else. Every worker steps its share of the envs. Where one is
 lost, its batch is too, and all begin anew with the policy as it is: no batch is of an
 older one.
 """
@@ -36,12 +36,12 @@ class Run(ppo.Run):
     address: str = "local"  # HOST:PORT of a cluster; auto: find it; local: this machine
 
 
-def make_worker_env(cfg: Run, rows: int, seed: int) -> EnvBase:
-    """A worker's rows; its exploration has a seed of its own, too."""
+def make_worker_env(cfg: Run, num_envs: int, seed: int) -> EnvBase:
+    """A worker's envs; its exploration has a seed of its own, too."""
     # the other processors have other workers
     os.environ.setdefault("NERD_THREADS", "1")
     torch.manual_seed(seed)
-    env = make_env(cfg.task, dynamics=cfg.dynamics, num_envs=rows, seed=seed)
+    env = make_env(cfg.task, dynamics=cfg.dynamics, num_envs=num_envs, seed=seed)
     return stack_frames(env, cfg.frame_stack)
 
 
@@ -49,11 +49,11 @@ def make_collector(
     cfg: Run, actor: ProbabilisticActor, frames: int, start: int
 ) -> RayCollector:
     """Workers with the actor as it is now; each start has other seeds."""
-    rows = cfg.num_envs // cfg.workers
+    num_envs = cfg.num_envs // cfg.workers
     seeds = (
         1000 * (cfg.seed + 1) + start * cfg.workers + i for i in range(cfg.workers)
     )
-    makers = [partial(make_worker_env, cfg, rows, seed) for seed in seeds]
+    makers = [partial(make_worker_env, cfg, num_envs, seed) for seed in seeds]
     return RayCollector(
         makers,
         actor,

@@ -1,11 +1,11 @@
 """Soft actor-critic from one replay buffer that learned dynamics and MuJoCo fill together.
 
-    python examples/sac.py                     # a quarter of the transitions are MuJoCo's
-    python examples/sac.py --true-share 0      # all of them NeRD's; 1: all MuJoCo's
+    python examples/sac.py                       # a quarter of transitions MuJoCo's
+    python examples/sac.py --mujoco-fraction 0   # all transitions NeRD's; 1: MuJoCo's
 
-Both dynamics write the same keys, so their transitions lie side by side; ``is_true`` says
-which is which. The policy is measured in both: after 80,000 transitions, four minutes on a
-busy core, a return of 737.4 ± 42.6 in NeRD and 737.9 ± 42.6 in MuJoCo.
+Both dynamics write the same keys, so their transitions lie side by side; ``is_mujoco``
+says which is which. The policy is measured in both: after 80,000 transitions, four
+minutes on a busy core, a return of 737.4 ± 42.6 in NeRD and 737.9 ± 42.6 in MuJoCo.
 """
 
 import logging
@@ -36,10 +36,10 @@ class Config:
 
     task: str = "cartpole/swingup"  # what to learn
     dynamics: str = "nerd"  # the learned ones: nerd or a checkpoint folder
-    true_share: float = 0.25  # of the transitions, from MuJoCo
+    mujoco_fraction: float = 0.25  # of the transitions
     frames: int = 80_000  # transitions in all
-    num_envs: int = 64  # rows, of both dynamics together
-    horizon: int = 8  # transitions of every row between two rounds of updates
+    num_envs: int = 64  # of both dynamics together
+    horizon: int = 8  # transitions of every env between two rounds of updates
     updates: int = 32  # gradient steps a round
     batch_size: int = 512  # transitions of a gradient step
     episodes: int = 256  # of the evaluation
@@ -77,8 +77,8 @@ class Agent:
 
 def make_collectors(cfg: Config, agent: Agent) -> dict[str, Iterator[TensorDictBase]]:
     """One for each dynamics that has a share, by its name."""
-    num_true = round(cfg.true_share * cfg.num_envs)
-    rows = {"mujoco": num_true, cfg.dynamics: cfg.num_envs - num_true}
+    num_mujoco = round(cfg.mujoco_fraction * cfg.num_envs)
+    sizes = {"mujoco": num_mujoco, cfg.dynamics: cfg.num_envs - num_mujoco}
     collectors = {
         dynamics: Collector(
             make_env(cfg.task, dynamics, num_envs, seed=cfg.seed),
@@ -88,15 +88,16 @@ def make_collectors(cfg: Config, agent: Agent) -> dict[str, Iterator[TensorDictB
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
-        for dynamics, num_envs in rows.items()
+        for dynamics, num_envs in sizes.items()
         if num_envs
     }
     return {dynamics: iter(collector) for dynamics, collector in collectors.items()}
 
 
-def transitions(batch: TensorDictBase, is_true: bool) -> TensorDictBase:
+def transitions(batch: TensorDictBase, is_mujoco: bool) -> TensorDictBase:
     """A batch ``[num_envs, horizon]`` as a buffer keeps it: flat, and marked."""
-    return batch.reshape(-1).set("is_true", torch.full((batch.numel(),), is_true))
+    marks = torch.full((batch.numel(),), is_mujoco)
+    return batch.reshape(-1).set("is_mujoco", marks)
 
 
 def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer]:
@@ -119,8 +120,8 @@ def main(cfg: Config) -> None:
     """Learn from both dynamics, measure in both."""
     torch.manual_seed(cfg.seed)
     agent, buffer = train(cfg)
-    share = buffer[torch.arange(len(buffer))]["is_true"].float().mean()
-    print(f"{len(buffer)} transitions, {share:.0%} of them MuJoCo's")
+    fraction = buffer[torch.arange(len(buffer))]["is_mujoco"].float().mean()
+    print(f"{len(buffer)} transitions, {fraction:.0%} of them MuJoCo's")
     returns = transfer(cfg.task, agent.actor, (cfg.dynamics,), cfg.episodes)
     print(transfer_table(returns))
 

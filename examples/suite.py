@@ -37,7 +37,7 @@ class Config:
     trajectories: int = 4000  # random ones of 100 steps each
     updates: int = 3000  # of the model
     frames: int = 600_000  # actions of the policy
-    num_envs: int = 256  # rows that it learns from together
+    num_envs: int = 256  # that it learns from together
     hold: int = 4  # control steps that an action is held
     episodes: int = 64  # of the report, in each dynamics
     seed: int = 0
@@ -45,7 +45,7 @@ class Config:
 
 
 def make_model(scene: Scene, cfg: Config, folder: Path) -> Path:
-    """Random trajectories of the true robot, and a network that learns from them."""
+    """Random trajectories in MuJoCo, and a network that learns from them."""
     data = DataConfig(trajectories=cfg.trajectories, steps=100, seed=cfg.seed)
     generate(scene, data, folder / "data")
     how = TrainConfig(
@@ -57,8 +57,8 @@ def make_model(scene: Scene, cfg: Config, folder: Path) -> Path:
         validate_every=max(500, cfg.updates // 3),
         seed=cfg.seed,
     )
-    rows = load_data(scene, folder / "data")
-    Trainer(scene, rows, scene, how, folder / "model", horizons=(20, 100)).run()
+    data = load_data(scene, folder / "data")
+    Trainer(scene, data, scene, how, folder / "model", horizons=(20, 100)).run()
     return folder / "model" / "best"
 
 

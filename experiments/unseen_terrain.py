@@ -86,7 +86,7 @@ class DoublePendulumOver(DoublePendulumPassive):
         self.build_scene = partial(double_pendulum_over, add_ground)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """``qpos`` and ``qvel (*batch, 2)`` as over planes, without a row's ground."""
+        """``qpos`` and ``qvel (*batch, 2)`` as over planes, without an env's ground."""
         state = super().initial_state(u)
         return {key: state[key] for key in (QPOS, QVEL)}
 

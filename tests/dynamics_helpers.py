@@ -29,7 +29,7 @@ from torchrl_nerd.dynamics import (
 from torchrl_nerd.dynamics.models import Inference
 from torchrl_nerd.dynamics.mujoco_warp import is_warp_installed
 from torchrl_nerd.envs.base import SceneEnv
-from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
+from torchrl_nerd.envs.streams import env_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
@@ -280,8 +280,8 @@ def random_actions(env: SceneEnv, steps: int, generator: Generator) -> Tensor:
 
 
 def row_uniforms(seed: int, episode: Tensor, count: int) -> Tensor:
-    """What the rows of an env with that seed draw at the start of these episodes."""
-    return uniforms(row_keys(seed, len(episode)), episode, stream_offsets(count))
+    """What the envs of one with that seed draw at the start of these episodes."""
+    return uniforms(env_keys(seed, len(episode)), episode, stream_offsets(count))
 
 
 def act(env: SceneEnv, action: Tensor) -> TensorDict:
@@ -301,7 +301,7 @@ def reset_rows(env: SceneEnv, rows: Tensor, state: TensorDict | None = None):
 
 
 def start_at(env: SceneEnv, state: TensorDict) -> TensorDict:
-    """All rows reset to ``state``."""
+    """All envs reset to ``state``."""
     return env.reset(state.clone(), set_state=True)
 
 

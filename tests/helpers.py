@@ -1,4 +1,4 @@
-"""Small robots made for a test, random true transitions, and robots moved elsewhere."""
+"""Small robots made for a test, random transitions of MuJoCo, moved robots."""
 
 import copy
 from collections.abc import Iterable
@@ -166,7 +166,7 @@ def in_ground(scene: Scene, rows: int, generator: Generator) -> TensorDict:
         state = {QPOS: drawn[QPOS], QVEL: drawn[QVEL]}
         scene.place_on_terrain(state, -depth)
         drawn[QPOS] = state[QPOS]
-    elif scene.terrain.is_per_row:
+    elif scene.terrain.is_per_env:
         gap = scene.clearances(drawn[QPOS], drawn[TERRAIN]).amin(-1)
         drawn[TERRAIN][:, 3] += gap + depth
     return drawn
@@ -310,7 +310,7 @@ def simulated(
 
 
 def varied_model(variation: Variation, parameters: Tensor) -> mujoco.MjModel:
-    """A model of its own for one row's parameters ``(size,)``."""
+    """A model of its own for one env's parameters ``(size,)``."""
     model = copy.copy(variation.model)
     for name, value in variation.fields(parameters.numpy()[None]).items():
         owner = model.opt if name.startswith("opt.") else model

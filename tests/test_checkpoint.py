@@ -212,7 +212,7 @@ def test_presets_are_those_of_the_shipped_models(name):
 @pytest.mark.parametrize("name", MADE_BY_MAKE)
 def test_so_are_make_targets_of_models_that_take_more(name):
     made = read_json(PRETRAINED / name / CARD)["training"]
-    assert made["init_from"] or made["device"] == "cuda"  # learned on, or wide
+    assert made["init_from"] or made["device"] == "cuda"  # continued, or paper-large
     preset = PRESETS[name.removesuffix("-mlp").removesuffix("-adaptive")]
     changes, trajectories = last_training(f"model-{name}")
     assert made["trajectories"] == trajectories

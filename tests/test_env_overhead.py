@@ -6,7 +6,7 @@ import pytest
 
 @pytest.mark.parametrize("task", ["cartpole/swingup", "ant/run"])
 def test_the_parts_are_shares_of_a_whole(task):
-    found = env_overhead.step_times(task, "nerd", rows=2, steps=3)
+    found = env_overhead.step_times(task, "nerd", num_envs=2, steps=3)
     assert 0.0 < found["dynamics_s"] < found["step_s"]
     for name in ("torchrl_share", "task_share"):
         assert 0.0 < found[name] < 1.0

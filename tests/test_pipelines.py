@@ -33,19 +33,24 @@ def example(monkeypatch, seed):
     return importlib.import_module
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_sac_learns_from_the_asked_share_of_true_transitions(example, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 1.0])
+def test_sac_learns_from_the_asked_fraction_of_mujoco(example, fraction):
     sac: ModuleType = example("sac")
     cfg = sac.Config(
-        true_share=share, frames=128, num_envs=8, horizon=4, updates=1, batch_size=16
+        mujoco_fraction=fraction,
+        frames=128,
+        num_envs=8,
+        horizon=4,
+        updates=1,
+        batch_size=16,
     )
     agent, buffer = sac.train(cfg)
     stored = buffer[torch.arange(len(buffer))]
     assert len(buffer) == cfg.frames
-    assert int(stored["is_true"].sum()) == share * cfg.frames
+    assert int(stored["is_mujoco"].sum()) == fraction * cfg.frames
     for name in ("mujoco", "nerd"):
-        rows = stored[stored["is_true"] == (name == "mujoco")]
-        assert not len(rows) or step_error(name, rows) < ROUNDING
+        own = stored[stored["is_mujoco"] == (name == "mujoco")]
+        assert not len(own) or step_error(name, own) < ROUNDING
     assert all(weight.isfinite().all() for weight in agent.loss.parameters())
 
 
@@ -82,12 +87,12 @@ def test_sac_lowers_its_critics_error(example):
 def test_dyna_branches_start_at_replayed_states(example):
     dyna = example("dyna")
     cfg = dyna.Config(frames=32, num_envs=4, horizon=4, branch=2, starts=8, updates=1)
-    agent, true, learned = dyna.train(cfg)
-    assert (len(true), len(learned)) == (32, 2 * 8 * 2)
-    true, learned = (b[torch.arange(len(b))] for b in (true, learned))
-    assert true["is_true"].all() and not learned["is_true"].any()
+    agent, exact, learned = dyna.train(cfg)
+    assert (len(exact), len(learned)) == (32, 2 * 8 * 2)
+    exact, learned = (b[torch.arange(len(b))] for b in (exact, learned))
+    assert exact["is_mujoco"].all() and not learned["is_mujoco"].any()
     starts = learned.reshape(-1, cfg.branch)[:, 0]
-    is_replayed = (starts["qpos"][:, None] == true["qpos"]).all(-1).any(-1)
+    is_replayed = (starts["qpos"][:, None] == exact["qpos"]).all(-1).any(-1)
     assert is_replayed.all()
     assert step_error("nerd", starts) < ROUNDING < step_error("mujoco", starts)
 
@@ -319,15 +324,15 @@ def test_rows_whose_episode_ended_begin_anew_and_the_others_go_on(example, seed)
 
 def test_no_row_points_the_batch_its_way(example, generator):
     """Rows sensitive to the initial state are shortened, others left alone to the bit."""
-    bound_rows = example("first_order").bound_rows
+    bound_gradients = example("first_order").bound_gradients
     gradient = torch.randn(65, 7, dtype=torch.float64, generator=generator)
     gradient /= gradient.norm(dim=-1, keepdim=True)
     gradient *= torch.linspace(0.5, 1.5, 65, dtype=torch.float64)[:, None]
-    assert torch.equal(bound_rows(gradient), gradient)
+    assert torch.equal(bound_gradients(gradient), gradient)
     wild = gradient.clone()
     wild[:4] *= torch.tensor([1e3, 1e30, 1e150, 20.0], dtype=torch.float64)[:, None]
     wild[4, 2], wild[5, 1] = torch.nan, torch.inf
-    found = bound_rows(wild)
+    found = bound_gradients(wild)
     assert found.isfinite().all() and torch.equal(found[6:], wild[6:])
     median = wild.nan_to_num(0.0, 0.0, 0.0).norm(dim=-1).median()
     assert (found.norm(dim=-1) < 4.0 * median * (1 + 1e-9)).all()

@@ -18,7 +18,7 @@ def ppo_rate(monkeypatch, seed):
 
 def test_every_dynamics_takes_its_turns(ppo_rate, capsys, seed):
     options = ppo_rate.Options(
-        tasks=("cartpole/swingup",), rounds=1, rows=2, compile=False, seed=seed
+        tasks=("cartpole/swingup",), rounds=1, num_envs=2, compile=False, seed=seed
     )
     found = ppo_rate.main(options)["cartpole/swingup"]
     assert set(found) == {"MuJoCo", "NeRD"} and found["MuJoCo"].ratio == 1.0

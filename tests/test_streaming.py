@@ -10,7 +10,7 @@ def test_a_row_for_every_preset(capsys, seed, tmp_path):
     options = streaming.Options(
         "cartpole",
         ("transformer-2x64",),
-        rows=2,
+        num_envs=2,
         rounds=1,
         compile=False,
         seed=seed,

@@ -24,8 +24,8 @@ class FeatureConfig:
     # contacts predicted along the motion that the robot has if nothing touches it, not at
     # constant velocity; see `PredictedPenetration`
     unconstrained_motion: bool = False
-    # the row's parameters, for a model of a varied scene that is told what others find in
-    # their history; see `Variation`
+    # the robot's parameters, for a model of a varied scene that is told what others
+    # find in their history; see `Variation`
     parameters: bool = False
     self_contact: bool = False  # of the robot with itself, see `SelfContactFeatures`
 
@@ -86,8 +86,8 @@ class TrainConfig:
     """Settings of a training: one-step targets first, then rollouts of the model.
 
     Raises:
-        SettingError: a number that is too small, or symmetry images of a hybrid, whose
-            analytic change has none.
+        SettingError: a number that is too small, or symmetry augmentation of a hybrid,
+            whose analytic change has no symmetric copies.
     """
 
     network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width
@@ -95,7 +95,7 @@ class TrainConfig:
     predicted_force: bool = False  # feature: contact forces by the penalty law
     # feature: contacts along the unconstrained motion in place of constant velocity
     unconstrained_motion: bool = False
-    parameters: bool = False  # feature: the row's parameters, of a varied scene
+    parameters: bool = False  # feature: the robot's parameters, of a varied scene
     self_contact: bool = False  # features of the robot's contacts with itself
     steps: int = 20_000  # updates on one-step targets
     rollout_steps: int = 2_000  # further updates on the model's own rollouts
@@ -194,8 +194,8 @@ class PPOConfig:
     """Proximal policy optimisation: Schulman et al., https://arxiv.org/abs/1707.06347."""
 
     total_frames: int = 3_000_000  # actions to learn from
-    num_envs: int = 1024  # rows stepped together
-    horizon: int = 32  # actions of every row between two updates
+    num_envs: int = 1024  # that step together
+    horizon: int = 32  # actions of every env between two updates
     epochs: int = 5  # passes over those actions
     minibatch: int = 2048  # actions per gradient
     lr: float = 3e-3  # Adam's step size at the start; falls linearly to zero

@@ -135,8 +135,8 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _begin(self, mask: np.ndarray) -> np.ndarray:
         """Begin episodes where the mask says; observations of all envs."""
-        rows = torch.from_numpy(mask.copy())[:, None].to(self.env.device)
-        fresh = self.env.reset(TensorDict({"_reset": rows}, self.env.batch_size))
+        is_reset = torch.from_numpy(mask.copy())[:, None].to(self.env.device)
+        fresh = self.env.reset(TensorDict({"_reset": is_reset}, self.env.batch_size))
         return _numpy(fresh[OBSERVATION])
 
     def step(

@@ -14,21 +14,22 @@ QVEL = "qvel"
 """Joint velocities ``(*batch, nv)``, m/s and rad/s, float64, MuJoCo's order."""
 
 TERRAIN = "terrain"
-"""Ground parameters of each row ``(*batch, scene.terrain.size)``, world frame, float64.
+"""Ground parameters of each env ``(*batch, scene.terrain.size)``, world frame, float64.
 Planes (unit normal, offset) with ``normal . x = offset``, see `Terrain`. Only where the
-ground varies from row to row."""
+ground varies from env to env."""
 
 GOAL = "goal"
-"""Where the hand should go ``(*batch, 3)``, m, world frame, float64; a task's row
-parameter, drawn at each reset."""
+"""Where the hand should go ``(*batch, 3)``, m, world frame, float64; each env
+draws its own at a reset."""
 
 TARGET = "target"
 """Where a task of the dm_control suite put its n targets ``(*batch, 3 n)``, m, in the
-frame of their bodies, float64; a task's row parameter, drawn at each reset."""
+frame of their bodies, float64; each env draws its own at a reset."""
 
 PARAMETERS = "parameters"
-"""Physical parameters of each row ``(*batch, variation.size)``, float64, see `Variation`.
-Only where they vary; the ground truth reads them, and models that are told."""
+"""Physical parameters of each env ``(*batch, variation.size)``, float64; see
+`Variation`. Only where they vary. The ground truth reads them, as do models that are
+told."""
 
 SENSORDATA = "sensordata"
 """What MuJoCo's sensors read during the last substep ``(*batch, nsensordata)``, float64.
@@ -96,5 +97,5 @@ TRUST = "trust"
 1: as 99% of its training data. Only in envs with a guard, see `GuardedDynamics`."""
 
 FAULT = "fault"
-"""Why a row ended that should not have ``(*batch, 1)``, int64, see `envs.faults`; 0: no
-fault."""
+"""Why an episode ended that should not have ``(*batch, 1)``, int64, see `envs.faults`;
+0: no fault."""

@@ -78,7 +78,7 @@ class MjxDynamics(Dynamics):
     kind = "ground truth"
 
     def __init__(self, scene: Scene) -> None:
-        if scene.terrain is not None and scene.terrain.is_per_row:
+        if scene.terrain is not None and scene.terrain.is_per_env:
             raise ValueError(f"MJX: no ground per env, which '{scene.name}' has")
         super().__init__(scene)
         self.advance = _advance(scene)

@@ -20,12 +20,12 @@ def items(setup: Setup) -> dict[str, Item]:
     network = setup.pick("paper-large", "transformer-2x64")
     sizes = setup.pick((512, 16384), (4,))
     return {
-        f"{network}, {size}": lambda size=size: look(network, size, setup)
+        f"{network}, {size}": lambda size=size: profile_step(network, size, setup)
         for size in sizes
     }
 
 
-def look(network: str, size: int, setup: Setup) -> dict[str, Any]:
+def profile_step(network: str, size: int, setup: Setup) -> dict[str, Any]:
     """Kernels of eager steps by time, and the roofline of the graph's."""
     scene, config = load_scene("ant"), network_config(network)
     assert isinstance(config, TransformerConfig)

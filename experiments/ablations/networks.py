@@ -32,7 +32,7 @@ class CellState:
     cell: Tensor
 
     def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool ``(num_rows,)``), others untouched."""
+        """Empty the history of ``rows`` (bool ``(rows,)``), others untouched."""
         self.hidden = torch.where(rows[:, None], 0.0, self.hidden)
         self.cell = torch.where(rows[:, None], 0.0, self.cell)
 

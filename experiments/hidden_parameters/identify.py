@@ -1,7 +1,7 @@
 """System identification: MuJoCo's parameters with the least one-step error on a history.
 
-`identify` fits all rows at once. `identify_by_mujoco` is MuJoCo's own toolbox, one row
-after the other, with the same residuals; ``pip install "mujoco[sysid]"``.
+`identify` fits all motions at once. `identify_by_mujoco` is MuJoCo's own toolbox, one
+motion after the other, with the same residuals; ``pip install "mujoco[sysid]"``.
 """
 
 import importlib
@@ -56,8 +56,8 @@ def residuals_of(scene: Scene, history: TensorDict, scale: Tensor) -> Residuals:
 def identify(scene: Scene, history: TensorDict) -> Tensor:
     """Parameters ``(rows, size)`` from ``[rows, T]``, from the middle of their ranges.
 
-    Levenberg-Marquardt with finite differences, all rows at once. Parameters stay within
-    their ranges.
+    Levenberg-Marquardt with finite differences, all motions at once. Parameters stay
+    within their ranges.
     """
     variation = _variation(scene)
     residuals = residuals_of(scene, history, scale_of(history))

@@ -27,7 +27,8 @@ class PoseEncoder(nn.Module):
     A weighted mean of the velocities between the last pose and each before it, plus what a
     small network adds. It sees them in the base frame, with gravity. At first the mean is
     the slope of the line of least squares through the window, and nothing is added. That
-    slope is of the window's middle: where all of it flies, the fall since then is added.
+    slope is of the window's middle. Where all of the window is airborne, the fall since
+    then is added.
 
     Args:
         scene: a single free body.
@@ -86,10 +87,10 @@ class PoseEncoder(nn.Module):
         change = self.network(seen.float()).double()
         size = change.new_tensor(REACH).repeat_interleave(3)
         velocity = self.weights @ speeds + size * change[:, :6]
-        flies = self.scene.clearances(window).amin((-2, -1)) > CLEAR
+        is_airborne = self.scene.clearances(window).amin((-2, -1)) > CLEAR
         gravity = torch.as_tensor(self.scene.model.opt.gravity).to(last)
         fall = 0.5 * self.span * self.scene.control_step * gravity
-        linear = rotate(quat, velocity[:, :3]) + flies[:, None] * fall
+        linear = rotate(quat, velocity[:, :3]) + is_airborne[:, None] * fall
         shift = SHIFT * change[:, 6:]
         return (
             integrate_pos(self.layout, last, shift),

@@ -40,7 +40,7 @@ def moved(scene, rows, stages=2, merged=1, outer=1, precision="float64"):
 
 
 def errors(scene, rows, stages=2, outer=1):
-    """Error of velocities and places, over the true change of velocity, of each row."""
+    """Error of velocities and places over the true change of velocity, per state."""
     qpos, qvel, _ = moved(scene, rows, stages, outer=outer)
     ground_truth = rows["next"]
     size = (ground_truth[QVEL] - rows[QVEL]).norm(dim=-1).clamp_min(1e-6)
@@ -55,7 +55,7 @@ def touching(scene, generator):
 
 
 def air(scene, generator):
-    """Rows that neither ground nor limits push."""
+    """States that neither ground nor limits push."""
     rows = random_transitions(scene, ROWS, generator)
     if scene.base.is_floating:
         rows[QPOS][:, 2] += 3.0
@@ -85,7 +85,7 @@ def test_one_substep_is_mujocos_as_its_constraints_get_soft(scene, stages, gener
         fast, slip = errors(one, mujoco_step(one, rows, torque), stages)
         assert fast.median() < 20.0 * impedance and slip.median() < 20.0 * impedance
         found.append(fast.median())
-    assert found[1] < 0.3 * found[0]  # a tenth, but for rows that lose touch
+    assert found[1] < 0.3 * found[0]  # a tenth, but for states that lose touch
 
 
 @each_on_ground

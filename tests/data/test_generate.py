@@ -1,4 +1,4 @@
-"""Data sets: true transitions in TorchRL's layout, the same bits for the same seed."""
+"""Data sets: MuJoCo's transitions in TorchRL's layout, the same bits for one seed."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_layout_is_torchrls(scene, tmp_path, seed):
     model = scene.model
     widths = {"qpos": model.nq, "qvel": model.nv, ("next", "qpos"): model.nq}
     widths |= {("next", "qvel"): model.nv, ("next", "joint_torque"): model.nu}
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    if scene.terrain is not None and scene.terrain.is_per_env:
         widths["terrain"] = scene.terrain.size
     assert data.batch_size == (7, 5)
     assert {k: data[k].shape for k in data.keys(True, True)} == {
@@ -84,7 +84,7 @@ def test_every_transition_obeys_the_mujoco_dynamics(scene, generator):
     for key in STATE:
         expected, got = again["next", key], every["next", key]
         torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-6)
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    if scene.terrain is not None and scene.terrain.is_per_env:
         assert torch.equal(data["terrain"], data["terrain"][:, :1].expand(-1, 6, -1))
 
 
@@ -220,7 +220,7 @@ def test_many_dropped_trajectories_are_refused_by_name(scene, generator):
 RANGES = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4), "delay": (0, 2)}
 
 
-def test_varied_data_are_steps_of_each_rows_own_robot(tmp_path, seed):
+def test_varied_data_are_steps_of_each_trajectorys_own_robot(tmp_path, seed):
     scene = SCENE.vary(RANGES)
     config = DataConfig(trajectories=9, steps=20, seed=seed)
     data = load_data(scene, generate(scene, config, tmp_path, quiet=True))

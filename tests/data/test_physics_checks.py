@@ -143,7 +143,7 @@ def test_lost_frames_are_found(log, real_cube, generator, count):
     if count > 1:  # one frame of an impact: poses alone do not tell
         corrupted.append(changed(corrupted[0], linear=NONE, angular=NONE))
     for wrong in corrupted:
-        with pytest.raises(ValueError, match="lost, before row"):
+        with pytest.raises(ValueError, match="lost, before frame"):
             check_log(wrong, real_cube)
 
 

@@ -90,11 +90,11 @@ def test_a_set_begun_here_is_finished_by_ray(
 
 
 def test_results_come_in_order_and_threads_are_one(cluster):
-    def look(item: int) -> tuple[int, int]:
+    def visit(item: int) -> tuple[int, int]:
         return item, MujocoDynamics(SCENE).num_threads
 
-    assert list(ray_map(look, range(7))) == [(item, 1) for item in range(7)]
-    assert list(ray_map(look, [])) == []
+    assert list(ray_map(visit, range(7))) == [(item, 1) for item in range(7)]
+    assert list(ray_map(visit, [])) == []
 
 
 def test_what_goes_wrong_in_a_worker_is_said_here(cluster):

@@ -26,7 +26,7 @@ def write_csv(path, header, *columns):
 
 
 def numbers(log):
-    """The trajectory of every row, as a column."""
+    """The trajectory of every frame, as a column."""
     return log.trajectory_of(torch.arange(len(log.qpos)))[:, None]
 
 
@@ -107,14 +107,14 @@ def test_selected_tosses_are_those_asked_for(recording, generator):
 def test_flight_goes_on_as_gravity_says(recording, real_cube):
     """Half a frame of gravity makes a recorded velocity that of its pose's time."""
     data = recording.transitions()
-    flies = (real_cube.clearances(data["qpos"]).amin(-1) > 0.02) & (
+    is_airborne = (real_cube.clearances(data["qpos"]).amin(-1) > 0.02) & (
         real_cube.clearances(data["next", "qpos"]).amin(-1) > 0.02
     )
     frame = recording.frame
     fall = 0.5 * frame**2 * free_fall(recording)
     ahead = data["qpos"][:, :3] + frame * data["qvel"][:, :3] + fall
-    apart = (ahead - data["next", "qpos"][:, :3])[flies]
-    assert flies.sum() > 50
+    apart = (ahead - data["next", "qpos"][:, :3])[is_airborne]
+    assert is_airborne.sum() > 50
     assert apart.abs().median() < 5e-5  # m; without it 2e-4 along z
 
 

@@ -149,7 +149,7 @@ def test_torques_keep_as_long_as_asked_and_stay_uniform(scene, generator):
         assert abs(found - rho) < 0.08
 
 
-def test_each_row_has_a_correlation_time_of_its_own(generator):
+def test_each_trajectory_has_a_correlation_time_of_its_own(generator):
     scene = load_scene("cartpole")
     sampling = replace(scene.sampling, correlation_time=(1e-3, 1e3))
     one = torch.ones(2000, 1, dtype=torch.float64)

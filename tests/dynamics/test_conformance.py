@@ -25,7 +25,7 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import SCENES, load_scene
 
 ROWS, STEPS = 6, 4
-PER_ENV = [s for s in map(load_scene, SCENES) if s.terrain and s.terrain.is_per_row]
+PER_ENV = [s for s in map(load_scene, SCENES) if s.terrain and s.terrain.is_per_env]
 
 
 def rows_of(rows, state, torques, terrain):

@@ -62,7 +62,7 @@ def test_a_row_goes_on_from_its_history_and_in_a_copy(scene, generator):
     """A step that is taken back leaves no trace; a history can be restored again."""
     start, torques, terrain = random_drive(scene, ROWS, STEPS, generator)
     expected = roll(DMControlDynamics(scene), start, torques, terrain)
-    dynamics, half, all_rows = (
+    dynamics, half, all_envs = (
         DMControlDynamics(scene),
         STEPS // 2,
         torch.ones(ROWS) > 0,
@@ -71,7 +71,7 @@ def test_a_row_goes_on_from_its_history_and_in_a_copy(scene, generator):
     past, copied = dynamics.history(), pickle.loads(pickle.dumps(dynamics))
     for _ in range(2):
         roll(dynamics, now, -0.5 * torques[half:], terrain)
-        dynamics.restore(past, all_rows)
+        dynamics.restore(past, all_envs)
     for other in (dynamics, copied):
         found = roll(other, now, torques[half:], terrain)
         for key in ("qpos", "qvel"):

@@ -69,9 +69,9 @@ def test_a_row_goes_back_to_the_model_once_it_has_calmed_down(scene, generator):
     rows = is_wild & (fresh["trust"][:, 0] == 1.0)
     for dynamics in (guarded, learned):
         dynamics.step(state, torque, terrain)
-    for is_true in (True, True, False):  # two trusted steps, then the model
+    for is_ground_truth in (True, True, False):  # two trusted steps, then the model
         after, mine = (d.step(calm, torque, terrain) for d in (guarded, learned))
-        expected = true if is_true else mine
+        expected = true if is_ground_truth else mine
         assert torch.equal(after["qvel"][rows], expected["qvel"][rows])
     guarded.step(state, torque, terrain)
     guarded.reset(calm, is_wild)  # a fresh row owes nothing to the one before

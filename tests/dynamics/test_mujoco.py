@@ -1,4 +1,4 @@
-"""The batched rollout is a plain loop of mj_step, one MjData per row."""
+"""The batched rollout is a plain loop of mj_step, one MjData per env."""
 
 import copy
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ ROWS, STEPS = 16, 8
 def plain_loop(
     scene: Scene, start: TensorDict, torques: Tensor, plane: Tensor | None = None
 ) -> Iterator[mujoco.MjData]:
-    """MuJoCo's own data of one row after each control step."""
+    """MuJoCo's own data of one env after each control step."""
     model = copy.copy(scene.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     data = mujoco.MjData(model)
@@ -120,7 +120,7 @@ def test_numbers_that_do_not_fit_are_refused(scene, generator):
     torques = torques.transpose(0, 1)
     some = None if terrain is None else terrain[:1]
     with pytest.raises(ValueError, match="expected joint_torque of shape"):
-        MujocoDynamics(scene).rollout(start[:1], torques, some)  # not for all rows
+        MujocoDynamics(scene).rollout(start[:1], torques, some)  # not for all envs
     with pytest.raises(ValueError, match="num_threads, a whole number of at least 1"):
         MujocoDynamics(scene, num_threads=0)
 

@@ -35,7 +35,7 @@ def window(env: SceneEnv, gain: torch.Tensor, start) -> torch.Tensor:
 
 @pytest.mark.parametrize("goes_on", [True, False])
 def test_windows_follow_on_each_other(env, goes_on, generator):
-    """A reset of all rows leaves no graph behind, wherever it starts."""
+    """A reset of all envs leaves no graph behind, wherever it starts."""
     gain = torch.randn(4, 1, generator=generator).requires_grad_()
     start = env.reset()
     for _ in range(3):

@@ -52,7 +52,7 @@ def test_a_reset_row_is_like_one_in_a_fresh_env(task_id, dynamics, generator):
 
 @each_dynamics
 def test_the_age_of_a_row_is_its_own(task_id, dynamics, generator):
-    """Truncation counts from each row's own reset."""
+    """Truncation counts from each env's own reset."""
     horizon = 5
     env = EnvMaker(task_id, dynamics, generator, horizon)(2)
     later = int(torch.randint(1, horizon, (), generator=generator))

@@ -26,7 +26,7 @@ class Replay:
     def __init__(self, scene, recording):
         self.scene, self.recording = scene, recording
 
-    def reset(self, state, rows=None):
+    def reset(self, state, is_reset=None):
         pass
 
     def step(self, state, joint_torque, terrain=None, ctrl=None):

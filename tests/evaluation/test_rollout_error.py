@@ -141,13 +141,13 @@ def test_summaries_by_hand(rng):
     scene, rows = load_scene("cartpole"), int(rng.integers(2, 90))
     error = rng.exponential(size=(rows, 7))
     summary = summarize(scene, {"slider": torch.from_numpy(error)})["slider"]
-    per_row = error.mean(1)
+    per_trajectory = error.mean(1)
     assert summary.unit == "m"
     assert summary.mean == pytest.approx(error.mean())
-    half = 1.96 * np.std(per_row, ddof=1) / np.sqrt(rows)
+    half = 1.96 * np.std(per_trajectory, ddof=1) / np.sqrt(rows)
     assert summary.interval == pytest.approx(half)
     assert summary.final == pytest.approx(error[:, -1].mean())
-    assert summary.p95 == pytest.approx(np.quantile(per_row, 0.95))
+    assert summary.p95 == pytest.approx(np.quantile(per_trajectory, 0.95))
 
 
 def test_non_finite_errors_stay_visible(rng):

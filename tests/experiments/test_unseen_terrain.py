@@ -21,7 +21,7 @@ each_case = pytest.mark.parametrize("case", CASES)
 def test_only_the_ground_differs(case):
     scene, trained = CASES[case].scene, load_scene("double_pendulum")
     assert scene.robot_hash == trained.robot_hash and scene.hash != trained.hash
-    assert not scene.terrain.is_per_row
+    assert not scene.terrain.is_per_env
     links = [scene.model.geom(name).id for name in ("link1", "link2")]
     others = [trained.model.geom(name).id for name in ("link1", "link2")]
     for field in ("geom_solref", "geom_solimp", "geom_friction", "geom_priority"):

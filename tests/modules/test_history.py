@@ -1,4 +1,4 @@
-"""Window mode runs a network on each row's last h tokens, no more and no fewer."""
+"""Window mode runs a network on each env's last h tokens, no more and no fewer."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def stream(network: nn.Module, tokens: Tensor, resets: Tensor) -> Tensor:
 
 
 def recompute(window: WindowNetwork, tokens: Tensor, resets: Tensor) -> Tensor:
-    """The definition: for each row and step, the network on the tokens it may see."""
+    """The definition: for each env and step, the network on the tokens it may see."""
     outputs = torch.empty(*tokens.shape[:2], OUTPUTS, dtype=tokens.dtype)
     for row in range(len(tokens)):
         start = 0

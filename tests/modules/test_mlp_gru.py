@@ -1,4 +1,4 @@
-"""MLP and GRU speak the transformer's language: sequences, steps, a memory per row."""
+"""MLP and GRU speak the transformer's language: sequences, steps, a memory per env."""
 
 import pytest
 import torch
@@ -86,7 +86,7 @@ def test_gradients_through_stepping_equal_the_full_sequence(config, generator):
 
 
 @pytest.mark.parametrize("name", ["mlp-4x64", "gru"])
-def test_only_the_gru_remembers(name, generator):
+def test_only_the_gru_has_a_history(name, generator):
     network = build(CONFIGS[name], generator)
     tokens = randn(generator, ROWS, STEPS, INPUTS)
     changed = tokens.clone()

@@ -50,7 +50,7 @@ def stream(network: nn.Module, tokens: Tensor, resets: Tensor | None = None) -> 
 
 
 def episodes(network: nn.Module, tokens: Tensor, resets: Tensor) -> Tensor:
-    """Every episode of every row as one full sequence of its own."""
+    """Every episode of every env as one full sequence of its own."""
     outputs = []
     for row, starts in zip(tokens, resets, strict=True):
         cuts = [0, *starts[1:].nonzero()[:, 0].add(1).tolist(), len(row)]

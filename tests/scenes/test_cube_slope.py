@@ -1,4 +1,4 @@
-"""A plane per row: as steep as said, as far below, and the ground that MuJoCo steps on."""
+"""A plane per env: as steep as said, as far below, and the ground MuJoCo steps on."""
 
 import copy
 from dataclasses import replace

@@ -288,7 +288,7 @@ def test_random_trajectories_stay_sound(name, generator):
 
 
 def test_servos_are_driven_by_random_controls(servos, generator):
-    """Uniform about the middle of their ranges, as far from it as the row's scale."""
+    """Uniform about the middle of their ranges, as far from it as the state's scale."""
     low, high = torch.from_numpy(servos.model.actuator_ctrlrange.copy()).T
     is_free = servos.model.actuator_ctrllimited == 0
     low[is_free], high[is_free] = -1.0, 1.0
@@ -429,7 +429,7 @@ def test_files_that_do_not_compile_are_refused_in_one_sentence(tmp_path):
         Scene.from_mjcf(write(tmp_path, BODY), control_step=0.003)
 
 
-def test_a_ground_per_row_needs_somebody_to_draw_it(tmp_path):
+def test_a_ground_per_env_needs_somebody_to_draw_it(tmp_path):
     world = '<body mocap="true"><geom type="plane" size="1 1 1"/></body>'
     world += (
         '<body pos="0 0 1"><joint name="a"/><geom size="0.1" pos="0.3 0 0"/></body>'
@@ -441,7 +441,7 @@ def test_a_ground_per_row_needs_somebody_to_draw_it(tmp_path):
     def level(qpos, generator):
         return torch.tensor([0.0, 0.0, 1.0, 0.0]).double().expand(len(qpos), 4)
 
-    assert Scene.from_mjcf(path, ground=level).terrain.is_per_row
+    assert Scene.from_mjcf(path, ground=level).terrain.is_per_env
 
 
 @pytest.mark.parametrize("control_step", [float("nan"), float("inf"), 0, -0.02, "a"])

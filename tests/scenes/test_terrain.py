@@ -82,7 +82,7 @@ def test_the_mocap_body_takes_the_shortest_turn(generator):
 
 def test_the_files_plane_is_the_default():
     scene = load_scene("double_pendulum")
-    assert scene.terrain.is_per_row
+    assert scene.terrain.is_per_env
     np.testing.assert_allclose(scene.terrain.default, (0.0, 0.0, 1.0, 0.0))
     xml = """<mujoco><worldbody><body pos="1 2 3" quat="0.9 0.2 0.1 0.3">
       <geom type="plane" size="0 0 1" pos="0.1 0.2 0.3" quat="0.5 0.5 -0.2 0.1"/></body>
@@ -94,7 +94,7 @@ def test_the_files_plane_is_the_default():
     normal, offset = terrain.fixed_plane[:3], terrain.fixed_plane[3]
     np.testing.assert_allclose(normal, data.geom_xmat[0].reshape(3, 3)[:, 2])
     np.testing.assert_allclose(offset, normal @ data.geom_xpos[0])
-    assert not terrain.is_per_row and terrain.size == 0 and not len(terrain.default)
+    assert not terrain.is_per_env and terrain.size == 0 and not len(terrain.default)
 
 
 @pytest.mark.parametrize("number", range(7))

@@ -1,4 +1,4 @@
-"""Ground of several surfaces, fixed and per row, against MuJoCo's own distances."""
+"""Ground of several surfaces, fixed and per env, against MuJoCo's own distances."""
 
 import copy
 from dataclasses import replace
@@ -61,7 +61,7 @@ def random_terrain(scene, rows, generator):
 
 
 def place(scene, data, qpos, terrain):
-    """MuJoCo's data with the robot and the row's ground where they should be."""
+    """MuJoCo's data with the robot and the env's ground where they should be."""
     pose, count = scene.terrain.mocap_pose(terrain).numpy(), 3 * scene.model.nmocap
     data.qpos = qpos.numpy()
     if count:

@@ -14,7 +14,7 @@ PI = np.pi
 
 
 def random_state(task, generator, rows: int = ROWS) -> TensorDict:
-    """States of the scene's training ranges, with the task's row parameters."""
+    """States of the scene's training ranges, with the task's own parameters."""
     state, _, _ = random_drive(task.scene, rows, 1, generator)
     drawn = task.initial_state(uniforms(task, generator, rows))
     return state.update({key: drawn[key] for key in task.parameters})

@@ -25,10 +25,16 @@ SKIPPED = (
     *("results/*", "docs/figures/*", "docs/glossary.md", "*.safetensors", "typings/*"),
 )
 
+IS_TRUE = r"(is|num)_true|true[-_ ](share|transitions)"
+FORCES = r"(?-i:push|drag|gain) =(?!=)"
+ROWS = r"per[ _]row|row to row|rows? of envs?|(every|each|all) rows?(?! of)"
+ROW_NAMES = r"(row_keys|bound_rows|num_rows)|rows (stepped|that it learns)"
+
 WORDS = {
     # what steps the state
     r"(?<!ground )(?<!ground-)truths?": "ground truth",
     r"true (dynamics|physics|solver|steps?|engine|motion)|(?-i:true) env": "ground truth",
+    IS_TRUE: "is_mujoco, mujoco_fraction",
     r"teachers?": "reference solver",
     r"networks? alone": "learned model",
     r"free motion": "unconstrained motion",
@@ -46,7 +52,10 @@ WORDS = {
     r"foresees?|foreseen|foresight|foreseeing|coming depth": "predicted",
     r"flight bypass|flight shortcut": "contact-free bypass",
     r"untold( pushes)?|expect none": "unsupported forces, check_supported",
-    r"set down|the mount": "place_on_terrain, base frame",
+    r"set down|(the|self) mount|mount quat": "place_on_terrain, base frame",
+    FORCES: "normal_force, friction_force, velocity_change",
+    r"flies(?! (off|up))": "is_airborne, off the ground",
+    r"def look(?! up)": "dynamics evaluation, profile_step",
     r"has simulator": "kind",
     # data and training
     r"nudged?|nudges": "perturbed, settled",
@@ -55,15 +64,21 @@ WORDS = {
     r"lr other|rollout lr(?! ratio)|rollout rounds|softening": "training settings",
     r"legs? of training|two legs$|learn on": "stage, continue training",
     r"telling rows?|mirror images": "hard examples, symmetry augmentation",
+    r"symmetry s? ?images?": "symmetry augmentation, symmetric copies",
+    r"images? of (the )?(step|samples?|states?|tokens?|positions|velocities)": (
+        "symmetric copies"
+    ),
     r"recipes?": "training preset",
     r"(mlp|transformer|grounded|free|residual) (tiny|wide|small|larger|fine|halves)": (
         "kind and size"
     ),
     # envs, evaluation, command line
+    ROWS: "env, trajectory, sample, frame",
+    ROW_NAMES: "num_envs, is_reset",
     r"coverage": "TrainingRange, OODScore",
     r"(training |its |the )box": "training range",
     r"fault folder": "dump_dir",
-    r"(policy|it) remembers|recalls?": "frame_stack",
+    r"remembers?|remembered|recalls?": "history, frame_stack",
     r"steps per action": "frame_skip",
     r"races?|contenders?": "benchmark, candidate",
     r"chaos( floor)?": "sensitivity to initial state",
@@ -78,7 +93,7 @@ WORDS = {
 }
 """Left column of the glossary as a regular expression, and what to write instead."""
 
-RAW = {r"ground [1-6]"}
+RAW = {r"ground [1-6]", IS_TRUE, FORCES, ROWS, ROW_NAMES}
 """Words that are looked for in the line as it is, with its punctuation."""
 
 ALLOWED = {
@@ -91,6 +106,12 @@ ALLOWED = {
         "benchmarks/draw_benchmarks.py",
         "tests/test_docs.py",
     ),
+    FORCES: (
+        "tests/*",
+        "experiments/hidden_parameters/identify.py",
+        "torchrl_nerd/evaluation/policy.py",
+    ),
+    ROWS: ("docs/evaluation.md", "tests/geometry/*"),  # of tables and of matrices
     r"(not )?met": ("*.json", "tests/data/tosses_excerpt.md"),
 }
 """Files in which a word is used in another meaning."""

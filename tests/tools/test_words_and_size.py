@@ -16,6 +16,14 @@ from tools.size import LONGEST, ROOT, count_comments, measure
         "num_looks = 2",
         "--own-actions",
         "Coverage.distance",
+        "planes that differ from row to row",
+        "def is_per_row(self):",
+        "symmetry images of a hybrid",
+        "            drag = friction_force(slip)",
+        "self.mount = 1",
+        "true_share: float = 0.25",
+        "def look(network, size):",
+        "the tokens that a network remembers",
     ],
 )
 def test_a_replaced_word_is_found(line):
@@ -31,6 +39,10 @@ def test_a_replaced_word_is_found(line):
         "rollout_lr_ratio: float = 1.0",
         "a method, metrics and a metre",
         "gaps to the ground",
+        "every row of a table, and each row of the matrix",
+        "images of a camera",
+        "gain == AFFINE, and is True",
+        "look_up('network', kind, NETWORKS)",
     ],
 )
 def test_other_words_are_not(line):

@@ -57,7 +57,7 @@ def move_to_meta(trainer: Trainer) -> None:
 @pytest.mark.parametrize("name", slow_but(("cartpole", "ant"), SCENES))
 @pytest.mark.parametrize("network", slow_but(NETWORKS[:1], NETWORKS))
 def test_updates_read_nothing(name, network, meta, tmp_path):  # noqa: F811
-    """One of each kind; symmetry images where a robot has them."""
+    """One of each kind; symmetry augmentation where a robot has symmetries."""
     is_symmetric = name == "ant"
     config = replace(CONFIG, network=network, use_symmetry=is_symmetric)
     trainer = make_trainer(name, config, tmp_path)

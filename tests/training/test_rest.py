@@ -12,7 +12,13 @@ from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import SCENES
-from torchrl_nerd.training.rest import MAX_SPEED, REST_SPEED, ROWS, find_rest, resting
+from torchrl_nerd.training.rest import (
+    MAX_SPEED,
+    MAX_STATES,
+    REST_SPEED,
+    find_rest,
+    resting,
+)
 
 ON_GROUND = [name for name in SCENES if load_scene(name).terrain is not None]
 each_on_ground = pytest.mark.parametrize("name", ON_GROUND)
@@ -108,7 +114,7 @@ def test_states_at_rest_are_found(generator):
         {QVEL: speed, ("next", QVEL): speed.roll(-1, 1)}, batch_size=[rows, steps]
     )
     found = resting(data)
-    assert 0 < len(found) <= ROWS
+    assert 0 < len(found) <= MAX_STATES
     for key in (QVEL, ("next", QVEL)):
         assert (found[key] < REST_SPEED).all()
     assert len(resting(data[:, :0])) == 0

@@ -115,7 +115,7 @@ def test_other_networks_and_kinds_are_refused(generator):
         begin_from(hybrid, CARTPOLE, replace(CONFIG, network=name))
 
 
-def test_symmetry_needs_statistics_that_images_share(generator):
+def test_symmetry_needs_statistics_that_copies_share(generator):
     scene, network = load_scene("ant"), NETWORKS["mlp-1x16"]
     data = simulate(scene, 64, 4, generator)
     data = data[is_sound(data)]
@@ -124,7 +124,7 @@ def test_symmetry_needs_statistics_that_images_share(generator):
     begin_from(shared, scene, MLP, symmetry)
     alone = NeRD(scene, NO_PREDICTIONS, network, stats)
     begin_from(alone, scene, MLP)
-    with pytest.raises(ValueError, match="trained on symmetry images"):
+    with pytest.raises(ValueError, match="trained with use_symmetry"):
         begin_from(alone, scene, MLP, symmetry)
 
 

@@ -48,15 +48,15 @@ def data(scene, generator):
     return data[is_sound(data)]
 
 
-def test_the_image_of_a_trajectory_is_the_trajectory_of_the_image(scene, data):
+def test_a_copy_of_a_trajectory_is_the_trajectory_of_the_copy(scene, data):
     """Whole rollouts of the MuJoCo solver, impacts included."""
     steps, start = 10, data[:, 0]
     torque = data[JOINT_TORQUE][:, :steps]
     dynamics = MujocoDynamics(scene, num_threads=1)
     for isometry in find_isometries(scene):
-        image = isometry(start)
-        dynamics.reset(image)
-        path = dynamics.rollout(image, isometry.torque(torque))
+        mirrored = isometry(start)
+        dynamics.reset(mirrored)
+        path = dynamics.rollout(mirrored, isometry.torque(torque))
         expected = isometry.qpos(data[NEXT_QPOS][:, :steps])
         assert _apart(path[QPOS], expected).median() < 1e-9
         assert _apart(path[QPOS], expected).max() < 1e-3  # sensitive, in contact
@@ -73,11 +73,11 @@ def test_the_group_is_closed_and_has_inverses(scene, data):
     """Every product of two is one of them again."""
     state = data[:, 0]
     group = find_isometries(scene)
-    images = [isometry(state) for isometry in group]
+    copies = [isometry(state) for isometry in group]
     for first in group[:8]:
         for second in group[-8:]:
             twice = second(first(state))
-            gaps = [_apart(twice[QPOS], image[QPOS]).max() for image in images]
+            gaps = [_apart(twice[QPOS], mirrored[QPOS]).max() for mirrored in copies]
             assert min(gaps) < 1e-9
 
 
@@ -90,17 +90,17 @@ def test_tokens_and_targets_are_renumbered(scene, data):
         there = raw_tokens(*encode, isometry(flat))
         choice = torch.full((len(flat),), number)
         both = symmetry.tokens, symmetry.targets
-        for images, x, expected in zip(both, here, there, strict=True):
-            image = images(x[:, None], choice)[:, 0]
-            torch.testing.assert_close(image, expected, rtol=1e-6, atol=1e-6)
+        for copies, x, expected in zip(both, here, there, strict=True):
+            mirrored = copies(x[:, None], choice)[:, 0]
+            torch.testing.assert_close(mirrored, expected, rtol=1e-6, atol=1e-6)
 
 
-def test_statistics_are_those_of_all_images(scene, data):
+def test_statistics_are_those_of_all_copies(scene, data):
     """So that normalised vectors are renumbered as raw ones are."""
     symmetry = Symmetry(scene)
     found = symmetry.complete(data_stats(scene, data))
-    images = [isometry(data) for isometry in symmetry.isometries]
-    expected = data_stats(scene, torch.cat(images))
+    copies = [isometry(data) for isometry in symmetry.isometries]
+    expected = data_stats(scene, torch.cat(copies))
     for key, own in ((TOKEN, symmetry.tokens), (TARGET, symmetry.targets)):
         assert found[key].count == expected[key].count
         torch.testing.assert_close(
@@ -115,7 +115,7 @@ def test_statistics_are_those_of_all_images(scene, data):
             torch.testing.assert_close(std, std[source], atol=1e-12, rtol=1e-9)
 
 
-def test_batches_show_images_of_the_data(scene, data, generator):
+def test_batches_show_symmetric_copies_of_the_data(scene, data, generator):
     """Those of one step and those of rollouts, which the MuJoCo solver also takes."""
     symmetry = Symmetry(scene)
     model = NeRD(
@@ -139,12 +139,12 @@ def test_batches_show_images_of_the_data(scene, data, generator):
 
 def test_what_is_no_symmetry_is_refused():
     x = torch.randn(20, 3).double()
-    with pytest.raises(ValueError, match="entry 1 of the image"):
+    with pytest.raises(ValueError, match="entry 1 of a copy"):
         SignedPermutations(x, [x * torch.tensor([1.0, 2.0, 1.0])])
     swapped = torch.stack((x[:, 1], -x[:, 0], x[:, 2]), -1)
-    images = SignedPermutations(x, [x, swapped])
-    assert images.sources.tolist() == [[0, 1, 2], [1, 0, 2]]
-    assert images.signs.tolist() == [[1, 1, 1], [1, -1, 1]]
+    copies = SignedPermutations(x, [x, swapped])
+    assert copies.sources.tolist() == [[0, 1, 2], [1, 0, 2]]
+    assert copies.signs.tolist() == [[1, 1, 1], [1, -1, 1]]
 
 
 @pytest.mark.slow

@@ -258,7 +258,7 @@ def test_step_sizes_rise_and_fall_to_zero_in_both_phases(tmp_path):
 def test_a_share_of_an_update_is_one_at_that_share_of_the_learning_rate(
     ratio, generator
 ):
-    """In both optimizers, and with what they remember of earlier gradients."""
+    """In both optimizers, and with their averages of earlier gradients."""
     start = torch.randn(6, 4, generator=generator)
     grads = torch.randn(3, 6, 4, generator=generator)
     ends = []

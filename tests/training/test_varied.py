@@ -122,7 +122,7 @@ def test_rollouts_are_of_one_robot_where_robots_change(length, generator):
     assert none is None and change_times(data.exclude(PARAMETERS)) is None
 
 
-def test_symmetry_images_of_varied_robots_are_refused(data, tmp_path):
+def test_symmetry_augmentation_of_varied_robots_are_refused(data, tmp_path):
     config = TrainConfig(use_symmetry=True)
     with pytest.raises(ValueError, match="varied scene without use_symmetry"):
         Trainer(SCENE, data, SCENE, config, tmp_path)

@@ -74,7 +74,7 @@ def mujoco_contacts(scene, row):
 
 def is_raisable(scene):
     return not scene.base.others and (
-        scene.terrain.is_per_row or scene.base.is_floating
+        scene.terrain.is_per_env or scene.base.is_floating
     )
 
 
@@ -91,7 +91,7 @@ def near_ground(scene, generator):
 def raised(scene, rows, height):
     """The ground lowered by ``height (rows,)``, or the robot raised by it."""
     rows = rows.clone()
-    if scene.terrain.is_per_row:
+    if scene.terrain.is_per_env:
         rows[TERRAIN][:, 3] -= height
     else:
         rows[QPOS][:, scene.base.qpos_address + 2] += height

@@ -44,7 +44,7 @@ def mujoco_force(scene, rows):
     for row in rows:
         mujoco.mj_resetData(model, data)
         data.qpos, data.qvel = row[QPOS].numpy(), row[QVEL].numpy()
-        if scene.terrain.is_per_row:
+        if scene.terrain.is_per_env:
             pose = scene.terrain.mocap_pose(row[TERRAIN]).reshape(-1, 7).numpy()
             data.mocap_pos, data.mocap_quat = pose[:, :3], pose[:, 3:]
         mujoco.mj_forward(model, data)

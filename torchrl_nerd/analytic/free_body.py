@@ -21,7 +21,7 @@ from torchrl_nerd.geometry.rotations import (
     quat_multiply,
     quat_normalize,
 )
-from torchrl_nerd.scenes.penalty_law import PenaltyLaw, friction_force, normal_force
+from torchrl_nerd.scenes import penalty_law
 from torchrl_nerd.scenes.scene import Scene
 
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
@@ -81,7 +81,7 @@ class FreeBodyPenaltyStep(AnalyticStep):
                 f"expected a single free body on a ground, got scene '{scene.name}'"
             )
         body = int(model.jnt_bodyid[0])
-        law = PenaltyLaw.of_bodies(model, [body])
+        law = penalty_law.PenaltyLaw.of_bodies(model, [body])
         contact = law.friction, law.stiffness, law.damping, law.slip
         self.num_substeps = num_substeps
         self.step_size = scene.control_step / num_substeps
@@ -158,13 +158,15 @@ class FreeBodyPenaltyStep(AnalyticStep):
             rising = (moving @ up[:, :, None])[..., 0]
             sliding = moving - rising[..., None] * up[:, None]  # (N, P, 3)
             speed = (sliding.square().sum(-1) + MIN_SLIP**2).sqrt()
-            normal = normal_force(spring, damper, depth, rising)
-            faded = mu / (1.0 + fading * normal)
-            drag = friction_force(slip, faded, normal, speed) / speed
-            force = normal[..., None] * up[:, None] - drag[..., None] * sliding
-            push = (rotation @ force.sum(1)[..., None])[..., 0]
+            normal_force = penalty_law.normal_force(spring, damper, depth, rising)
+            faded = mu / (1.0 + fading * normal_force)
+            stick = slip, faded
+            friction_force = penalty_law.friction_force(*stick, normal_force, speed)
+            per_slip = (friction_force / speed)[..., None]
+            force = normal_force[..., None] * up[:, None] - per_slip * sliding
+            total_force = (rotation @ force.sum(1)[..., None])[..., 0]
             moment = force.flatten(1) @ cross
-            change = torch.cat(((h / self.mass) * push, h * moment / inertia), 1)
+            change = torch.cat(((h / self.mass) * total_force, h * moment / inertia), 1)
             by_contact = by_contact + change
             gyro = torch.linalg.cross(angular, inertia * angular)
             linear = linear + change[:, :3]

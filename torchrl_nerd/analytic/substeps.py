@@ -155,12 +155,14 @@ class SubstepIntegrator(nn.Module):
         stick_force = slip_damping * slip_speed
         on_cone = (scale * (spring + share * stick_force)).clamp_min(0.0)
         on_cone = torch.where(depth > 0.0, on_cone, 0.0)
-        pressed = penalty_law.normal_force(stiffness, damping, depth, rising)
+        normal_force = penalty_law.normal_force(stiffness, damping, depth, rising)
         is_sliding = stick_force > friction * spring
-        pressed = merged * torch.where(is_sliding, on_cone, pressed)
+        normal_force = merged * torch.where(is_sliding, on_cone, normal_force)
         sticking = merged * slip_damping
-        drag = penalty_law.friction_force(sticking, friction, pressed, slip_speed)
-        return pressed * normal - (drag / slip_speed) * slip
+        friction_force = penalty_law.friction_force(
+            sticking, friction, normal_force, slip_speed
+        )
+        return normal_force * normal - (friction_force / slip_speed) * slip
 
     def _limit_force(self, position: Tensor, velocity: Tensor) -> Tensor:
         """Torques ``(L, N)``, N m or N, of the joints that have limits."""

@@ -72,8 +72,8 @@ class Eval(MeasuringCommand):
     (a transformer that recomputes its history at every step, as in the paper)."""
     vary: Vary = ()
     history: int = 0
-    """Steps of the ground truth's motion that every row has seen before: what a model
-    adapts to."""
+    """Steps of the ground truth's motion that every candidate has seen before: what a
+    model adapts to."""
     reference: Literal["rk4"] | None = None
     """Measure against the reference solver in place of the scene's own: MuJoCo's RK4 at
     four times its substeps."""
@@ -110,13 +110,14 @@ class Eval(MeasuringCommand):
         print(
             f"{self.scene}: {self.num_trajectories} trajectories per case. Ground truth: "
             f"{solver_name}, {solver}. "
-            "Every row, coarse MuJoCo included, is measured against it."
+            "Every candidate, coarse MuJoCo included, is measured against it."
         )
         candidates = simulators(scene)
         if ranges:
             print(
-                f"Every trajectory is of another robot: {', '.join(ranges)}. MuJoCo's rows "
-                "know each, but for the nominal one. So do models told their parameters."
+                f"Every trajectory is of another robot: {', '.join(ranges)}. MuJoCo "
+                "knows each, but for the nominal one. So do models that are told the "
+                "parameters."
             )
             candidates.append(
                 Candidate(f"{solver_name}, nominal", "simulator", _as_in_its_file)

@@ -39,7 +39,7 @@ CARD = "data.json"
 MOST_DROPPED = 0.05  # share of trajectories; more, and the data are not the robot's
 
 Draw = Callable[[int, int, Generator], TensorDict]
-"""``(rows, steps, generator) -> trajectories [rows, steps]``, diverged ones included."""
+"""``(trajectories, steps, generator) -> [trajectories, steps]``, diverged ones too."""
 
 Mapper = Callable[..., Iterable[TensorDict]]
 """Python's ``map`` or a parallel version of it that keeps the order."""
@@ -47,8 +47,8 @@ Mapper = Callable[..., Iterable[TensorDict]]
 
 def draw_chunk(draw: Draw, config: DataConfig, chunk: tuple[int, int]) -> TensorDict:
     """The trajectories of a chunk (number, count); seed and number alone decide them."""
-    number, rows = chunk
-    return draw(rows, config.steps, fold_in(config.seed, number))
+    number, trajectories = chunk
+    return draw(trajectories, config.steps, fold_in(config.seed, number))
 
 
 def generate(
@@ -78,17 +78,17 @@ def generate(
     how |= {"total": config.trajectories * config.steps, "initial": done * config.steps}
     with tqdm(**how, disable=quiet) as bar:
         drawn = mapper(partial(draw_chunk, draw, config), chunks)
-        for (number, rows), data in zip(chunks, drawn, strict=True):
+        for (number, count), data in zip(chunks, drawn, strict=True):
             sound = is_sound(data)
             kept = cast(TensorDict, data[sound])
             write_chunk(kept, chunk_path(folder, number))
             card["trajectories"] += len(kept)
-            card["dropped"] += rows - len(kept)
+            card["dropped"] += count - len(kept)
             beyond = first_beyond(scene, cast(TensorDict, data[~sound]))
             card["beyond"] = Counter(card.get("beyond")) + Counter(beyond)
             card["chunks_done"] = number + 1
             write_json(folder / CARD, card)
-            bar.update(rows * config.steps)
+            bar.update(count * config.steps)
     return folder
 
 

@@ -62,7 +62,7 @@ def read_log(path: Path, scene: Scene) -> Recording:
     motors, nv = len(scene.actuated), scene.model.nv
     sizes = {QPOS: scene.model.nq, QVEL: nv, TORQUE: motors}
     sizes |= {name: len(columns) for name, columns in FREE_BODY.items()}
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    if scene.terrain is not None and scene.terrain.is_per_env:
         needed.append(TERRAIN)
         sizes[TERRAIN] = scene.terrain.size
     if num_ctrl(scene):

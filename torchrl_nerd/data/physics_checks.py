@@ -193,9 +193,9 @@ def _velocity(
 
 def _gap(name: str, values: Tensor, limit: float) -> Check:
     """The largest of the frames' ``values (N,)``, and where it is."""
-    row = int(values.argmax())
-    advice = f"there is a gap in time, or frames are lost, before row {row}"
-    return Check(name, float(values[row]), 0.0, limit, "of it", advice)
+    frame = int(values.argmax())
+    advice = f"there is a gap in time, or frames are lost, before frame {frame}"
+    return Check(name, float(values[frame]), 0.0, limit, "of it", advice)
 
 
 def _length(x: Tensor) -> Tensor:

@@ -34,8 +34,8 @@ class Recording:
     qpos: Tensor  # (N, nq)
     qvel: Tensor  # (N, nv); NaN where not recorded, until `complete`
     joint_torque: Tensor  # (N, num_actuated), N m or N, held until the next state;
-    # a servo's is that of the row's own time
-    offsets: Tensor  # (T + 1,): trajectory i is rows offsets[i]:offsets[i + 1]
+    # a servo's is that of the frame's own time
+    offsets: Tensor  # (T + 1,): trajectory i is frames offsets[i]:offsets[i + 1]
     frame: float  # time between two states, s
     time: Tensor | None = None  # time stamps (N,), s
     terrain: Tensor | None = None  # the ground (N, terrain.size), where it varies
@@ -53,23 +53,23 @@ class Recording:
 
     @property
     def inside(self) -> Tensor:
-        """Which rows follow one of the same trajectory, bool ``(N,)``."""
+        """Which frames follow one of the same trajectory, bool ``(N,)``."""
         inside = torch.ones(len(self.qpos), dtype=torch.bool)
         inside[self.offsets[:-1]] = False
         return inside
 
     def select(self, numbers: Tensor) -> "Recording":
         """Some of the trajectories by their ``numbers (n,)``, in that order."""
-        rows = self.starts(1, numbers)
+        frames = self.starts(1, numbers)
         counts = self.offsets.diff()[numbers]
         ends = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
         names = "qpos", "qvel", "joint_torque", "terrain", "ctrl"
         found = {name: getattr(self, name) for name in names}
-        kept = {name: x[rows] for name, x in found.items() if x is not None}
+        kept = {name: x[frames] for name, x in found.items() if x is not None}
         return replace(self, **kept, offsets=ends, time=None)
 
     def starts(self, states: int, numbers: Tensor | None = None) -> Tensor:
-        """Rows ``(windows,)`` where ``states`` consecutive states begin.
+        """Indices ``(windows,)`` of frames where ``states`` consecutive states begin.
 
         Of the trajectories with these ``numbers (n,)``, or of all.
 
@@ -87,27 +87,28 @@ class Recording:
         for i in range(len(self)) if numbers is None else numbers.tolist():
             first, end = bounds[i].start, bounds[i].stop
             found.append(torch.arange(first, max(first, end - states + 1)))
-        rows = torch.cat(found)
-        if len(rows) == 0:
+        starts = torch.cat(found)
+        if len(starts) == 0:
             raise ValueError(
                 f"expected a trajectory of at least {states} states, got none"
             )
-        return rows
+        return starts
 
     @property
     def trajectories(self) -> list[slice]:
-        """The rows of each."""
+        """The frames of each."""
         bounds = self.offsets.tolist()
         return [slice(first, end) for first, end in pairwise(bounds)]
 
-    def trajectory_of(self, rows: Tensor) -> Tensor:
-        """Number of the trajectory that each of ``rows (n,)`` belongs to, ``(n,)``."""
-        return torch.searchsorted(self.offsets, rows, right=True) - 1
+    def trajectory_of(self, frames: Tensor) -> Tensor:
+        """Number of the trajectory of each of ``frames (n,)``, ``(n,)``."""
+        return torch.searchsorted(self.offsets, frames, right=True) - 1
 
     def windows(self, starts: Tensor, states: int) -> TensorDict:
         """Consecutive states and what drives them ``[windows, states]``."""
-        rows = starts[:, None] + torch.arange(states)  # (windows, states)
-        return TensorDict({k: v[rows] for k, v in self.columns.items()}, [*rows.shape])
+        frames = starts[:, None] + torch.arange(states)  # (windows, states)
+        columns = {key: value[frames] for key, value in self.columns.items()}
+        return TensorDict(columns, [*frames.shape])
 
     def transitions(self) -> TensorDict:
         """The keys of every other data set ``[transitions]``, and trajectory numbers.
@@ -141,12 +142,12 @@ def complete(log: Recording, scene: Scene) -> Recording:
     log = replace(log, qpos=qpos)
     qvel = torch.where(log.qvel.isnan(), estimate_velocities(log, scene), log.qvel)
     if is_free_body(scene):
-        flies = scene.clearances(qpos).amin(-1) > CLEAR
-        steady = flies & log.inside
+        is_airborne = scene.clearances(qpos).amin(-1) > CLEAR
+        steady = is_airborne & log.inside
         if steady.any():
             mean = backward_differences(log, scene)[:, 2]
             now = mean + 0.5 * log.frame * float(free_fall(log)[2])
-            qvel[flies, 2] += (now - qvel[:, 2])[steady].median()
+            qvel[is_airborne, 2] += (now - qvel[:, 2])[steady].median()
     log = replace(log, qvel=qvel)
     if scene.servos is None or log.ctrl is None:
         return log
@@ -178,8 +179,8 @@ def free_fall(log: Recording) -> Tensor:
         ValueError: no trajectory of at least 4 frames.
     """
     found = []
-    for rows in log.trajectories:
-        path = log.qpos[rows, :3][:FLIGHT]  # (frames, 3)
+    for frames in log.trajectories:
+        path = log.qpos[frames, :3][:FLIGHT]  # (frames, 3)
         if len(path) < 4:
             continue
         t = log.frame * torch.arange(len(path), dtype=torch.float64)

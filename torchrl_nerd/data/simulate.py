@@ -20,24 +20,24 @@ LARGEST = 1e5  # reference code: a trajectory beyond this has diverged
 
 def simulate(
     scene: Scene,
-    rows: int,
+    trajectories: int,
     steps: int,
     generator: Generator,
     is_changing: bool = False,
 ) -> TensorDict:
-    """Trajectories ``[rows, steps]`` from the scene's ranges, diverged ones included.
+    """Draw ``[trajectories, steps]`` from the scene's ranges, diverged ones included.
 
     ``is_changing``: hidden parameters change once in every trajectory, see `change_once`.
     """
     dynamics = MujocoDynamics(scene)
-    start, scale = scene.sample_initial(rows, generator)
+    start, scale = scene.sample_initial(trajectories, generator)
     terrain, varied, own = start.pop(TERRAIN, None), scene.variation, None
     if varied is not None:
-        first = varied.draw(rows, generator)
-        own = first[:, None].repeat(1, steps, 1)  # (rows, steps, size)
+        first = varied.draw(trajectories, generator)
+        own = first[:, None].repeat(1, steps, 1)  # (trajectories, steps, size)
         if is_changing:
-            change_once(own, varied.draw(rows, generator), generator)
-    state = TensorDict(start, batch_size=[rows])
+            change_once(own, varied.draw(trajectories, generator), generator)
+    state = TensorDict(start, batch_size=[trajectories])
     dynamics.reset(state)
     states, commands, done = [state[:, None]], [], 0
     sampling, drawn = scene.sampling, ()
@@ -49,7 +49,7 @@ def simulate(
         if own is not None:
             last = last.set(PARAMETERS, own[:, done])
         if sampling.drive is None:
-            command = drawn[segment]  # (rows, SEGMENT, m)
+            command = drawn[segment]  # (trajectories, SEGMENT, m)
         else:  # depends on the state: one step at a time
             command = sampling.drive(last[QPOS], last[QVEL], scale, generator)[:, None]
         torque, ctrl = held(scene, command)
@@ -61,16 +61,16 @@ def simulate(
 
 
 def change_once(own: Tensor, other: Tensor, generator: Generator) -> None:
-    """Let parameters ``(rows, steps, size)`` change, in place, to ``other (rows, size)``.
+    """Change parameters ``(trajectories, steps, size)``, in place, once per trajectory.
 
-    Each row does so at a random time, after a whole number of segments. It takes over each
-    of its parameters with a chance of a half.
+    Each trajectory does so at a random time, after a whole number of segments. It takes
+    over each of ``other (trajectories, size)`` with a chance of a half.
     """
-    rows, steps, size = own.shape
+    trajectories, steps, size = own.shape
     last = max(1, (steps - 1) // SEGMENT)
-    begin = SEGMENT * torch.randint(1, last + 1, (rows, 1), generator=generator)
-    is_late = torch.arange(steps) >= begin  # (rows, steps)
-    is_other = torch.rand(rows, size, generator=generator) < 0.5
+    begin = SEGMENT * torch.randint(1, last + 1, (trajectories, 1), generator=generator)
+    is_late = torch.arange(steps) >= begin  # (trajectories, steps)
+    is_other = torch.rand(trajectories, size, generator=generator) < 0.5
     own.copy_(torch.where(is_late[..., None] & is_other[:, None], other[:, None], own))
 
 
@@ -81,11 +81,11 @@ def as_transitions(
     terrain: Tensor | None,
     parameters: Tensor | None = None,
 ) -> TensorDict:
-    """A data set ``[rows, steps]`` in TorchRL's layout.
+    """A data set ``[trajectories, steps]`` in TorchRL's layout.
 
-    ``states`` are parts ``[rows, *]`` of trajectories in order, steps + 1 in all, and
-    ``commands`` parts ``(rows, *, m)`` of what drives them. Where they vary, terrain and
-    parameters are ``(rows, size)``.
+    ``states`` are consecutive parts ``[trajectories, *]``, steps + 1 in all.
+    ``commands`` are parts ``(trajectories, *, m)`` of what drives them. Where they
+    vary, terrain and parameters are ``(trajectories, size)``.
     """
     path = cast(TensorDict, TensorDict.cat(states, 1))
     data, after = (cast(TensorDict, path[:, a:b]) for a, b in ((0, -1), (1, None)))
@@ -122,6 +122,6 @@ def first_beyond(scene: Scene, data: TensorDictBase) -> list[str]:
 
 
 def is_sound(data: TensorDictBase) -> Tensor:
-    """Which trajectories ``[rows, steps]`` stay finite and within bounds, ``(rows,)``."""
+    """Which of ``[trajectories, steps]`` stay finite and within bounds, bool."""
     state = torch.cat((data["next", QPOS], data["next", QVEL]), -1)
     return (state.abs() < LARGEST).all(-1).all(-1)

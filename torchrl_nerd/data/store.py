@@ -48,7 +48,7 @@ def expect_layout(data: TensorDictBase, scene: Scene, steps: int, path: Path) ->
     sizes |= {"next/joint_torque": len(scene.actuated)}
     if num_ctrl(scene):
         sizes |= {"next/ctrl": num_ctrl(scene)}
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    if scene.terrain is not None and scene.terrain.is_per_env:
         sizes |= {"terrain": scene.terrain.size}
     if scene.variation is not None:
         sizes |= {"parameters": scene.variation.size}

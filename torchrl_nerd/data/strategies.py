@@ -30,13 +30,13 @@ class SettledStates:
     scene: Scene  # the robot, whose sampling gives the initial states
     seconds: float = 3.0  # length of the trajectories
 
-    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+    def __call__(self, count: int, generator: Generator) -> dict[str, Tensor]:
         """See `Starts`; a trajectory that diverges gives its initial state."""
-        start, _ = self.scene.sample_initial(rows, generator)
+        start, _ = self.scene.sample_initial(count, generator)
         terrain = start.pop(TERRAIN, None)
-        state = first = TensorDict(start, [rows])
+        state = first = TensorDict(start, [count])
         dynamics = MujocoDynamics(self.scene)
-        torque, ctrl = held(self.scene, idle(self.scene, rows, 1))
+        torque, ctrl = held(self.scene, idle(self.scene, count, 1))
         dynamics.reset(first)
         for _ in range(round(self.seconds / self.scene.control_step)):
             path = dynamics.rollout(state, torque, terrain, ctrl)
@@ -61,17 +61,18 @@ class PerturbedRestStates:
     # smallest over largest size, which is 1 m/s, 3 rad/s, 1 cm, 0.03 rad
     min_scale: float = 1e-4
 
-    def __call__(self, rows: int, generator: Generator) -> dict[str, Tensor]:
+    def __call__(self, count: int, generator: Generator) -> dict[str, Tensor]:
         """See `Starts`."""
-        start, scene = self.settled(rows, generator), self.settled.scene
-        size = log_uniform(self.min_scale, 1.0, 2 * rows, generator).reshape(2, rows, 1)
-        shape = (2, rows, scene.model.nv)
-        push = size * torch.randn(shape, dtype=torch.float64, generator=generator)
+        start, scene = self.settled(count, generator), self.settled.scene
+        size = log_uniform(self.min_scale, 1.0, 2 * count, generator)
+        size = size.reshape(2, count, 1)
+        shape = (2, count, scene.model.nv)
+        change = size * torch.randn(shape, dtype=torch.float64, generator=generator)
         unit = torch.full((scene.model.nv,), 3.0, dtype=torch.float64)
         if scene.base.is_floating:
             unit[scene.base.dof_address : scene.base.dof_address + 3] = 1.0
-        moved = integrate_pos(scene.layout, start[QPOS], 0.01 * unit * push[0])
-        return start | {QPOS: moved, QVEL: unit * push[1]}
+        moved = integrate_pos(scene.layout, start[QPOS], 0.01 * unit * change[0])
+        return start | {QPOS: moved, QVEL: unit * change[1]}
 
 
 def resample(scene: Scene, **ranges: Any) -> Scene:
@@ -87,8 +88,8 @@ def along(scene: Scene, **ranges: Any) -> Draw:
 def mix(*draws: Draw) -> Draw:
     """Equal shares of each, as nearly as the number of trajectories allows."""
 
-    def draw(rows: int, steps: int, generator: Generator) -> TensorDict:
-        ends = [rows * i // len(draws) for i in range(len(draws) + 1)]
+    def draw(trajectories: int, steps: int, generator: Generator) -> TensorDict:
+        ends = [trajectories * i // len(draws) for i in range(len(draws) + 1)]
         counts = [end - start for start, end in pairwise(ends)]
         shares = zip(draws, counts, strict=True)
         parts = [one(count, steps, generator) for one, count in shares if count]

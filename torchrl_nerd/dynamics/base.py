@@ -29,14 +29,20 @@ class Dynamics(Protocol):
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
 
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Forget the past of ``rows`` (bool ``(num_envs,)``; None for all envs)."""
+    def reset(self, state: TensorDictBase, is_reset: Tensor | None = None) -> None:
+        """Forget the past of the envs that start anew.
+
+        ``is_reset (num_envs,)`` is True for these; None stands for all envs.
+        """
 
     def history(self) -> Any:
         """A copy of the past that is kept of all envs, for `restore`."""
 
-    def restore(self, history: Any, rows: Tensor) -> None:
-        """Give ``rows`` (bool ``(num_envs,)``) back the past they had at `history`."""
+    def restore(self, history: Any, is_restored: Tensor) -> None:
+        """Give envs back the past that they had at `history`.
+
+        ``is_restored (num_envs,)`` is True for these.
+        """
 
     def step(
         self,
@@ -123,11 +129,11 @@ class Engine(Dynamics):
         self._fit(state["count"])
         self.restore(state["past"], torch.ones(self._count, dtype=torch.bool))
 
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+    def reset(self, state: TensorDictBase, is_reset: Tensor | None = None) -> None:
         """See `Dynamics.reset`."""
         self._fit(len(state[QPOS]))
         every = torch.ones(self._count, dtype=torch.bool)
-        self.restore(None, every if rows is None else rows)
+        self.restore(None, every if is_reset is None else is_reset)
 
     @torch.no_grad()
     @uncompiled
@@ -197,26 +203,27 @@ def check_step(
 
     So does a ground that is not finite: unlike a state, it never becomes so by itself.
     """
-    rows = state.batch_size[0] if state.batch_size else state[QPOS].shape[0]
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    num_envs = state.batch_size[0] if state.batch_size else state[QPOS].shape[0]
+    if scene.terrain is not None and scene.terrain.is_per_env:
         if terrain is None:
             raise ValueError(
                 f"scene '{scene.name}' has a ground per env: got no terrain"
             )
-        scene.terrain.check(terrain, (rows, scene.terrain.size))
+        scene.terrain.check(terrain, (num_envs, scene.terrain.size))
     for name, value, width in (
         (QPOS, state[QPOS], scene.model.nq),
         (QVEL, state[QVEL], scene.model.nv),
         ("joint_torque", joint_torque, len(scene.actuated)),
         ("ctrl", ctrl, scene.model.nu),
     ):
-        if value is not None and value.shape != (rows, width):
+        expected = num_envs, width
+        if value is not None and value.shape != expected:
             got = tuple(value.shape)
-            raise ValueError(f"expected {name} of shape {(rows, width)}, got {got}")
+            raise ValueError(f"expected {name} of shape {expected}, got {got}")
 
 
 def refuse_variation(scene: Scene, engine: str) -> None:
-    """Raise ValueError where the scene's parameters differ from row to row."""
+    """Raise ValueError where the scene's parameters differ from env to env."""
     if scene.variation is not None:
         raise ValueError(
             f"expected MuJoCo for the varied scene '{scene.name}', got {engine}, which "
@@ -230,7 +237,7 @@ def ground_pose(scene: Scene, terrain: Tensor | None) -> dict[str, Tensor]:
     Empty where the ground does not vary.
     """
     ground, size = scene.terrain, 3 * scene.model.nmocap
-    if terrain is None or ground is None or not ground.is_per_row:
+    if terrain is None or ground is None or not ground.is_per_env:
         return {}
     pose = ground.mocap_pose(terrain.double())
     pos, quat = pose[..., :size], pose[..., size:]

@@ -45,7 +45,7 @@ class DMControlDynamics(Engine):
     `MujocoDynamics` is faster: here every env costs a Python call.
 
     Raises:
-        ValueError: a scene whose parameters differ from row to row.
+        ValueError: a scene whose parameters differ from env to env.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -55,27 +55,27 @@ class DMControlDynamics(Engine):
 
     def _allocate(self, count: int) -> None:
         given = self.scene, self.has_actuators
-        self._rows = [make_physics(*given) for _ in range(count)]
+        self._physics = [make_physics(*given) for _ in range(count)]
 
     def history(self) -> list[np.ndarray]:
         """See `Dynamics.history`: all that MuJoCo integrates, warm start and time too."""
         pasts = []
-        for physics in self._rows:
+        for physics in self._physics:
             where = physics.model.ptr, physics.data.ptr
             pasts.append(np.empty(mujoco.mj_stateSize(where[0], INTEGRATED)))
             mujoco.mj_getState(*where, pasts[-1], INTEGRATED)
         return pasts
 
-    def restore(self, history: list[np.ndarray] | None, rows: Tensor) -> None:
+    def restore(self, history: list[np.ndarray] | None, is_restored: Tensor) -> None:
         """See `Dynamics.restore`; without a history, to the state of a new `Physics`."""
-        for row in rows.nonzero()[:, 0].tolist():
-            physics = self._rows[row]
+        for env in is_restored.nonzero()[:, 0].tolist():
+            physics = self._physics[env]
             if not history:
                 physics.reset()
                 continue
             where = physics.model.ptr, physics.data.ptr
             mujoco.mj_resetData(*where)  # warnings of a step that is taken back
-            mujoco.mj_setState(*where, history[row], INTEGRATED)
+            mujoco.mj_setState(*where, history[env], INTEGRATED)
             mujoco.mj_step1(*where)  # with which `Physics` ends a step
 
     def _step(
@@ -86,18 +86,18 @@ class DMControlDynamics(Engine):
         placed, told = {k: as_numpy(x) for k, x in given.items()}, as_numpy(command)
         next_qpos, next_qvel = np.empty_like(placed[QPOS]), np.empty_like(placed[QVEL])
         felt = np.empty((len(told), self.scene.model.nsensordata))
-        for row, physics in enumerate(self._rows):
-            _place(physics, {key: value[row] for key, value in placed.items()})
+        for env, physics in enumerate(self._physics):
+            _place(physics, {key: value[env] for key, value in placed.items()})
             if self.has_actuators:
-                physics.set_control(told[row])
+                physics.set_control(told[env])
             else:
-                physics.data.qfrc_applied[self.scene.actuated] = told[row]
+                physics.data.qfrc_applied[self.scene.actuated] = told[env]
             with physics.suppress_physics_errors():
                 physics.step(self.scene.substeps)
             is_broken = physics.data.warning.number.any()
-            next_qpos[row] = np.nan if is_broken else physics.data.qpos
-            next_qvel[row] = np.nan if is_broken else physics.data.qvel
-            felt[row] = physics.data.sensordata
+            next_qpos[env] = np.nan if is_broken else physics.data.qpos
+            next_qvel[env] = np.nan if is_broken else physics.data.qvel
+            felt[env] = physics.data.sensordata
         values = {QPOS: next_qpos, QVEL: next_qvel}
         if self.feels_forces:
             values[SENSORDATA] = felt

@@ -60,25 +60,25 @@ class GuardedDynamics(Dynamics):
         self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
         self.ground_truth = MujocoDynamics(self.scene) if guard == "fallback" else None
 
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
+    def reset(self, state: TensorDictBase, is_reset: Tensor | None = None) -> None:
         """See `Dynamics.reset`."""
-        self.learned.reset(state, rows)
-        if rows is None:
+        self.learned.reset(state, is_reset)
+        if is_reset is None:
             self._calm = self._calm[:0]
-        elif len(self._calm) == rows.numel():
-            self._calm = self._calm.masked_fill(rows.reshape(-1), self.patience)
+        elif len(self._calm) == is_reset.numel():
+            self._calm = self._calm.masked_fill(is_reset.reshape(-1), self.patience)
 
     def history(self) -> tuple[Tensor, Any]:
         """See `Dynamics.history`."""
         return self._calm, self.learned.history()
 
-    def restore(self, history: tuple[Tensor, Any], rows: Tensor) -> None:
+    def restore(self, history: tuple[Tensor, Any], is_restored: Tensor) -> None:
         """See `Dynamics.restore`."""
         calm, past = history
-        self.learned.restore(past, rows)
-        if len(self._calm) == len(rows):
-            known = calm if len(calm) == len(rows) else self.patience
-            self._calm = torch.where(rows, known, self._calm)
+        self.learned.restore(past, is_restored)
+        if len(self._calm) == len(is_restored):
+            known = calm if len(calm) == len(is_restored) else self.patience
+            self._calm = torch.where(is_restored, known, self._calm)
 
     def step(
         self,
@@ -96,20 +96,24 @@ class GuardedDynamics(Dynamics):
         after = self.learned.step(*given, is_scored=True)
         distance = after.pop(OOD_SCORE)
         trust = (1.0 / distance.detach().clamp(min=1.0)).nan_to_num(0.0)
-        rows = trust < 1.0
-        if self.guard == "raise" and rows.any():
+        is_untrusted = trust < 1.0
+        if self.guard == "raise" and is_untrusted.any():
             raise UntrustedError(
-                f"expected inputs like those of training, got {int(rows.sum())} of "
-                f"{len(rows)} envs beyond them, first env {int(rows.nonzero()[0])}, "
+                "expected inputs like those of training, got "
+                f"{int(is_untrusted.sum())} of {len(trust)} envs beyond them, "
+                f"first env {int(is_untrusted.nonzero()[0])}, "
                 f"least trust {float(trust.min()):.2g}"
             )
-        if self.ground_truth is not None and (rows := self._not_yet_calm(rows)).any():
-            ground, told = (None if x is None else x[rows] for x in (terrain, ctrl))
-            some = state.select(QPOS, QVEL, PARAMETERS, strict=False)[rows]
+        if self.ground_truth is None:
+            return after.set(TRUST, trust[:, None].to(torch.float32))
+        envs = self._not_yet_calm(is_untrusted)
+        if envs.any():
+            ground, told = (None if x is None else x[envs] for x in (terrain, ctrl))
+            some = state.select(QPOS, QVEL, PARAMETERS, strict=False)[envs]
             self.ground_truth.reset(some)  # no warm start of other envs
-            exact = self.ground_truth.step(some, joint_torque[rows], ground, told)
+            exact = self.ground_truth.step(some, joint_torque[envs], ground, told)
             for key in (QPOS, QVEL):
-                after[key] = after[key].index_put((rows,), exact[key].to(after[key]))
+                after[key] = after[key].index_put((envs,), exact[key].to(after[key]))
         return after.set(TRUST, trust[:, None].to(torch.float32))
 
     def _not_yet_calm(self, untrusted: Tensor) -> Tensor:

@@ -79,25 +79,25 @@ class TorchDynamics(Dynamics):
         self._compiled = Compiled(self._predict, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
 
-    def parts(self, rows: int) -> int:
+    def parts(self, num_envs: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
         is_whole = self.differentiable or self._compiled.is_eager
         if is_whole or not self.is_single_threaded:
             return 1
-        return parts_of(rows, max(1, MIN_WORK // self.scene.layout.nv))
+        return parts_of(num_envs, max(1, MIN_WORK // self.scene.layout.nv))
 
     def history(self) -> Any:
         """See `Dynamics.history`."""
         return copy.copy(self._memory)
 
     @unaffected
-    def restore(self, history: Any, rows: Tensor) -> None:
+    def restore(self, history: Any, is_restored: Tensor) -> None:
         """See `Dynamics.restore`."""
         with torch.set_grad_enabled(self.differentiable):
             if history is not None:
-                self._memory.restore(history, rows.to(self.device))
+                self._memory.restore(history, is_restored.to(self.device))
             elif self._memory is not None:
-                self._memory.clear(rows.to(self.device))
+                self._memory.clear(is_restored.to(self.device))
 
     @unaffected
     def step(
@@ -146,7 +146,7 @@ class TorchDynamics(Dynamics):
     def _told(self, state: TensorDictBase, like: Tensor) -> Tensor | None:
         """What the model is told of a varied scene's parameters."""
 
-    def _prepare(self, rows: int) -> None:
+    def _prepare(self, num_envs: int) -> None:
         """What a step of so many envs needs beforehand."""
 
     def _run(self, given: tuple) -> Prediction:
@@ -196,19 +196,19 @@ class NeRDDynamics(TorchDynamics):
         self.network = cast(Network, model.network)
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.token_size)
-        self._rows = 0
+        self._num_envs = 0  # in the memory
         super().__init__(model, compile, differentiable)
 
     @unaffected
-    def reset(self, state: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Empty the history of ``rows`` and leave the others bitwise as they are."""
+    def reset(self, state: TensorDictBase, is_reset: Tensor | None = None) -> None:
+        """See `Dynamics.reset`; the history of all other envs stays as it is."""
         count = len(state[QPOS])
         # gradients keep their history, and the past of all envs is forgotten
-        if rows is None or (self.differentiable and bool(rows.all())):
+        if is_reset is None or (self.differentiable and bool(is_reset.all())):
             self._memory = None
         self._prepare(count)
-        if rows is not None:  # asks nothing of the device; the memory stays where it is
-            self.restore(None, rows.reshape(count))
+        if is_reset is not None:  # no look at its values: they may be on the device
+            self.restore(None, is_reset.reshape(count))
 
     def _told(self, state: TensorDictBase, like: Tensor) -> Tensor | None:
         features = self.model.scene_features
@@ -218,9 +218,10 @@ class NeRDDynamics(TorchDynamics):
             raise ValueError("expected parameters in the state, got none")
         return features.told(state[PARAMETERS].to(like))
 
-    def _prepare(self, rows: int) -> None:
-        if self._memory is None or self._rows != rows:
-            self._rows, self._memory = rows, self.network.empty_memory(rows)
+    def _prepare(self, num_envs: int) -> None:
+        if self._memory is None or self._num_envs != num_envs:
+            self._memory = self.network.empty_memory(num_envs)
+            self._num_envs = num_envs
 
     def _predict(
         self,

@@ -44,17 +44,18 @@ def default_threads() -> int:
     return int(said)
 
 
-class RowParameters:
+class BatchParameters:
     """Parameters of a `Variation` in a batch that begins with the scene's own model."""
 
     def __init__(self, variation: Variation, batch: Batch) -> None:
         self.variation, self.batch = variation, batch
-        rows, dofs = batch.nsim, len(variation.actuated)
-        self._values = np.full((rows, variation.size), np.nan)
-        self._strength, self._delay = np.ones((rows, dofs)), np.zeros(rows, int)
+        num_envs, dofs = batch.nsim, len(variation.actuated)
+        self._values = np.full((num_envs, variation.size), np.nan)
+        self._strength = np.ones((num_envs, dofs))
+        self._delay = np.zeros(num_envs, int)
 
     def write(self, parameters: np.ndarray) -> None:
-        """Give every simulation its parameters ``(rows, size)``.
+        """Give every simulation its parameters ``(num_envs, size)``.
 
         Raises:
             ValueError: another shape, or parameters of no robot; nothing has changed then.
@@ -64,23 +65,23 @@ class RowParameters:
                 f"expected parameters of shape {self._values.shape}, got "
                 f"{parameters.shape}"
             )
-        rows = np.flatnonzero((parameters != self._values).any(1))
-        if len(rows):
-            self.variation.check(torch.from_numpy(parameters[rows]))
-            values = self._values[rows] = parameters[rows]
+        changed = np.flatnonzero((parameters != self._values).any(1))
+        if len(changed):
+            self.variation.check(torch.from_numpy(parameters[changed]))
+            values = self._values[changed] = parameters[changed]
             for name, value in self.variation.fields(values).items():
-                self.batch.expand(name)[rows] = value
-            self.batch.set_const(rows)
-            self._strength[rows] = self.variation.strength(values)
-            self._delay[rows] = self.variation.delay(values)
+                self.batch.expand(name)[changed] = value
+            self.batch.set_const(changed)
+            self._strength[changed] = self.variation.strength(values)
+            self._delay[changed] = self.variation.delay(values)
 
     def applied(
         self, command: np.ndarray, late: np.ndarray, is_ctrl: bool
     ) -> np.ndarray:
-        """What the engine gets where ``command (rows, m)`` is asked of the motors.
+        """What the engine gets where ``command (num_envs, m)`` is asked of the motors.
 
-        Of a ``ctrl`` the model itself weakens the actuators. ``late (rows, 1 + max_delay,
-        at least m)`` holds the last commands, and takes this one in.
+        Of a ``ctrl`` the model itself weakens the actuators. ``late (num_envs,
+        1 + max_delay, at least m)`` holds the last commands, and takes this one in.
         """
         late[:, 1:] = late[:, :-1].copy()
         late[:, 0, : command.shape[1]] = command
@@ -119,7 +120,7 @@ class MujocoDynamics(Engine):
         size = max(len(self.scene.actuated), model.nu)
         length = 1 if varied is None else 1 + varied.max_delay
         self._late = np.zeros((count, length, size))  # commands, the latest first
-        self._own: RowParameters | None = None
+        self._own: BatchParameters | None = None
         self._batch: Batch | None = None
         self._warmstart = np.zeros((count, model.nv))
         if count:
@@ -141,10 +142,10 @@ class MujocoDynamics(Engine):
         return (self._warmstart.copy(), self._late.copy()) if self._count else None
 
     def restore(
-        self, history: tuple[np.ndarray, np.ndarray] | None, rows: Tensor
+        self, history: tuple[np.ndarray, np.ndarray] | None, is_restored: Tensor
     ) -> None:
         """See `Dynamics.restore`; without a history, to none."""
-        mask, pasts = rows.cpu().numpy(), (self._warmstart, self._late)
+        mask, pasts = is_restored.cpu().numpy(), (self._warmstart, self._late)
         for past, then in zip(pasts, history or (None, None), strict=True):
             past[mask] = 0.0 if then is None else then[mask]
 
@@ -170,15 +171,16 @@ class MujocoDynamics(Engine):
         """Many control steps in one call: what `step` gives one after the other.
 
         Args:
-            state: ``qpos (rows, nq)``, ``qvel (rows, nv)``.
-            joint_torque: ``(rows, T, num_actuated)``, each held over its control step;
-                with ``ctrl`` it is not used, and may be None.
-            terrain: ``(rows, terrain.size)`` where the ground varies.
-            ctrl: ``(rows, T, nu)``, each held: MuJoCo's actuators act in every substep.
+            state: ``qpos (num_envs, nq)``, ``qvel (num_envs, nv)``.
+            joint_torque: ``(num_envs, T, num_actuated)``, each held over its control
+                step; with ``ctrl`` it is not used, and may be None.
+            terrain: ``(num_envs, terrain.size)`` where the ground varies.
+            ctrl: ``(num_envs, T, nu)``, each held: MuJoCo's actuators act in every
+                substep.
 
         Returns:
-            ``[rows, T]``: ``qpos`` and ``qvel`` after each step; NaN from where MuJoCo
-            gave up on.
+            ``[num_envs, T]``: ``qpos`` and ``qvel`` after each step; NaN from where
+            MuJoCo gave up on.
 
         Raises:
             ValueError: a shape that is not the scene's, or a ground that is not finite.
@@ -194,10 +196,10 @@ class MujocoDynamics(Engine):
     def _roll(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
     ) -> dict[str, Tensor]:
-        """``qpos`` and ``qvel`` after each of the commands ``(rows, T, m)``."""
-        rows, length = command.shape[:2]
-        qpos = np.empty((rows, length, self._model.nq))
-        qvel = np.empty((rows, length, self._model.nv))
+        """``qpos`` and ``qvel`` after each of the commands ``(num_envs, T, m)``."""
+        num_envs, length = command.shape[:2]
+        qpos = np.empty((num_envs, length, self._model.nq))
+        qvel = np.empty((num_envs, length, self._model.nv))
         if self._batch is not None and length:
             self._vary(self._batch, state.get(PARAMETERS, None))
             batch = self._batch
@@ -205,7 +207,7 @@ class MujocoDynamics(Engine):
             placed = {key: state[key] for key in (QPOS, QVEL)}
             for key, value in (placed | ground_pose(self.scene, terrain)).items():
                 batch.bind(key)[:] = as_numpy(value)
-            commands, is_whole = as_numpy(command), np.ones(rows, bool)
+            commands, is_whole = as_numpy(command), np.ones(num_envs, bool)
             for t in range(length):
                 self._advance(batch, commands[:, t], is_whole)
                 qpos[:, t], qvel[:, t] = batch.bind(QPOS), batch.bind(QVEL)
@@ -216,7 +218,7 @@ class MujocoDynamics(Engine):
         if self.scene.variation is None:
             return
         if parameters is not None:
-            self._own = self._own or RowParameters(self.scene.variation, batch)
+            self._own = self._own or BatchParameters(self.scene.variation, batch)
             self._own.write(as_numpy(parameters))
         elif self._own is not None:  # the scene's own robot again, in a new batch
             self._restart()
@@ -229,7 +231,7 @@ class MujocoDynamics(Engine):
             batch.bind("ctrl")[:] = command
         else:
             batch.bind("qfrc_applied")[:, self.scene.actuated] = command
-        counts = batch.warning[..., 1]  # (rows, kinds of warning), as they stand now
+        counts = batch.warning[..., 1]  # (num_envs, kinds of warning), as they are now
         before = counts.copy()
         ids = None if is_whole.all() else np.flatnonzero(is_whole)
         with silence_mujoco():

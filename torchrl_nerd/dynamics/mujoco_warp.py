@@ -91,11 +91,11 @@ class MujocoWarpDynamics(Engine):
         """See `Dynamics.history`: the warm start."""
         return self._view("qacc_warmstart").clone() if self._count else None
 
-    def restore(self, history: Tensor | None, rows: Tensor) -> None:
+    def restore(self, history: Tensor | None, is_restored: Tensor) -> None:
         """See `Dynamics.restore`; without a history, to no warm start."""
         if not self._count:
             return
-        mask, now = rows.to(self.device), self._view("qacc_warmstart")
+        mask, now = is_restored.to(self.device), self._view("qacc_warmstart")
         now[mask] = 0.0 if history is None else history.to(self.device)[mask]
 
     def _step(
@@ -119,7 +119,7 @@ class MujocoWarpDynamics(Engine):
     def _write(
         self, state: TensorDictBase, command: Tensor, terrain: Tensor | None
     ) -> Tensor:
-        """Put envs where they should be; bool ``(rows,)``: those that can be stepped.
+        """Put envs where they should be; returns which can be stepped, ``(num_envs,)``.
 
         The others stand at rest meanwhile, so that their numbers cost no other env.
         """
@@ -143,13 +143,13 @@ class MujocoWarpDynamics(Engine):
         return is_sound
 
     def _has_overflown(self) -> Tensor:
-        """Envs ``(rows,)`` that lost contacts or constraints for want of memory."""
+        """Envs ``(num_envs,)`` that lost contacts or constraints for want of memory."""
         kinds = self._engine.OverflowType
         lost = kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE
         return (self._view("overflow") & int(lost | kinds.CCD)) != 0
 
     def _view(self, name: str) -> Tensor:
-        """An array of Warp's as a tensor of the same memory, ``(rows, ...)``."""
+        """An array of Warp's as a tensor of the same memory, ``(num_envs, ...)``."""
         return cast(Tensor, self._warp.to_torch(getattr(self._data, name)))
 
     def _scope(self) -> AbstractContextManager[Any]:

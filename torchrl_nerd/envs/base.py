@@ -19,7 +19,7 @@ from torchrl_nerd.envs.faults import FaultRecorder
 from torchrl_nerd.envs.pixels import RenderedEnv
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
-from torchrl_nerd.envs.streams import row_keys, stream_offsets, uniforms
+from torchrl_nerd.envs.streams import env_keys, stream_offsets, uniforms
 from torchrl_nerd.envs.transition import FLAGS, Transition, drive_sizes, given_state
 from torchrl_nerd.keys import ACTION, FAULT, PARAMETERS, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
@@ -177,7 +177,7 @@ class SceneEnv(RenderedEnv):
         if not isinstance(seed, Integral) or not 0 <= seed < MAX_SEED:
             raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed!r}")
         self._seed = torch.full_like(self._seed, seed)
-        self._keys = row_keys(seed, len(self._episode), self.device)
+        self._keys = env_keys(seed, len(self._episode), self.device)
         self._episode = torch.zeros_like(self._episode)
 
     @unaffected
@@ -194,7 +194,7 @@ class SceneEnv(RenderedEnv):
         for name, value in self._buffers.items():
             self._buffers[name] = cast(Tensor, value).detach().clone()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-        self._keys = row_keys(self.seed, len(self._episode), self.device)
+        self._keys = env_keys(self.seed, len(self._episode), self.device)
         self.dynamics.reset(self.state)
 
     @property
@@ -207,11 +207,11 @@ class SceneEnv(RenderedEnv):
         return {key: kept[f"_state_{key}"] for key in self._state_sizes}
 
     def _begin(
-        self, state: dict[str, Tensor], rows: Tensor, given: dict[str, Tensor]
+        self, state: dict[str, Tensor], is_reset: Tensor, given: dict[str, Tensor]
     ) -> dict[str, Tensor]:
         drawn = uniforms(self._keys, self._episode, self._offsets, state[QPOS].dtype)
         with self._gradients():
-            return self._restart(state, rows, drawn, given)
+            return self._restart(state, is_reset, drawn, given)
 
     def _gradients(self) -> torch.set_grad_enabled:
         """None where the dynamics has none: compiled code is one, however called."""
@@ -226,19 +226,19 @@ class SceneEnv(RenderedEnv):
         **kwargs: object,
     ) -> TensorDict:
         every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        rows = every if tensordict is None else tensordict.get("_reset", every)
-        rows = rows.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
+        is_reset = every if tensordict is None else tensordict.get("_reset", every)
+        is_reset = is_reset.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
         old, given = self._state(), {}
         if set_state:
             sizes, dtype = self._state_sizes, old[QPOS].dtype
-            given = given_state(self.scene, tensordict, rows, sizes, dtype)
+            given = given_state(self.scene, tensordict, is_reset, sizes, dtype)
         # nothing of the past is left: no gradients of it either
-        if self._is_differentiable and rows.all():
+        if self._is_differentiable and is_reset.all():
             old = {key: value.detach() for key, value in old.items()}
-        found = self._begin(old, rows, given)
-        episode, age = self._episode + rows, self._age.masked_fill(rows, 0)
+        found = self._begin(old, is_reset, given)
+        episode, age = self._episode + is_reset, self._age.masked_fill(is_reset, 0)
         result = self._hand_out(found, {"_episode": episode, "_age": age})
-        self.dynamics.reset(result, rows)
+        self.dynamics.reset(result, is_reset)
         return self._seen(result)
 
     @unaffected
@@ -268,16 +268,16 @@ class SceneEnv(RenderedEnv):
         return self._seen(self._hand_out(found, {"_age": age}))
 
     def _hold(
-        self, found: dict[str, Tensor], rows: Tensor, tensordict: TensorDictBase
+        self, found: dict[str, Tensor], is_held: Tensor, tensordict: TensorDictBase
     ) -> dict[str, Tensor]:
-        """``found``, but ``rows`` are as they were before the step and earn nothing.
+        """``found``, but held envs are as they were before the step and earn nothing.
 
         Flags are those of ``tensordict``; a transform may have changed its observation.
         """
-        shown = self._begin(self._state(), rows & False, {})
+        shown = self._begin(self._state(), is_held & False, {})
         for key in (*drive_sizes(self.task), FAULT, TRUST, *FLAGS):
             shown[key] = tensordict.get(key, shown[key])
-        held = rows[:, None]
+        held = is_held[:, None]
         return {k: torch.where(held, shown.get(k, 0.0), v) for k, v in found.items()}
 
     def _hand_out(

@@ -53,8 +53,8 @@ class DmEnvironment(dm_env.Environment):
         """Act, or begin an episode where none is; ValueError for another shape."""
         if self._is_over:
             return self.reset()
-        row = {ACTION: as_action(action).to(self.env.device)[None]}  # (1, A)
-        after = self.env.step(TensorDict(row, self.env.batch_size))["next"]
+        given = {ACTION: as_action(action).to(self.env.device)[None]}  # (1, A)
+        after = self.env.step(TensorDict(given, self.env.batch_size))["next"]
         self._is_over = bool(after["done"])
         make = dm_env.transition
         if self._is_over:

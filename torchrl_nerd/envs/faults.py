@@ -72,9 +72,9 @@ class FaultRecorder:
                 self._written.add(kind)
                 self._write(kind, int((fault == kind).nonzero()[0, 0]))
 
-    def _write(self, kind: int, row: int) -> None:
+    def _write(self, kind: int, env: int) -> None:
         steps = self._steps  # at most `HISTORY`, the oldest first: (T, n) each
-        tensors = {k: torch.stack([s[k][row] for s in steps]) for k in steps[0]}
-        about = {**self.about, "reason": REASONS[kind], "env": str(row)}
+        tensors = {k: torch.stack([s[k][env] for s in steps]) for k in steps[0]}
+        about = {**self.about, "reason": REASONS[kind], "env": str(env)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
         write_tensors(path, tensors, about)

@@ -151,28 +151,29 @@ class Renderer:
         renderer = self._gl[height, width]
         images = np.empty((len(state[QPOS]), height, width, 3), np.uint8)
         for i, image in enumerate(images):
-            row = {key: value[i] for key, value in state.items()}
-            self._draw(row, renderer, camera)
+            shown = {key: value[i] for key, value in state.items()}
+            self._draw(shown, renderer, camera)
             renderer.render(out=image)
         return images
 
-    def _draw(self, row: State, renderer: "mujoco.Renderer", camera: Camera) -> None:
+    def _draw(self, shown: State, renderer: "mujoco.Renderer", camera: Camera) -> None:
         model, data, scene = self._model, self._data, self.task.scene
-        data.qpos[:] = as_numpy(row[QPOS])
-        for key, value in ground_pose(scene, row.get(TERRAIN)).items():
+        data.qpos[:] = as_numpy(shown[QPOS])
+        for key, value in ground_pose(scene, shown.get(TERRAIN)).items():
             getattr(data, key)[:] = as_numpy(value)
-        self.task.show(model, data, row)
+        self.task.show(model, data, shown)
         mujoco.mj_fwdPosition(model, data)
         if scene.base.is_floating and not isinstance(camera, int | str):
             camera.lookat[:] = data.subtree_com[scene.base.body]
         renderer.update_scene(data, camera)
-        if GOAL in row and row[GOAL].shape[-1] == 3:  # a task of users may mean another
+        goal = shown.get(GOAL)
+        if goal is not None and goal.shape[-1] == 3:  # a user's task may mean another
             seen = renderer.scene
             mujoco.mjv_initGeom(
                 seen.geoms[seen.ngeom],
                 mujoco.mjtGeom.mjGEOM_SPHERE,
                 np.full(3, GOAL_RADIUS),
-                as_numpy(row[GOAL]),
+                as_numpy(goal),
                 np.eye(3).ravel(),
                 np.array(GOAL_COLOR, np.float32),
             )

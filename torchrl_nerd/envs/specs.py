@@ -14,19 +14,19 @@ from torchrl_nerd.tasks import Task
 def make_specs(
     task: Task,
     state_sizes: Mapping[str, int],
-    rows: torch.Size,
+    batch_size: torch.Size,
     device: torch.device,
     is_guarded: bool,
     state_dtype: torch.dtype,
 ) -> Iterator[tuple[str, TensorSpec]]:
-    """Name and value of every spec of an env of that task and batch size ``rows``.
+    """Name and value of every spec of an env of that task and ``batch_size``.
 
     ``state_sizes`` are the widths of the state's keys, whose type, and that of torques, is
     ``state_dtype``; steps of guarded dynamics have a ``trust``.
     """
 
     def shape(width: int) -> torch.Size:
-        return torch.Size((*rows, width))
+        return torch.Size((*batch_size, width))
 
     def column(num_values: int, dtype: torch.dtype) -> TensorSpec:
         return Categorical(num_values, shape(1), device, dtype)
@@ -39,13 +39,13 @@ def make_specs(
         state[TRUST] = Bounded(0.0, 1.0, shape(1), device, torch.float32)
     # what `reset` takes with ``set_state``: transforms hand on nothing else
     given = {key: state[key].clone() for key in state_sizes}
-    yield "state_spec", Composite(given, shape=rows, device=device)
+    yield "state_spec", Composite(given, shape=batch_size, device=device)
     state[FAULT] = column(len(REASONS), torch.int64)
     observed = shape(task.observation_size)
     state[OBSERVATION] = Unbounded(observed, device, torch.float32)
-    yield "observation_spec", Composite(state, shape=rows, device=device)
+    yield "observation_spec", Composite(state, shape=batch_size, device=device)
     actions = shape(task.controller.num_actions)
     yield "action_spec", Bounded(-1.0, 1.0, actions, device, torch.float32)
     yield "reward_spec", Unbounded(shape(1), device, torch.float32)
     flags = {key: column(2, torch.bool) for key in FLAGS}
-    yield "full_done_spec", Composite(flags, shape=rows, device=device)
+    yield "full_done_spec", Composite(flags, shape=batch_size, device=device)

@@ -25,11 +25,11 @@ def _mix(x: Tensor) -> Tensor:
     return x ^ _shift_right(x, 31)
 
 
-def row_keys(seed: int, rows: int, device: torch.device | str = "cpu") -> Tensor:
-    """What sets the streams of envs apart, int64 ``(rows,)``."""
-    row = torch.arange(rows, device=device)
-    key = _mix(torch.full_like(row, seed) * GOLDEN)
-    return _mix(key + (row + 1) * GOLDEN)
+def env_keys(seed: int, num_envs: int, device: torch.device | str = "cpu") -> Tensor:
+    """What sets the streams of envs apart, int64 ``(num_envs,)``."""
+    env = torch.arange(num_envs, device=device)
+    key = _mix(torch.full_like(env, seed) * GOLDEN)
+    return _mix(key + (env + 1) * GOLDEN)
 
 
 def stream_offsets(count: int, device: torch.device | str = "cpu") -> Tensor:
@@ -40,12 +40,13 @@ def stream_offsets(count: int, device: torch.device | str = "cpu") -> Tensor:
 def uniforms(
     keys: Tensor, episode: Tensor, offsets: Tensor, dtype: torch.dtype = torch.float64
 ) -> Tensor:
-    """Uniform numbers in [0, 1), ``(rows, count)``, of as many bits as their type holds.
+    """Uniform numbers in [0, 1), ``(num_envs, count)``.
 
-    From the keys of `row_keys`, how many episodes each env has begun, int64 ``(rows,)``,
-    and the offsets of `stream_offsets`.
+    They have as many bits as their type holds. They follow from the keys of `env_keys`,
+    how many episodes each env has begun, int64 ``(num_envs,)``, and the offsets of
+    `stream_offsets`.
     """
     keys = _mix(keys + (episode + 1) * GOLDEN)
-    bits = _mix(keys[:, None] + offsets)  # (rows, count)
+    bits = _mix(keys[:, None] + offsets)  # (num_envs, count)
     held = 53 if dtype == torch.float64 else 24  # bits of a float's fraction
     return _shift_right(bits, 64 - held).to(dtype) * 2.0**-held

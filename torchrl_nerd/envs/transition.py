@@ -167,9 +167,9 @@ class Transition:
         return self._move(state, *given)
 
     def restart(
-        self, state: Tensors, rows: Tensor, drawn: Tensor, given: Tensors
+        self, state: Tensors, is_reset: Tensor, drawn: Tensor, given: Tensors
     ) -> Tensors:
-        """New episodes for ``rows (num_envs,)``; the others stay bitwise as they are.
+        """New episodes where ``is_reset (num_envs,)``; other envs stay bitwise.
 
         What of a start is not ``given`` is left to chance: ``drawn (num_envs, numbers)``,
         uniform in [0, 1), for all envs, so that shapes stay the same. They are an argument,
@@ -183,14 +183,14 @@ class Transition:
         if (variation := self.task.scene.variation) is not None:
             fresh[PARAMETERS] = variation.values(drawn[:, self.task.num_uniforms :])
         fresh = fresh | given
-        column = rows[:, None]
+        column = is_reset[:, None]
         start = {
             key: torch.where(column, fresh[key].to(now.dtype), now)
             for key, now in state.items()
         }
         sizes, zero = drive_sizes(self.task), start[QPOS].new_zeros
         return start | {
-            **{key: zero(len(rows), size) for key, size in sizes.items()},
+            **{key: zero(len(is_reset), size) for key, size in sizes.items()},
             FAULT: torch.zeros_like(column, dtype=torch.long),
             TRUST: torch.ones_like(column, dtype=torch.float32),
             OBSERVATION: self.task.observation(start).to(torch.float32),
@@ -201,14 +201,14 @@ class Transition:
 def given_state(
     scene: Scene,
     tensordict: TensorDictBase | None,
-    rows: Tensor,
+    is_reset: Tensor,
     sizes: Mapping[str, int],
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
     """The state that ``reset(td, set_state=True)`` asks for, copies, of unit quaternions.
 
     Of the keys in ``sizes``, which have these widths, ``qpos`` and ``qvel`` must be there.
-    Only the state of ``rows (num_envs,)``, which are reset, must be finite.
+    Only the state of envs where ``is_reset (num_envs,)`` must be finite.
 
     Raises:
         ValueError: a key that is missing, of another shape or not finite; parameters of
@@ -220,15 +220,15 @@ def given_state(
         raise ValueError(f"set_state needs {missing} in the tensordict")
     values = {}
     for key, size in sizes.items():
-        value, expected = given.get(key, None), (len(rows), size)
+        value, expected = given.get(key, None), (len(is_reset), size)
         if value is None:
             continue
         if (got := tuple(value.shape)) != expected:
             raise ValueError(f"expected {key} of shape {expected}, got {got}")
-        if not value[rows].isfinite().all():
+        if not value[is_reset].isfinite().all():
             raise ValueError(f"expected finite {key} to set the state to")
-        values[key] = value.to(rows.device, dtype, copy=True)
+        values[key] = value.to(is_reset.device, dtype, copy=True)
     values[QPOS] = normalize_pos(scene.layout, values[QPOS])
     if PARAMETERS in values and scene.variation is not None:
-        scene.variation.check(values[PARAMETERS][rows])
+        scene.variation.check(values[PARAMETERS][is_reset])
     return values

@@ -220,7 +220,7 @@ def _terrain(scene: Scene, has_normal: bool) -> str:
     if terrain is None:
         return "none that the robot can touch" + FALLS * scene.base.is_floating
     planes = sum(surface.kind == PLANE for surface in terrain.surfaces)
-    where = "drawn for each trajectory" if terrain.is_per_row else "fixed"
+    where = "drawn for each trajectory" if terrain.is_per_env else "fixed"
     normal = "a feature" if has_normal else "no feature: it follows from the state"
     shapes = f"{planes} plane{'s' * (planes != 1)}"
     if planes < len(terrain.surfaces):

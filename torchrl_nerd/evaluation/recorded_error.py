@@ -37,7 +37,7 @@ def window_errors(
 ) -> Errors:
     """Errors after each step of rollouts over so many ``states`` of a recording.
 
-    ``starts``: rows of the first states, ``(windows,)``.
+    ``starts``: frames of the first states, ``(windows,)``.
     """
     parts = (recording.windows(part, states) for part in starts.split(PART))
     found = [errors_along(dynamics, window) for window in parts]

@@ -141,14 +141,14 @@ class RigidBodyDynamics(nn.Module):
         extra = torch.diag(self.armature + 0.5 * period * self.damping)
         mass_matrix = upper + lower + extra[..., None]
         gravity = rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
-        push = -self._bias(bodies, spin, slide, rate, gravity)
-        push = push - self.damping[:, None] * rate
+        smooth = -self._bias(bodies, spin, slide, rate, gravity)
+        smooth = smooth - self.damping[:, None] * rate
         if joint_torque is not None:
             torque = rows_last(joint_torque, 1)
             torque = torch.cat((torque, torch.zeros_like(rate[:1])))
-            push = push + take(torque, self.torque_at, 0)
+            smooth = smooth + take(torque, self.torque_at, 0)
         stretch = self.rest[:, None] - take(position, self.qpos_addresses, 0)
-        base, joints = push[: self.num_base_dofs], push[self.num_base_dofs :]
+        base, joints = smooth[: self.num_base_dofs], smooth[self.num_base_dofs :]
         joints = joints + self.stiffness[:, None] * stretch
         return mass_matrix, torch.cat((base, joints))
 

@@ -1,4 +1,4 @@
-"""What networks remember of every row, and the paper's way: the last tokens, recomputed."""
+"""Histories of networks, and the paper's: the last tokens, recomputed at every step."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -16,7 +16,7 @@ def stored(old: Tensor, new: Tensor) -> Tensor:
 
 
 def replaced(old: Tensor, rows: Tensor, new: Tensor | float) -> Tensor:
-    """``old`` with ``rows`` (bool mask ``(num_rows,)``) from ``new``, see `stored`."""
+    """``old`` with ``rows`` (bool mask ``(rows,)``) from ``new``, see `stored`."""
     mask = rows.view(-1, *[1] * (old.ndim - 1))
     return stored(old, torch.where(mask, new, old))
 
@@ -29,7 +29,7 @@ class History:
     """
 
     def clear(self, rows: Tensor) -> None:
-        """Empty the history of ``rows`` (bool mask ``(num_rows,)``), others untouched."""
+        """Empty the history of ``rows`` (bool mask ``(rows,)``), others untouched."""
         for field in fields(self):
             old = getattr(self, field.name)
             setattr(self, field.name, replaced(old, rows, 0))
@@ -49,13 +49,13 @@ class History:
 
 @dataclass
 class TokenWindow(History):
-    """The last tokens of every row, left-aligned: a row's first is at index 0."""
+    """The last tokens of every env, left-aligned: an env's first is at index 0."""
 
     tokens: Tensor  # (rows, size, width)
-    age: Tensor  # (rows,): tokens seen since the row's reset, at most size
+    age: Tensor  # (rows,): tokens seen since the env's reset, at most size
 
     def append(self, token: Tensor) -> Tensor:
-        """Add a token to every row; returns the index it got, ``(rows,)``."""
+        """Add a token to every env; returns the index it got, ``(rows,)``."""
         size = self.tokens.shape[1]
         is_full = (self.age >= size)[:, None, None]
         tokens = torch.where(is_full, self.tokens.roll(-1, 1), self.tokens)

@@ -118,9 +118,9 @@ class TrainingRange(nn.Module):
             return qpos, qvel
         within = qpos.clamp(self.qpos_low, self.qpos_high)
         within = torch.where(qpos.abs() < MAX_POSITION, within, qpos)  # faults stay
-        push = take(within - qpos, self.joint_of) * self.is_limited  # (*batch, nv)
-        slow = torch.where(push > 0.0, qvel.clamp_min(0.0), qvel)
-        return within, torch.where(push < 0.0, slow.clamp_max(0.0), slow)
+        back = take(within - qpos, self.joint_of) * self.is_limited  # (*batch, nv)
+        slow = torch.where(back > 0.0, qvel.clamp_min(0.0), qvel)
+        return within, torch.where(back < 0.0, slow.clamp_max(0.0), slow)
 
     def excess(self, features: Tensor) -> Tensor:
         """How far outside the range the farthest feature lies, in widths ``(*batch,)``."""

@@ -53,7 +53,7 @@ class KeyValueCache(History):
 
     keys: list[Tensor]  # per layer (rows, heads, band, head width)
     values: list[Tensor]  # the same
-    age: Tensor  # (rows,): tokens seen since the row's reset, at most band - 1
+    age: Tensor  # (rows,): tokens seen since the env's reset, at most band - 1
     # (1,): where the oldest token lies, which the next one overwrites; a tensor, so that
     # compiled code is the same for all of them
     slot: Tensor
@@ -148,7 +148,7 @@ class Attention(nn.Module):
         return self.output((weights @ value).transpose(1, 2).flatten(2))
 
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
-        """One token per row, ``(rows, width)``, against itself and the cached ones."""
+        """One token per env, ``(rows, width)``, against itself and the cached ones."""
         query, key, value = self._split(x)
         # written before it is read: compiled code then copies no ring
         offset = cache.write(layer, key, value)
@@ -264,7 +264,7 @@ class CausalTransformer(nn.Module):
         return KeyValueCache(keys, values, age, age.new_zeros(1), last)
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
-        """The next token of every row, ``(rows, F) -> (rows, D)``; advances ``memory``."""
+        """Next token of all envs, ``(rows, F) -> (rows, D)``; advances ``memory``."""
         x = self.embed(token)
         if self.embed_last is not None:
             x = x + memory.last

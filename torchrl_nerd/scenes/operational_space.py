@@ -180,7 +180,7 @@ class OperationalSpaceController:
         """Mass matrix ``(*batch, nv, nv)`` and forces to overcome ``(*batch, nv)``."""
         for module in (self.kinematics, self.base_pose, self.rigid_body):
             module.to(qpos.device)
-        still = qvel.new_zeros(0, qvel.shape[-1])  # no rows: positions alone
+        still = qvel.new_zeros(0, qvel.shape[-1])  # no velocities: positions alone
         places, _ = self.kinematics(qpos, still)
         given = qpos, qvel, None, self.base_pose(qpos)[1], places
         matrix, force = self.rigid_body.mass_matrix_and_force(*given)

@@ -8,24 +8,24 @@ import numpy as np
 
 
 class Fields(dict[str, np.ndarray]):
-    """Fields of a model, one copy per row ``(rows, ...)``, made when first asked for.
+    """Fields of a model, a copy per env ``(num_envs, ...)``, made when asked for.
 
     Those of its options are named as in ``"opt.gravity"``.
     """
 
-    def __init__(self, model: mujoco.MjModel, rows: int) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int) -> None:
         super().__init__()
-        self.model, self.rows = model, rows
+        self.model, self.num_envs = model, num_envs
 
     def __missing__(self, name: str) -> np.ndarray:
         owner = self.model.opt if name.startswith("opt.") else self.model
         value = np.asarray(getattr(owner, name.removeprefix("opt.")))
-        self[name] = np.repeat(value[None], self.rows, 0)
+        self[name] = np.repeat(value[None], self.num_envs, 0)
         return self[name]
 
 
 Write = Callable[[Fields, list[int], np.ndarray], None]
-"""``(fields, indices of the target, values (rows, V))``: changes the fields."""
+"""``(fields, indices of the target, values (num_envs, V))``: changes the fields."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ def _to(name: str) -> Write:
 def _stiffness(fields: Fields, geoms: list[int], factor: np.ndarray) -> None:
     """``solref`` is minus stiffness and damping, or time constant and damping ratio."""
     solref, root = fields["geom_solref"], np.sqrt(factor)
-    first, second = solref[:, geoms].transpose(2, 0, 1)  # (rows, geoms) each
+    first, second = solref[:, geoms].transpose(2, 0, 1)  # (num_envs, geoms) each
     is_direct = first < 0.0
     solref[:, geoms, 0] = np.where(is_direct, first * factor, first / root)
     solref[:, geoms, 1] = np.where(is_direct, second * root, second)
 
 
 def _slope(fields: Fields, axes: list[int], angle: np.ndarray) -> None:
-    gravity = fields["opt.gravity"]  # (rows, 3), down at first
+    gravity = fields["opt.gravity"]  # (num_envs, 3), down at first
     size = np.linalg.norm(gravity, axis=1, keepdims=True)
     gravity[:, axes] = gravity[:, 2:] * np.tan(angle)
     length = np.linalg.norm(gravity, axis=1, keepdims=True)
@@ -82,10 +82,10 @@ def _slope(fields: Fields, axes: list[int], angle: np.ndarray) -> None:
 def _payload(fields: Fields, bodies: list[int], given: np.ndarray) -> None:
     """Point masses ``given[:, 0]`` at places ``given[:, 1:]``, NaN: centre of mass."""
     for body in bodies:
-        for row, (load, *place) in enumerate(given):
-            mass = fields["body_mass"][row]
+        for env, (load, *place) in enumerate(given):
+            mass = fields["body_mass"][env]
             names = "body_ipos", "body_iquat", "body_inertia"
-            centre, quat, inertia = (fields[name][row, body] for name in names)
+            centre, quat, inertia = (fields[name][env, body] for name in names)
             arm = np.where(np.isnan(place), 0.0, place - centre)
             total = mass[body] + load
             if load and arm.any():

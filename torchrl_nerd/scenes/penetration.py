@@ -9,9 +9,9 @@ from torch import Tensor
 
 
 def deepest_contacts(model: mujoco.MjModel, qpos: Tensor) -> Tensor:
-    """Depth of the deepest contact that MuJoCo finds in each state, m, ``(rows,)``.
+    """Depth of the deepest contact that MuJoCo finds in each state, m, ``(n,)``.
 
-    0 where nothing touches. Contacts with mocap bodies, which ``qpos (rows, nq)`` does not
+    0 where nothing touches. Contacts with mocap bodies, which ``qpos (n, nq)`` does not
     place, do not count.
     """
     is_mocap = model.body_mocapid[model.body_weldid[model.geom_bodyid]] >= 0
@@ -25,7 +25,7 @@ def deepest_contacts(model: mujoco.MjModel, qpos: Tensor) -> Tensor:
 def touching_bodies(
     model: mujoco.MjModel, qpos: Tensor
 ) -> Iterator[set[tuple[int, int]]]:
-    """Which bodies touch each other in each state ``(rows, nq)``, by ids, low first."""
+    """Which bodies touch each other in each state ``(n, nq)``, by ids, low first."""
     for geoms, dist in _contacts(model, qpos):
         bodies = np.sort(model.geom_bodyid[geoms[dist <= 0.0]])
         yield {(int(low), int(high)) for low, high in bodies}

@@ -19,7 +19,7 @@ Drive = Callable[[Tensor, Tensor, Tensor, Generator], Tensor]
 """``(qpos, qvel, scale (n, 1), generator) -> joint_torque (n, num_actuated)``."""
 
 Starts = Callable[[int, Generator], dict[str, Tensor]]
-"""``(rows, generator) -> qpos (rows, nq), qvel (rows, nv)``, perhaps ``terrain``."""
+"""``(count, generator) -> qpos (count, nq), qvel (count, nv)``, perhaps ``terrain``."""
 
 MAX_REDRAWS = 300  # of states that are not clear of the ground or of the robot itself
 
@@ -36,14 +36,14 @@ class BaseSampling:
     angular_low: Row  # rad/s, base frame
     angular_high: Row
 
-    def draw(self, rows: int, generator: Generator) -> tuple[Tensor, Tensor]:
-        """``qpos (rows, 7)`` and ``qvel (rows, 6)`` of the free joint, float64."""
-        position = uniform(self.low, self.high, rows, generator)
-        axis = torch.rand(rows, 3, dtype=torch.float64, generator=generator)
-        angle = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
+    def draw(self, count: int, generator: Generator) -> tuple[Tensor, Tensor]:
+        """``qpos (count, 7)`` and ``qvel (count, 6)`` of the free joint, float64."""
+        position = uniform(self.low, self.high, count, generator)
+        axis = torch.rand(count, 3, dtype=torch.float64, generator=generator)
+        angle = torch.rand(count, 1, dtype=torch.float64, generator=generator)
         quat = random_tilt(torch.cat((axis, angle), -1), self.tilt)
-        linear = uniform(self.linear_low, self.linear_high, rows, generator)
-        angular = uniform(self.angular_low, self.angular_high, rows, generator)
+        linear = uniform(self.linear_low, self.linear_high, count, generator)
+        angular = uniform(self.angular_low, self.angular_high, count, generator)
         qvel = torch.cat((rotate(quat, linear), angular), -1)
         return torch.cat((position, quat), -1), qvel
 
@@ -64,21 +64,21 @@ class Sampling:
     torque: Row  # largest torque of each actuated dof, N and N m
     # start of a floating base, whose joint comes before the others
     base: BaseSampling | None = None
-    ground: GroundSampler | None = None  # draws each row's, where it varies
+    ground: GroundSampler | None = None  # draws that of each state, where it varies
     # draws grounds that the robot hits head-on, see `data.strategies`
     level_ground: GroundSampler | None = None
     drive: Drive | None = None  # torques that depend on the state, not uniform ones
     clearance: float | None = None  # m: starts nearer to the ground are drawn again
     # m: starts with a deeper contact, of the robot with the ground or with itself, are
-    # drawn again; the least deep draw of a row stays if all of its draws are deeper
+    # drawn again; of draws that are all deeper the least deep one stays
     penetration: float | None = None
     zero_torque_fraction: float = 0.25  # share of trajectories with no torque at all
     # share whose torque and velocity are scaled down by U(0, 1)
     low_torque_fraction: float = 0.25
     starts: Starts | None = None  # draws the initial states, in place of the ranges
-    # torque scales of the other rows are log-uniform from this to 1
+    # torque scales of the other trajectories are log-uniform from this to 1
     min_torque_scale: float | None = None
-    # lowest and highest time, s, that a row's torques keep; None: drawn at every step
+    # shortest and longest correlation time of torques, s; None: drawn at every step
     correlation_time: tuple[float, float] | None = None
     # lowest and highest control of each servo, drawn in place of torques
     ctrl: tuple[Row, Row] | None = None
@@ -121,12 +121,12 @@ class Sampling:
 def draw_initial(
     sampling: Sampling,
     layout: JointLayout,
-    rows: int,
+    count: int,
     generator: Generator,
     clearances: Callable[[Tensor], Tensor],
     depths: Callable[[Tensor], Tensor],
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Initial states and each one's torque scale ``(rows, 1)``; see `Scene.sample_initial`.
+    """Initial states, torque scales ``(count, 1)``; see `Scene.sample_initial`.
 
     Of ``qpos (n, nq)``, ``clearances`` are gaps of contact points to the ground ``(n, P)``
     and ``depths`` of the deepest contact ``(n,)``, m.
@@ -135,10 +135,10 @@ def draw_initial(
         ValueError: no state within the ranges is clear of the ground.
     """
 
-    def draw(rows: int) -> tuple[Tensor, ...]:
+    def draw(count: int) -> tuple[Tensor, ...]:
         """States, and by how much they are too near to the ground, and too deep, m."""
-        qpos, qvel = _draw(sampling, layout, rows, generator)
-        low = deep = qpos.new_zeros(rows)
+        qpos, qvel = _draw(sampling, layout, count, generator)
+        low = deep = qpos.new_zeros(count)
         if sampling.clearance is not None:
             low = (sampling.clearance - clearances(qpos).amin(-1)).clamp_min(0.0)
         if sampling.penetration is not None:
@@ -146,11 +146,11 @@ def draw_initial(
         return qpos, qvel, low, deep
 
     if sampling.starts is not None:
-        state = dict(sampling.starts(rows, generator))
-        torque_scale, _ = sample_scale(sampling, rows, generator)
+        state = dict(sampling.starts(count, generator))
+        torque_scale, _ = sample_scale(sampling, count, generator)
     else:
-        qpos, qvel = _draw_clear(rows, draw)
-        torque_scale, speed_scale = sample_scale(sampling, rows, generator)
+        qpos, qvel = _draw_clear(count, draw)
+        torque_scale, speed_scale = sample_scale(sampling, count, generator)
         state = {"qpos": qpos, "qvel": speed_scale * qvel}
     if sampling.ground is not None and "terrain" not in state:
         state["terrain"] = sampling.ground(state["qpos"], generator)
@@ -158,10 +158,10 @@ def draw_initial(
 
 
 def _draw_clear(
-    rows: int, draw: Callable[[int], tuple[Tensor, ...]]
+    count: int, draw: Callable[[int], tuple[Tensor, ...]]
 ) -> tuple[Tensor, Tensor]:
     """Positions and velocities, drawn again where they are too near or too deep."""
-    drawn = qpos, qvel, low, deep = draw(rows)
+    drawn = qpos, qvel, low, deep = draw(count)
     for _ in range(MAX_REDRAWS):
         again = (low + deep > 0.0).nonzero()[:, 0]
         if not len(again):
@@ -179,13 +179,13 @@ def _draw_clear(
 
 
 def _draw(
-    sampling: Sampling, layout: JointLayout, rows: int, generator: Generator
+    sampling: Sampling, layout: JointLayout, count: int, generator: Generator
 ) -> tuple[Tensor, Tensor]:
     """Positions and velocities within the ranges."""
-    qpos = uniform(sampling.qpos_low, sampling.qpos_high, rows, generator)
-    qvel = uniform(sampling.qvel_low, sampling.qvel_high, rows, generator)
+    qpos = uniform(sampling.qpos_low, sampling.qpos_high, count, generator)
+    qvel = uniform(sampling.qvel_low, sampling.qvel_high, count, generator)
     if sampling.base is not None:
-        base_pos, base_vel = sampling.base.draw(rows, generator)
+        base_pos, base_vel = sampling.base.draw(count, generator)
         qpos, qvel = torch.cat((base_pos, qpos), -1), torch.cat((base_vel, qvel), -1)
     for q, _ in layout.rotations:
         qpos[:, q : q + 4] = quat_normalize(qpos[:, q : q + 4])
@@ -193,31 +193,31 @@ def _draw(
 
 
 def uniform(
-    low: Sequence[float], high: Sequence[float], rows: int, generator: Generator
+    low: Sequence[float], high: Sequence[float], count: int, generator: Generator
 ) -> Tensor:
-    """Independent uniform numbers ``(rows, len(low))``, float64."""
+    """Independent uniform numbers ``(count, len(low))``, float64."""
     a, b = torch.tensor([low, high], dtype=torch.float64)
-    u = torch.rand(rows, len(low), dtype=torch.float64, generator=generator)
+    u = torch.rand(count, len(low), dtype=torch.float64, generator=generator)
     return a + (b - a) * u
 
 
-def log_uniform(low: float, high: float, rows: int, generator: Generator) -> Tensor:
-    """Numbers ``(rows, 1)`` that are as likely in each octave, float64."""
-    u = torch.rand(rows, 1, dtype=torch.float64, generator=generator)
+def log_uniform(low: float, high: float, count: int, generator: Generator) -> Tensor:
+    """Numbers ``(count, 1)`` that are as likely in each octave, float64."""
+    u = torch.rand(count, 1, dtype=torch.float64, generator=generator)
     return low * torch.exp(u * log(high / low))
 
 
 def sample_commands(
     sampling: Sampling, scale: Tensor, steps: int, generator: Generator
 ) -> Tensor:
-    """Uniform torques or controls ``(rows, steps, m)``, see `Sampling.commands`.
+    """Uniform torques or controls ``(count, steps, m)``, see `Sampling.commands`.
 
-    Their distance from the middle is times each row's scale ``(rows, 1)``.
+    Their distance from the middle is times each trajectory's ``scale (count, 1)``.
     """
-    rows, (middle, half) = len(scale), sampling.commands
+    count, (middle, half) = len(scale), sampling.commands
     low, high = (-half).tolist(), half.tolist()
-    draw = uniform(low, high, steps * rows, generator)
-    return middle + scale[:, None] * draw.unflatten(0, (steps, rows)).transpose(0, 1)
+    draw = uniform(low, high, steps * count, generator)
+    return middle + scale[:, None] * draw.unflatten(0, (steps, count)).transpose(0, 1)
 
 
 def sample_correlated_commands(
@@ -227,10 +227,10 @@ def sample_correlated_commands(
     control_step: float,
     generator: Generator,
 ) -> Tensor:
-    """Commands of trajectories ``(rows, steps, m)``, correlated in time where asked.
+    """Commands of trajectories ``(count, steps, m)``, correlated in time where asked.
 
-    An Ornstein-Uhlenbeck process of each row's correlation time, put through its own
-    distribution function: at every single step a command is as uniform as without.
+    An Ornstein-Uhlenbeck process of each trajectory's correlation time is put through
+    its own distribution function: at every step a command is as uniform as without.
     """
     if sampling.correlation_time is None:
         return sample_commands(sampling, scale, steps, generator)
@@ -242,24 +242,24 @@ def sample_correlated_commands(
     walk = [noise[0]]
     for kick in noise[1:]:
         walk.append(keep * walk[-1] + (1.0 - keep**2).sqrt() * kick)
-    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)  # (rows, steps, m)
+    share = torch.erf(torch.stack(walk, 1) / 2.0**0.5)  # (count, steps, m)
     return middle + scale[:, None] * share * half
 
 
 def sample_scale(
-    sampling: Sampling, rows: int, generator: Generator
+    sampling: Sampling, count: int, generator: Generator
 ) -> tuple[Tensor, Tensor]:
-    """How violent each trajectory is: scales of torque and velocity ``(rows, 1)``.
+    """How violent each trajectory is: scales of torque and velocity ``(count, 1)``.
 
-    Both 1 for most rows (torque log-uniform from ``min_torque_scale`` to 1, if set);
-    torque 0 in the zero-torque fraction; both U(0, 1) in the low-torque one.
+    Both 1 for most trajectories (torque log-uniform from ``min_torque_scale`` to 1, if
+    set); torque 0 in the zero-torque fraction; both U(0, 1) in the low-torque one.
     """
-    draw = torch.rand(2, rows, 1, dtype=torch.float64, generator=generator)
+    draw = torch.rand(2, count, 1, dtype=torch.float64, generator=generator)
     loud = torch.ones_like(draw[0])
     is_passive = draw[0] < sampling.zero_torque_fraction
     is_quiet = draw[0] > 1.0 - sampling.low_torque_fraction
     speed = torch.where(is_quiet | is_passive, draw[1], 1.0)
     if sampling.min_torque_scale is not None:
-        loud = log_uniform(sampling.min_torque_scale, 1.0, rows, generator)
+        loud = log_uniform(sampling.min_torque_scale, 1.0, count, generator)
     torque = torch.where(is_passive, 0.0, torch.where(is_quiet, draw[1], loud))
     return torque, speed

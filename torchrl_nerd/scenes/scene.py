@@ -51,7 +51,7 @@ class Scene:
     sampling: Sampling  # ranges of training states and torques
     reference_ratio: int = 1  # substeps in one of the scene's own, see `reference`
     max_contact_points: int = MAX_POINTS  # about how many the robot may have
-    variation: Variation | None = None  # what differs from row to row, see `vary`
+    variation: Variation | None = None  # what differs from robot to robot, see `vary`
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -120,9 +120,9 @@ class Scene:
         sampling = default_sampling(model, controller, control_step, **ranges)
         scene = cls(name, model, substeps, controller, sampling)
         terrain = scene.terrain  # refuses a ground without features right away
-        if terrain is not None and terrain.is_per_row and not scene.sampling.ground:
+        if terrain is not None and terrain.is_per_env and not scene.sampling.ground:
             raise ValueError(
-                f"scene '{scene.name}' has a ground that moves with each row: expected "
+                f"scene '{scene.name}' has a ground of its own in each env: expected "
                 "ground=, a function that draws it"
             )
         return scene
@@ -228,15 +228,15 @@ class Scene:
         return robot_fingerprint(self.model, self.substeps)
 
     def sample_initial(
-        self, rows: int, generator: Generator
+        self, count: int, generator: Generator
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Initial states for training, and each row's torque scale ``(rows, 1)``.
+        """Initial states for training, and each one's torque scale ``(count, 1)``.
 
         Returns:
-            ``qpos (rows, nq)``, ``qvel (rows, nv)`` and, where the ground varies,
-            ``terrain (rows, terrain.size)``, all float64.
+            ``qpos (count, nq)``, ``qvel (count, nv)`` and, where the ground varies,
+            ``terrain (count, terrain.size)``, all float64.
         """
-        how = rows, generator, self.clearances, partial(deepest_contacts, self.model)
+        how = count, generator, self.clearances, partial(deepest_contacts, self.model)
         return draw_initial(self.sampling, self.layout, *how)
 
     def clearances(self, qpos: Tensor, terrain: Tensor | None = None) -> Tensor:
@@ -247,7 +247,7 @@ class Scene:
         return self._ground(qpos, terrain)[0]
 
     def place_on_terrain(self, state: dict[str, Tensor], gap: Tensor) -> None:
-        """Move floating bases, in place, to ``gap (rows,)`` m over the ground.
+        """Move floating bases, in place, to ``gap (num_envs,)`` m over the ground.
 
         Along its normal at the lowest contact point.
         """
@@ -259,7 +259,7 @@ class Scene:
                 own = trees[self.contacts.bodies] == trees[self.base.body]
                 gaps = torch.where(torch.from_numpy(own), gaps, torch.inf)
             lowest, point = gaps.min(-1)
-            normal = normals[torch.arange(len(qpos)), point]  # (rows, 3), in B_t
+            normal = normals[torch.arange(len(qpos)), point]  # (num_envs, 3), in B_t
             up = (self.base_pose(qpos)[1] @ normal[..., None])[..., 0]
             qpos[:, q : q + 3] += (gap - lowest)[:, None] * up
 

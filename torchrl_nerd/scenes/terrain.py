@@ -1,6 +1,6 @@
-"""The ground: planes, boxes and height fields, and planes that differ from row to row.
+"""The ground: planes, boxes and height fields, and planes that differ from env to env.
 
-A plane on a mocap body stands where each row's parameters say: unit normal and offset (m)
+A plane on a mocap body stands where each env's parameters say: unit normal, offset (m)
 in the world, plane by plane in MuJoCo's order.
 """
 
@@ -69,22 +69,22 @@ class Terrain:
 
     @cached_property
     def planes(self) -> list[Surface]:
-        """Those on mocap bodies: a row has `PLANE_PARAMETERS` numbers of each."""
+        """Those on mocap bodies: an env has `PLANE_PARAMETERS` numbers of each."""
         return [surface for surface in self.surfaces if surface.mocap >= 0]
 
     @property
     def size(self) -> int:
-        """How many numbers a row has."""
+        """How many numbers an env has."""
         return surfaces.PLANE_PARAMETERS * len(self.planes)
 
     @property
-    def is_per_row(self) -> bool:
-        """True where every row may have its own ground."""
+    def is_per_env(self) -> bool:
+        """True where every env may have its own ground."""
         return bool(self.planes)
 
     @property
     def default(self) -> np.ndarray:
-        """A row's parameters ``(size,)`` as the file has them."""
+        """An env's parameters ``(size,)`` as the file has them."""
         parts = [np.zeros(0)]
         for surface in self.planes:
             pose, plane = self.mocap_default[surface.mocap], surface.plane
@@ -120,7 +120,7 @@ class Terrain:
         return terrain.split(surfaces.PLANE_PARAMETERS, -1) if self.planes else ()
 
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
-        """Raise ValueError where a row's parameters are of another shape or not finite.
+        """Raise ValueError where parameters are of another shape or not finite.
 
         On an accelerator the numbers are not read, since that would synchronise it; nor in
         compiled code, which cannot raise on them.
@@ -130,9 +130,9 @@ class Terrain:
             raise ValueError(f"expected terrain of shape {shape}, got {got}")
         is_read = terrain.device.type == "cpu" and not torch.compiler.is_compiling()
         if is_read and not terrain.isfinite().all():
-            row = int((~terrain.isfinite()).any(-1).reshape(-1).nonzero()[0])
+            env = int((~terrain.isfinite()).any(-1).reshape(-1).nonzero()[0])
             raise ValueError(
-                f"expected finite terrain, got NaN or infinity in env {row}"
+                f"expected finite terrain, got NaN or infinity in env {env}"
             )
 
 
@@ -183,7 +183,7 @@ class TerrainDistance(nn.Module):
     def _to_surface(
         self, index: int, points: Tensor, planes: list[Tensor], frame: Pair
     ) -> Pair:
-        """Distance and normal to one surface; takes the row's ``planes`` in their order."""
+        """Distance and normal to one surface; takes ``planes`` in their order."""
         surface = self.terrain.surfaces[index]
 
         def own(name: str) -> Tensor:

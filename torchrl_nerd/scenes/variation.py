@@ -1,8 +1,8 @@
-"""Physical parameters that differ from row to row and that no feature tells.
+"""Physical parameters that differ from robot to robot and that no feature tells.
 
 A parameter is named ``KIND`` or ``KIND:TARGET``. With V its value:
 
-| kind | target | value | what the row's robot has |
+| kind | target | value | what the robot has |
 |---|---|---|---|
 | ``mass`` | body | factor | mass and inertia times V |
 | ``payload`` | body | kg | a point mass V, at the centre of mass |
@@ -115,9 +115,9 @@ class Variation:
                 values.append(p.low + (p.high - p.low) * share)
         return torch.stack(values, -1)
 
-    def draw(self, rows: int, generator: Generator) -> Tensor:
-        """Random parameters ``(rows, size)``, float64."""
-        shape = rows, self.size
+    def draw(self, count: int, generator: Generator) -> Tensor:
+        """Random parameters ``(count, size)``, float64."""
+        shape = count, self.size
         return self.values(torch.rand(shape, dtype=torch.float64, generator=generator))
 
     def check(self, parameters: Tensor) -> None:
@@ -148,9 +148,10 @@ class Variation:
         return torch.stack(shares, -1)
 
     def fields(self, parameters: np.ndarray) -> Fields:
-        """The fields of MuJoCo's model that change, ``(rows, ...)`` each.
+        """The fields of MuJoCo's model that change, ``(num_envs, ...)`` each.
 
-        ``parameters (rows, size)``; what acts on joint torques is in `strength`, `delay`.
+        ``parameters (num_envs, size)``. What acts on joint torques is in `strength` and
+        `delay`.
         """
         fields = Fields(self.model, len(parameters))
         for kind, about in KINDS.items():
@@ -170,14 +171,14 @@ class Variation:
         return fields
 
     def strength(self, parameters: np.ndarray) -> np.ndarray:
-        """Factor of every joint torque, ``(rows, num_actuated)``."""
+        """Factor of every joint torque, ``(num_envs, num_actuated)``."""
         factor = np.ones((len(parameters), len(self.actuated)))
         for i, p in self._of_kind("motor"):
             factor[:, np.isin(self.actuated, p.indices)] *= parameters[:, i : i + 1]
         return factor
 
     def delay(self, parameters: np.ndarray) -> np.ndarray:
-        """Control steps by which every torque is late, whole numbers ``(rows,)``."""
+        """Control steps by which every torque is late, integers ``(num_envs,)``."""
         columns = [i for i, _ in self._of_kind("delay")]
         return parameters[:, columns].sum(1).astype(int)
 

@@ -115,8 +115,8 @@ class SuiteTask(Task):
         if SENSORDATA in state.keys():
             felt = state[SENSORDATA][..., self._forces]
         target = [state[key] for key in self.parameters]
-        row = torch.cat((qpos, state[QVEL], *target, ctrl, felt), -1)
-        return self._judge(row)
+        judged = torch.cat((qpos, state[QVEL], *target, ctrl, felt), -1)
+        return self._judge(judged)
 
 
 class SuiteReward:
@@ -162,15 +162,17 @@ class SuiteReward:
         data, target = self._physics.data.ptr, self._model.geom_pos[self.targets]
         return np.concatenate((data.qpos, data.qvel, target.ravel()))
 
-    def judge(self, row: np.ndarray) -> np.ndarray:
+    def judge(self, state: np.ndarray) -> np.ndarray:
         """Reward, whether the episode ends (0 or 1), and observation of one state.
 
-        ``row``: qpos, qvel, the targets' positions, ctrl and the `forces` felt, NaN where
-        nobody knows them: MuJoCo then computes them at this state.
+        ``state``: qpos, qvel, the targets' positions, ctrl and the `forces` felt. These
+        are NaN where nobody knows them: MuJoCo then computes them at this state.
         """
         model, data = self._model, self._physics.data.ptr
         sizes = (model.nq, model.nv, 3 * len(self.targets), model.nu)
-        data.qpos, data.qvel, target, data.ctrl, felt = np.split(row, np.cumsum(sizes))
+        data.qpos, data.qvel, target, data.ctrl, felt = np.split(
+            state, np.cumsum(sizes)
+        )
         model.geom_pos[self.targets] = target.reshape(-1, 3)
         if np.isnan(felt).any():
             data.qacc_warmstart = 0.0  # nothing is left of the env before

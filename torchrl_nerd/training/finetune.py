@@ -137,12 +137,12 @@ class FineTuner:
         epoch, evaluations, seen = len(self.starts), self.config.evaluations, 0
         planned = evaluations * sum(min(windows, epoch) for windows in WINDOWS)
 
-        def error_of(values: dict[str, float], rows: Tensor) -> float:
+        def error_of(values: dict[str, float], starts: Tensor) -> float:
             nonlocal seen
-            seen += len(rows)
-            bar.update(len(rows))
+            seen += len(starts)
+            bar.update(len(starts))
             step.set_values(values)
-            return float(weighted_error(scene, self.errors(rows)).mean())
+            return float(weighted_error(scene, self.errors(starts)).mean())
 
         first = step.values() | fit_flight(scene, self.recording.select(self.train))
         how = evaluations, self.config.seed
@@ -212,10 +212,10 @@ class FineTuner:
         return ", ".join(f"{k} {v:.4f}" for k, v in errors_of(self.curve[-1]).items())
 
     @torch.no_grad()
-    def errors(self, rows: Tensor) -> Errors:
-        """`window_errors` of the model as it is now, from ``rows`` on."""
+    def errors(self, starts: Tensor) -> Errors:
+        """`window_errors` of the model as it is now, from frames ``starts`` on."""
         dynamics = dynamics_of(self.model)
-        return window_errors(dynamics, self.recording, rows, self.config.states)
+        return window_errors(dynamics, self.recording, starts, self.config.states)
 
     def card(self) -> dict[str, Any]:
         """Configuration and convergence, for a checkpoint's card."""
@@ -224,13 +224,13 @@ class FineTuner:
 
 
 def rollout_error(model: Model, window: TensorDict) -> Tensor:
-    """`weighted_error` of a rollout from the first state of ``[rows, steps + 1]``."""
+    """`weighted_error` of a rollout from the first of ``[windows, steps + 1]``."""
     dynamics = dynamics_of(model, differentiable=True)
     return weighted_error(model.scene, errors_along(dynamics, window))
 
 
 def weighted_error(scene: Scene, errors: Errors) -> Tensor:
-    """Sum of all errors, each by its scale, ``(rows, steps)``.
+    """Sum of all errors, each by its scale, ``(windows, steps)``.
 
     Not squared: after a first impact that was missed all that follows is far off, and must
     not outweigh the impacts that can be learned.

@@ -48,12 +48,12 @@ def rollout_loss(
 
     Args:
         model: in training mode.
-        qpos: true positions ``(rows, K + 1, nq)``, float64.
-        qvel: true velocities ``(rows, K + 1, nv)``.
-        command: ``(rows, K, m)``, torques or servos' controls.
-        terrain: ``(rows, terrain.size)`` or None.
+        qpos: true positions ``(batch, K + 1, nq)``, float64.
+        qvel: true velocities ``(batch, K + 1, nv)``.
+        command: ``(batch, K, m)``, torques or servos' controls.
+        terrain: ``(batch, terrain.size)`` or None.
         loss_eps: see `relative_error`.
-        parameters: ``(rows, variation.size)`` or None.
+        parameters: ``(batch, variation.size)`` or None.
         history: recorded steps that come first; their errors count as well.
     """
     delta, layout = model.state_delta, model.scene.layout

@@ -37,20 +37,22 @@ def fit_parameters(
     """Parameters with the least error after each stage: few windows, then more.
 
     Args:
-        error_of: parameters and rows of first states -> error, near 1.
+        error_of: parameters and frames of first states -> error, near 1.
         first: parameters to begin with.
         names: which of them to change.
-        starts: rows of the first states of training windows, to draw from.
+        starts: frames of the first states of training windows, to draw from.
         evaluations: of ``error_of``, in each stage.
         seed: of the draw.
     """
     generator = Generator().manual_seed(seed)
     order = torch.randperm(len(starts), generator=generator)
     for windows, radius in zip(WINDOWS, RADII, strict=True):
-        origin, rows = first, starts[order[:windows]]
+        origin, frames = first, starts[order[:windows]]
 
-        def score(x: np.ndarray, origin: dict = origin, rows: Tensor = rows) -> float:
-            error = error_of(moved(origin, names, x), rows)
+        def score(
+            x: np.ndarray, origin: dict = origin, frames: Tensor = frames
+        ) -> float:
+            error = error_of(moved(origin, names, x), frames)
             return error if np.isfinite(error) else LOST
 
         radii = {"initial_tr_radius": radius, "final_tr_radius": CLOSE}
@@ -78,12 +80,13 @@ def fit_flight(scene: Scene, recording: Recording) -> dict[str, float]:
 
     The centre of mass ``p + R c`` of a body at ``p``, turned by ``R``, draws a parabola:
     ``p + R c = p0 + v0 t - g t^2 / 2``, linear in all unknowns. Empty where no trajectory
-    flies long enough.
+    is off the ground long enough.
     """
-    flies = scene.clearances(recording.qpos).amin(-1) > CLEAR
+    is_airborne = scene.clearances(recording.qpos).amin(-1) > CLEAR
     rows, values = [], []
     for trajectory in recording.trajectories:
-        count = int(flies[trajectory].long().cumprod(0).sum())  # until it first lands
+        # until it first lands
+        count = int(is_airborne[trajectory].long().cumprod(0).sum())
         if count < 3 or count * recording.frame < SHORTEST:
             continue
         qpos = recording.qpos[trajectory][:count]

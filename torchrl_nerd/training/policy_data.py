@@ -26,39 +26,40 @@ from torchrl_nerd.tasks import Task
 def policy_data(
     task: Task,
     actor: Actor,
-    rows: int,
+    trajectories: int,
     steps: int,
     generator: Generator,
     noise: float = 0.5,
 ) -> TensorDict:
-    """Trajectories ``[rows, steps]`` of a policy in MuJoCo, diverged ones included.
+    """Draw ``[trajectories, steps]`` of a policy in MuJoCo, diverged ones included.
 
     They start with the task's resets and continue where an episode would end. Actions are
     the policy's mean plus normal noise, clipped to [-1, 1]; the noise of each trajectory
     has a standard deviation from U(0, ``noise``), in units of the action.
 
     Raises:
-        ValueError: a task that pushes a robot with servos by torques.
+        ValueError: a task that drives a robot with servos by torques.
     """
     scene, controller = task.scene, task.controller
-    size = (rows, task.num_uniforms)
+    size = (trajectories, task.num_uniforms)
     u = torch.rand(size, dtype=torch.float64, generator=generator)
-    spread = noise * torch.rand(rows, 1, dtype=torch.float64, generator=generator)
-    row = TensorDict(task.initial_state(u), [rows])
-    terrain = row.get(TERRAIN, None)
+    share = torch.rand(trajectories, 1, dtype=torch.float64, generator=generator)
+    spread = noise * share
+    current = TensorDict(task.initial_state(u), [trajectories])
+    terrain = current.get(TERRAIN, None)
     dynamics = MujocoDynamics(scene)
-    dynamics.reset(row)
-    state: TensorDictBase = row.select(QPOS, QVEL)
+    dynamics.reset(current)
+    state: TensorDictBase = current.select(QPOS, QVEL)
     if scene.variation is not None:
-        state[PARAMETERS] = scene.variation.draw(rows, generator)
-    action = torch.zeros(rows, controller.num_actions, dtype=torch.float64)
+        state[PARAMETERS] = scene.variation.draw(trajectories, generator)
+    action = torch.zeros(trajectories, controller.num_actions, dtype=torch.float64)
     states, commands, recent = [state.select(QPOS, QVEL)[:, None]], [], None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for step in range(steps):
             if step % task.frame_skip == 0:
-                seen = task.observation(row.update(state)).float()
+                seen = task.observation(current.update(state)).float()
                 recent = append_frame(recent, seen, frame_stack_of(actor))
-                shown = TensorDict({OBSERVATION: recent}, [rows])
+                shown = TensorDict({OBSERVATION: recent}, [trajectories])
                 mean = actor(shown)[ACTION].double()
                 kick = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
                 action = (mean + spread * kick).clamp(-1.0, 1.0)

@@ -14,18 +14,18 @@ from torchrl_nerd.modules.training_range import magnitudes
 from torchrl_nerd.scenes.commands import command_of
 
 REST_SPEED = 1e-4  # m/s, rad/s: slower is rest in the data; soft friction creeps faster
-ROWS, MIN_ROWS = 256, 16
+MAX_STATES, MIN_STATES = 256, 16
 STEPS = 20
 QUANTILE, MARGIN = 0.99, 1.5
 MAX_SPEED = 0.1  # m/s or rad/s: a model that moves faster than this does not rest
 
 
 def resting(data: TensorDict) -> TensorDict:
-    """Up to 256 transitions ``[rows]`` at rest, spread over ``[trajectories, steps]``."""
+    """Up to 256 transitions ``[n]`` at rest, spread over ``[trajectories, steps]``."""
     speed = torch.maximum(data[QVEL].abs(), data[NEXT_QVEL].abs()).amax(-1)
-    rows = (speed.flatten() < REST_SPEED).nonzero()[:, 0]
+    still = (speed.flatten() < REST_SPEED).nonzero()[:, 0]
     flat = cast(TensorDict, data.flatten())
-    return cast(TensorDict, flat[rows[:: max(1, -(-len(rows) // ROWS))]])
+    return cast(TensorDict, flat[still[:: max(1, -(-len(still) // MAX_STATES))]])
 
 
 @torch.no_grad()
@@ -36,7 +36,7 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
     above those that it gives them, stopped, within one. Nothing is changed where there are
     too few such states; a model that does not keep them at rest never sleeps.
     """
-    if len(states) < MIN_ROWS or not model.sleep.can_rest:
+    if len(states) < MIN_STATES or not model.sleep.can_rest:
         return
     model.sleep.sleep_speed.zero_()  # or an earlier threshold would hide its noise
     speeds = _speeds(model, states, STEPS)
@@ -51,7 +51,7 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
 def _speeds(model: NeRD, states: TensorDict, steps: int) -> Tensor:
     """What 99% of the states' speeds ``(nv,)`` in so many steps are below."""
     start = states.select(QPOS, QVEL, TERRAIN, PARAMETERS, strict=False)
-    command = command_of(model.scene, states)[:, None]  # (rows, 1, m)
+    command = command_of(model.scene, states)[:, None]  # (states, 1, m)
     path = states_of(NeRDDynamics(model), start, steps, command)
     speeds = [magnitudes(model.sleep.vectors, state[QVEL]) for state in path]
     return torch.quantile(torch.cat(speeds), QUANTILE, dim=0)

@@ -56,7 +56,8 @@ class Inputs(NamedTuple):
 class Sequences:
     """Batches of sequences from a data set ``[trajectories, steps]``, on its device.
 
-    With ``symmetry`` each sample of a learned model is shown as a random one of its images.
+    With ``symmetry`` each sample of a learned model is shown as a random one of its
+    symmetric copies.
     """
 
     def __init__(
@@ -69,70 +70,73 @@ class Sequences:
         self.change = change_times(data)
 
     def pick(
-        self, rows: int, length: int, generator: Generator
+        self, batch_size: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor]:
-        """Random trajectories and times: indices ``(rows, 1), (rows, length)``."""
-        row = torch.randint(len(self.targets), (rows, 1), generator=generator)
+        """Random trajectories and times: indices ``(batch, 1), (batch, length)``."""
+        size = (batch_size, 1)
+        trajectory = torch.randint(len(self.targets), size, generator=generator)
         last = self.steps - length + 1
-        start = torch.randint(last, (rows, 1), generator=generator)
-        row, start = self._sent(row), self._sent(start)
-        return row, start + torch.arange(length, device=start.device)
+        start = torch.randint(last, size, generator=generator)
+        trajectory, start = self._sent(trajectory), self._sent(start)
+        return trajectory, start + torch.arange(length, device=start.device)
 
     def _sent(self, drawn: Tensor) -> Tensor:
         """Random numbers of the host on the device, which it does not wait for."""
         return drawn.to(self.targets.device, non_blocking=True)
 
     def one_step(
-        self, rows: int, length: int, generator: Generator
+        self, batch_size: int, length: int, generator: Generator
     ) -> tuple["Inputs", Tensor]:
-        """Network inputs and targets of ``(rows, length)`` samples."""
-        row, time_index = self.pick(rows, length, generator)
-        targets = self.targets[row, time_index]  # (rows, length, D)
-        inputs = self.inputs.each(lambda x: x[row, time_index])
+        """Network inputs and targets of ``(batch_size, length)`` samples."""
+        index = self.pick(batch_size, length, generator)
+        targets = self.targets[index]  # (batch, length, D)
+        inputs = self.inputs.each(lambda x: x[index])
         if self.symmetry is None:
             return inputs, targets
         count = len(self.symmetry.isometries)
-        choice = self._sent(torch.randint(count, (rows,), generator=generator))
+        choice = self._sent(torch.randint(count, (batch_size,), generator=generator))
         token = self.symmetry.tokens(inputs.token, choice)
         return inputs._replace(token=token), self.symmetry.targets(targets, choice)
 
-    def _of_one_robot(self, row: Tensor, time_index: Tensor) -> Tensor:
-        """Windows ``(rows, length)`` moved behind their robot's change, or before it."""
+    def _of_one_robot(self, trajectory: Tensor, time_index: Tensor) -> Tensor:
+        """Windows ``(batch, length)`` moved behind a change of robot, or before it."""
         assert self.change is not None
-        change, first, length = self.change[row], time_index[:, :1], time_index.shape[1]
-        is_mixed = (first < change) & (change < first + length)  # (rows, 1)
+        first, length = time_index[:, :1], time_index.shape[1]
+        change = self.change[trajectory]
+        is_mixed = (first < change) & (change < first + length)  # (batch, 1)
         is_early = change + length > self.steps
         moved = torch.where(is_early, (change - length).clamp_min(0), change)
         return time_index - first + torch.where(is_mixed, moved, first)
 
     def rollout(
-        self, rows: int, length: int, generator: Generator
+        self, batch_size: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-        """True ``qpos``, ``qvel (rows, length + 1, ...)``, commands, ground, parameters."""
-        row, time_index = self.pick(rows, length, generator)
+        """``qpos``, ``qvel (batch, length + 1, ...)``, commands, ground, parameters."""
+        trajectory, time_index = self.pick(batch_size, length, generator)
         if self.change is not None:
-            time_index = self._of_one_robot(row, time_index)
-        batch = cast(TensorDict, self.data[row, time_index])
-        if self.symmetry is not None:  # the rows are in no order: a part for each
+            time_index = self._of_one_robot(trajectory, time_index)
+        batch = cast(TensorDict, self.data[trajectory, time_index])
+        if self.symmetry is not None:  # samples are in no order: a part for each
             isometries = self.symmetry.isometries
             parts = zip(isometries, batch.chunk(len(isometries)), strict=False)
-            images = [isometry(part) for isometry, part in parts]
-            batch = cast(TensorDict, torch.cat(images))  # pyright: ignore
+            copies = [isometry(part) for isometry, part in parts]
+            batch = cast(TensorDict, torch.cat(copies))  # pyright: ignore
         qpos = torch.cat((batch[QPOS], batch[NEXT_QPOS][:, -1:]), 1)
         qvel = torch.cat((batch[QVEL], batch[NEXT_QVEL][:, -1:]), 1)
         first = cast(TensorDict, batch[:, 0])  # these are the same at all times
-        own = first.get(TERRAIN, None), first.get(PARAMETERS, None)  # (rows, size)
+        own = first.get(TERRAIN, None), first.get(PARAMETERS, None)  # (batch, size)
         return qpos, qvel, command_of(self.scene, batch), *own
 
 
 def change_times(data: TensorDict) -> Tensor | None:
-    """The step from which a trajectory's robot is another, ``(rows,)``; 0: it stays.
+    """The step from which a trajectory's robot is another; 0: it stays.
 
-    None where no robot of the data ``[rows, steps]`` changes.
+    None where no robot of the data ``[trajectories, steps]`` changes.
     """
     parameters = data.get(PARAMETERS, None)
     if parameters is None:
         return None
-    is_new = (parameters[:, 1:] != parameters[:, :-1]).any(-1)  # (rows, steps - 1)
+    # (trajectories, steps - 1)
+    is_new = (parameters[:, 1:] != parameters[:, :-1]).any(-1)
     when = torch.where(is_new.any(1), is_new.int().argmax(1) + 1, 0)
     return when if bool(is_new.any()) else None

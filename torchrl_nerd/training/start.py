@@ -41,7 +41,7 @@ def begin_from(
 
     Raises:
         ValueError: in one sentence, a configuration of another network, kind or step,
-            inputs of another width, or statistics that the symmetry's images do not share.
+            inputs of another width, or statistics that symmetric copies do not share.
     """
     if start.config != network_config(config.network):
         names = [name for name, known in NETWORKS.items() if known == start.config]
@@ -65,7 +65,7 @@ def begin_from(
     model.normalize.load_state_dict(start.normalize.state_dict())
     if symmetry is not None and not symmetry.keeps(model.normalize):
         raise ValueError(
-            "expected a model to start from that was trained on symmetry images, got "
+            "expected a model to start from that was trained with use_symmetry, got "
             "one whose statistics they change: train without use_symmetry"
         )
     return model

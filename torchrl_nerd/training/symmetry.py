@@ -1,9 +1,9 @@
-"""Symmetries of a robot, and data augmentation by them: samples as images of themselves.
+"""Symmetries of a robot, and data augmentation by them: symmetric copies of samples.
 
 An ant turned by 90 degrees is the same ant with its legs renumbered. Candidates are the 48
 isometries that map the axes of the base frame to themselves. One is kept if it maps joints
-to joints and MuJoCo's step of the image is the image of its step. The image of a token or
-target is a signed permutation of its entries.
+to joints and commutes with MuJoCo's step. A symmetric copy of a token or target is a
+signed permutation of its entries.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ MAX_DEPTH = 0.01  # m that the trials reach into the ground
 MIRROR = np.diag((1.0, -1.0, 1.0))  # of the world, where the base is mirrored
 RTOL = 1e-7  # of equal entries, relative to the largest of a column
 STATS_TOL = 1e-3  # standard deviations: more than rounding, less than a network notices
-STATES = 512  # whose features tell which entry of an image is which of the original
+STATES = 512  # whose features tell which entry of a copy is which of the original
 OVERSHOOT = 0.2  # of a joint's range, beyond its limits
 MAX_DEPTHS = 0.01, 1.0  # m: with some of the contact points in the ground, and with all
 
@@ -47,7 +47,7 @@ class Isometry(nn.Module):
     Args:
         body: ``(3, 3)``, of vectors in the axes of the floating base. Where it is a
             reflection, the world is mirrored as well, so that the base stays a rotation.
-        sources: ``(nv,)``: dof v of the image is sign times dof source.
+        sources: ``(nv,)``: dof v of the copy is sign times dof source.
         signs: ``(nv,)``.
         actuated: dofs with a motor, in the order of torques.
     """
@@ -81,28 +81,28 @@ class Isometry(nn.Module):
         keep_indices(self, joint_sources=sources[6:], motors=motors)
 
     def qpos(self, qpos: Tensor) -> Tensor:
-        """Image of positions ``(*batch, nq)``."""
+        """Symmetric copy of positions ``(*batch, nq)``."""
         position, quat = qpos[..., :3] @ self.world.mT, qpos[..., 3:7] * self.mirror
         joints = qpos[..., self.joint_sources + 1] * self.joint_signs
         return torch.cat((position, quat_multiply(quat, self.turn), joints), -1)
 
     def qvel(self, qvel: Tensor) -> Tensor:
-        """Image of velocities ``(*batch, nv)``."""
+        """Symmetric copy of velocities ``(*batch, nv)``."""
         linear, angular = qvel[..., :3] @ self.world.mT, qvel[..., 3:6] @ self.axial.mT
         joints = qvel[..., self.joint_sources] * self.joint_signs
         return torch.cat((linear, angular, joints), -1)
 
     def torque(self, joint_torque: Tensor) -> Tensor:
-        """Image of joint torques ``(*batch, num_actuated)``."""
+        """Symmetric copy of joint torques ``(*batch, num_actuated)``."""
         return joint_torque[..., self.motors] * self.motor_signs
 
     def forward(self, data: TensorDict) -> TensorDict:
-        """Image of states or transitions: of every key that is there."""
+        """Symmetric copy of states or transitions: of every key that is there."""
         maps = {QPOS: self.qpos, QVEL: self.qvel, JOINT_TORQUE: self.torque}
         maps |= {NEXT_QPOS: self.qpos, NEXT_QVEL: self.qvel}
         keys = data.keys(True)
-        image = {key: apply(data[key]) for key, apply in maps.items() if key in keys}
-        return TensorDict(image, data.batch_size)
+        copy = {key: apply(data[key]) for key, apply in maps.items() if key in keys}
+        return TensorDict(copy, data.batch_size)
 
 
 def find_isometries(scene: Scene) -> list[Isometry]:
@@ -113,7 +113,7 @@ def find_isometries(scene: Scene) -> list[Isometry]:
     """
     model, ground = scene.model, scene.terrain
     is_legged = scene.base.is_floating and model.nv == model.njnt + 5
-    is_varied = ground is not None and ground.is_per_row
+    is_varied = ground is not None and ground.is_per_env
     if not is_legged or is_varied or scene.servos is not None:
         raise ValueError(
             f"expected a floating base, hinges or slides, motors and one ground to train "
@@ -136,7 +136,7 @@ def _candidates(scene: Scene) -> Iterator[Isometry]:
 def _match_joints(
     model: mujoco.MjModel, body: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """For each dof the one it is the image of, and the sign; None if one has none."""
+    """For each dof the one it is mapped from, and the sign; None if one has none."""
     data = mujoco.MjData(model)
     data.qpos[:] = np.eye(model.nq)[3]  # the base at the origin, not turned
     mujoco.mj_kinematics(model, data)
@@ -161,7 +161,7 @@ def _match_joints(
 
 
 def _solver_agrees(scene: Scene, isometry: Isometry) -> bool:
-    """Whether the step of the image is the image of the step, on the ground too."""
+    """Whether the isometry commutes with the step, on the ground too."""
     here = states_in_contact(scene, TRIALS, MAX_DEPTH)
     there = isometry(here)
     dynamics, ends = MujocoDynamics(scene, num_threads=1), []
@@ -173,58 +173,58 @@ def _solver_agrees(scene: Scene, isometry: Isometry) -> bool:
     return bool((expected - ends[1]).abs().amax() <= STEP_RTOL * (1.0 + change))
 
 
-def states_in_contact(scene: Scene, rows: int, max_depth: float) -> TensorDict:
-    """Random states and torques ``[rows]``, up to ``max_depth`` m in the ground."""
+def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
+    """Random states and torques ``[count]``, up to ``max_depth`` m in the ground."""
     generator = Generator().manual_seed(0)
-    state, scale = scene.sample_initial(rows, generator)
-    draw = torch.rand(rows, dtype=torch.float64, generator=generator)
+    state, scale = scene.sample_initial(count, generator)
+    draw = torch.rand(count, dtype=torch.float64, generator=generator)
     scene.place_on_terrain(state, -max_depth * draw)
     torque = sample_commands(scene.sampling, scale, 1, generator)
-    return TensorDict(state, [rows]).set(JOINT_TORQUE, torque[:, 0])
+    return TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
 
 
 class SignedPermutations(nn.Module):
-    """Images of a kind of vector under isometries: ``image[j] = sign[j] x[source[j]]``.
+    """Symmetric copies of a kind of vector: ``copy[j] = sign[j] x[source[j]]``.
 
-    Found from samples ``(N, F)`` and their images under each isometry. Every entry that is
+    Found from samples ``(N, F)`` and their copies by each isometry. Every entry that is
     ever not zero must be so in a sample.
 
     Raises:
-        ValueError: an entry of an image that is none of the original's.
+        ValueError: an entry of a copy that is none of the original's.
     """
 
     sources: Tensor
     signs: Tensor
 
-    def __init__(self, original: Tensor, images: Sequence[Tensor]) -> None:
+    def __init__(self, original: Tensor, copies: Sequence[Tensor]) -> None:
         super().__init__()
-        sources, signs = zip(*(_match(original, x) for x in images), strict=True)
+        sources, signs = zip(*(_match(original, x) for x in copies), strict=True)
         keep_indices(self, sources=sources)  # (isometries, F)
         keep_constants(self, signs=signs)
 
     def forward(self, x: Tensor, choice: Tensor) -> Tensor:
-        """Images of ``x (rows, length, F)``, each row by isometry ``choice (rows,)``."""
-        sources = self.sources[choice][:, None].expand(x.shape)  # (rows, length, F)
+        """Copies of ``x (batch, length, F)``, each by isometry ``choice (batch,)``."""
+        sources = self.sources[choice][:, None].expand(x.shape)  # (batch, length, F)
         return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
 
     def complete(self, stats: Stats) -> Stats:
-        """Statistics of all images: with these, normalised vectors map as raw ones do."""
+        """Statistics of all copies: with these, normalised vectors map as raw ones."""
         return Stats.merge_all(
             Stats(stats.count, sign * stats.mean[source], stats.m2[source])
             for source, sign in zip(self.sources, self.signs, strict=True)
         )
 
     def keep(self, mean: Tensor, std: Tensor) -> bool:
-        """Whether images of samples of these statistics ``(F,)`` have the same ones."""
+        """Whether copies of samples of these statistics ``(F,)`` have the same ones."""
         means, stds = self.signs * mean[self.sources], std[self.sources]
         apart = torch.maximum((means - mean).abs(), (stds - std).abs())
         return bool((apart < STATS_TOL * std).all())
 
 
-def _match(original: Tensor, image: Tensor) -> tuple[list[int], list[float]]:
+def _match(original: Tensor, copy: Tensor) -> tuple[list[int], list[float]]:
     scale = RTOL * (original.abs().amax(0) + 1e-3)
     sources, signs = [], []
-    for j, column in enumerate(image.T):
+    for j, column in enumerate(copy.T):
         for sign in (1.0, -1.0):
             apart = (column[:, None] - sign * original).abs().amax(0)
             fits = (apart <= scale).nonzero()[:, 0].tolist()
@@ -233,7 +233,7 @@ def _match(original: Tensor, image: Tensor) -> tuple[list[int], list[float]]:
                 signs.append(sign)
                 break
         else:
-            raise ValueError(f"entry {j} of the image is no entry of the original")
+            raise ValueError(f"entry {j} of a copy is no entry of the original")
     return sources, signs
 
 
@@ -242,7 +242,7 @@ class Symmetry(nn.Module):
 
     Raises:
         ValueError: see `find_isometries`; a feature that is zero in all of these states;
-            a scene whose parameters differ from row to row.
+            a scene whose parameters differ from robot to robot.
     """
 
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
@@ -261,23 +261,23 @@ class Symmetry(nn.Module):
             states[QPOS][:, model.jnt_qposadr[joint]] = low + (high - low) * mixed
         for key in (QPOS, QVEL):  # a change between any two states will do
             states["next", key] = states[key].roll(1, 0)
-        images = [raw_tokens(*encode, image(states)) for image in self.isometries]
-        still = (images[0][0] == 0.0).all(0).nonzero()[:, 0].tolist()
-        if still and len(images) > 1:
+        copies = [raw_tokens(*encode, isometry(states)) for isometry in self.isometries]
+        still = (copies[0][0] == 0.0).all(0).nonzero()[:, 0].tolist()
+        if still and len(copies) > 1:
             raise ValueError(
                 f"expected random states of '{scene.name}' to fill every feature, got "
                 f"none for {still}: train without use_symmetry"
             )
-        tokens, targets = zip(*images, strict=True)
+        tokens, targets = zip(*copies, strict=True)
         self.tokens = SignedPermutations(tokens[0], tokens)
         self.targets = SignedPermutations(targets[0], targets)
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
-        """Statistics of tokens and targets with all their images."""
+        """Statistics of tokens and targets with all their symmetric copies."""
         both = (TOKEN, self.tokens), (TARGET, self.targets)
-        return {key: images.complete(stats[key]) for key, images in both}
+        return {key: copies.complete(stats[key]) for key, copies in both}
 
     def keeps(self, normalize: Normalize) -> bool:
-        """Whether images of normalised tokens and targets are those of raw ones."""
+        """Whether copies of normalised tokens and targets are those of raw ones."""
         both = (TOKEN, self.tokens), (TARGET, self.targets)
         return all(x.keep(normalize.mean(key), normalize.std(key)) for key, x in both)

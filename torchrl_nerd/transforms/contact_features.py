@@ -2,10 +2,11 @@
 
 NeRD section 3.2 feeds closest point p1, normal n and distance d of every contact point,
 zeroed beyond the margin xi. p1 follows from kinematics, n and d, so it is left out. Where
-the ground is one plane that all rows share, and it is level (gravity is normal to it) or a
-fixed base cannot turn against it, n follows from gravity and pose and is left out too. Of
-several surfaces each point sees the nearest, so that a model fits any number. Added are
-velocities and predictions, see `predicted_contact`; all fades to zero at the margin.
+the ground is one plane that all envs share, and it is level (gravity is normal to it)
+or a fixed base cannot turn against it, n follows from gravity and pose, and is left out
+too. Of several surfaces each point sees the nearest, so that a model fits any number.
+Added are velocities and predictions, see `predicted_contact`; all fades to zero at the
+margin.
 """
 
 import numpy as np
@@ -72,7 +73,7 @@ class ContactFeatures(FeatureTransform):
             in_keys = [QPOS, QVEL]
             sizes = {CONTACT_DISTANCE: count, CONTACT_VELOCITY: 4 * count}
             sizes[CONTACT_DEPTH] = len(times_of(scene)) * count
-            if terrain.is_per_row:
+            if terrain.is_per_env:
                 in_keys.append(TERRAIN)
             if features.predicted_force:
                 sizes[CONTACT_FORCE] = scene.layout.nv
@@ -133,13 +134,14 @@ class ContactFeatures(FeatureTransform):
         gate = gate[..., None]  # (*batch, P, 1)
         speed = (velocity * normal).sum(-1)
         sliding = velocity - speed[..., None] * normal
-        gain = None
+        velocity_change = None  # of unconstrained motion over the step
         if self.rigid_body is not None:
             torque = None if drive is None else drive[..., : self.num_torques]
             given = qpos, qvel, torque, pose[1], places, self.step_size
-            gain = self.step_size * self.rigid_body(*given)
-        motion = qpos, qvel, terrain, gain, self.radii - distance, speed
-        depth = gate * self.predicted_penetration(*motion)  # (*batch, P, K)
+            velocity_change = self.step_size * self.rigid_body(*given)
+        motion = qpos, qvel, terrain, velocity_change
+        penetration = self.predicted_penetration(*motion, self.radii - distance, speed)
+        depth = gate * penetration  # (*batch, P, K)
         moving = gate * torch.cat((speed[..., None], sliding), -1)  # (*batch, P, 4)
         features = [beyond.clamp_max(0.0), moving.flatten(-2), depth.flatten(-2)]
         if self.force is not None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants, over_ground
 from torchrl_nerd.geometry.kinematics import PointKinematics
 from torchrl_nerd.geometry.manifold import integrate_pos
-from torchrl_nerd.scenes.penalty_law import PenaltyLaw, friction_force, normal_force
+from torchrl_nerd.scenes import penalty_law
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain import TerrainDistance
 
@@ -56,7 +56,7 @@ class PredictedPenetration(nn.Module):
         qpos: Tensor,
         qvel: Tensor,
         terrain: Tensor | None,
-        gain: Tensor | None,
+        velocity_change: Tensor | None,
         depth: Tensor,
         speed: Tensor,
     ) -> Tensor:
@@ -66,19 +66,20 @@ class PredictedPenetration(nn.Module):
         after the step. Along unconstrained motion the cubic through depths and rates at
         both ends, accurate to 0.02 mm in the double pendulum's impacts.
 
-        ``gain (*batch, nv)`` is the velocity change of unconstrained motion over the step,
+        ``velocity_change (*batch, nv)`` is that of unconstrained motion over the step;
         None: at constant velocity. Of every point now, ``depth (*batch, P)`` is in m and
         ``speed (*batch, P)`` that along its normal, m/s.
         """
-        if gain is None:
+        if velocity_change is None:
             later = integrate_pos(self.layout, qpos, self.period * qvel)
             points, _ = self.kinematics(later, qvel.new_empty(0, qvel.shape[-1]))
             distance, _ = self.ground(points, terrain, *self.pose(later))
             ends = depth, -self.period * speed, self.radii - distance
             # (*batch, P, 3) @ (3, K)
             return (torch.stack(ends, -1) @ self.parabola).clamp_min(0.0)
-        first = qvel + 0.5 / self.substeps * gain  # semi-implicit Euler: velocity first
-        mean, last = first + 0.5 * gain, first + gain
+        # semi-implicit Euler: velocity first
+        first = qvel + 0.5 / self.substeps * velocity_change
+        mean, last = first + 0.5 * velocity_change, first + velocity_change
         later = integrate_pos(self.layout, qpos, self.period * mean)
         # both ends of the step at once: (2, *batch, nq) and (2, *batch, nv)
         states, rates = torch.stack((qpos, later)), torch.stack((first, last))
@@ -127,7 +128,7 @@ class PredictedForce(nn.Module):
     def __init__(self, scene: Scene, axes: JointAxes) -> None:
         super().__init__()
         model, self.is_floating = scene.model, scene.base.is_floating
-        law = PenaltyLaw.of_bodies(model, scene.contacts.bodies)
+        law = penalty_law.PenaltyLaw.of_bodies(model, scene.contacts.bodies)
         merged = scene.contacts.merged.sum(1)
         numbers = law.stiffness, law.damping, law.slip, law.friction, merged
         keep_constants(
@@ -154,13 +155,16 @@ class PredictedForce(nn.Module):
         across it, m/s; ``places (*batch, 2 J, 3)`` of the axes' anchors and tips, m.
         """
         stiffness, damping, slip, friction, merged = self.law
+        spring, damper = stiffness[:, None], damping[:, None]
         # mean over the K times: (*batch, P)
-        push = normal_force(stiffness[:, None], damping[:, None], depth, speed).mean(-1)
+        normal_force = penalty_law.normal_force(spring, damper, depth, speed).mean(-1)
         slipping = torch.linalg.vector_norm(sliding, dim=-1)
-        touching = (depth > 0.0).to(push.dtype).mean(-1)  # share of the step
-        drag = friction_force(slip * touching, friction, push, slipping)
-        drag = drag / (slipping + MIN_SLIP)
-        force = push[..., None] * normal - drag[..., None] * sliding
+        touching = (depth > 0.0).to(normal_force.dtype).mean(-1)  # share of the step
+        friction_force = penalty_law.friction_force(
+            slip * touching, friction, normal_force, slipping
+        )
+        per_slip = friction_force / (slipping + MIN_SLIP)
+        force = normal_force[..., None] * normal - per_slip[..., None] * sliding
         force = merged[:, None] * force  # coinciding points act one by one
         moment = torch.linalg.cross(points, force)
         anchor, tip = places.chunk(2, -2)  # (*batch, J, 3) each

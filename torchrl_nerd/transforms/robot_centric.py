@@ -99,8 +99,8 @@ class RobotCentric(FeatureTransform):
     ) -> list[Tensor]:
         """Poses of other trees ``(*batch, 3)``, and velocities of free bodies, in B_t."""
         batch = qpos.shape[:-1]
-        rows = (x.reshape(batch.numel(), x.shape[-1]).T for x in (qpos, qvel))
-        position, rotation, spin, linear = trees(*rows)
+        columns = (x.reshape(batch.numel(), x.shape[-1]).T for x in (qpos, qvel))
+        position, rotation, spin, linear = trees(*columns)
         vectors = [position[:, i] for i in self.seen]
         vectors += [rotation[:, axis, i] for i in self.seen for axis in (0, 1)]
         vectors += [x[:, i] for i in self.free for x in (linear, spin)]
@@ -181,9 +181,9 @@ class _JointFeatures:
             above = (high - position - margin).clamp_max(0.0)
             parts += [below, above]
             if self.gated:
-                rows, dofs = map(list, zip(*self.gated, strict=True))
+                points, dofs = map(list, zip(*self.gated, strict=True))
                 depth = -torch.minimum(below, above) / (FADE * margin)
-                parts.append(take(qvel, dofs) * take(depth, rows).clamp(0.0, 1.0))
+                parts.append(take(qvel, dofs) * take(depth, points).clamp(0.0, 1.0))
         if self.predicted:
             parts.append(self._limit_torque(take(qpos, self.limited), qvel))
         return parts

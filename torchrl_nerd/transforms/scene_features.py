@@ -36,7 +36,7 @@ class SceneFeatures(nn.Module):
         self.size += 0 if self.variation is None else self.variation.size
 
     def told(self, parameters: Tensor | None) -> Tensor | None:
-        """What a model that is told the row's parameters gets of them; else None."""
+        """What a model that is told the env's parameters gets of them; else None."""
         if self.variation is None or parameters is None:
             return None
         return self.variation.shares(parameters)

@@ -50,9 +50,9 @@ class StateDelta(Transform):
     def __init__(self, scene: Scene) -> None:
         super().__init__([QPOS, QVEL, NEXT_QPOS, NEXT_QVEL], [STATE_DELTA])
         self.layout, self.base = scene.layout, scene.base
-        self.step_size, mount = scene.control_step, np.empty(4)
-        mujoco.mju_mat2Quat(mount, scene.fixed_base_pose[1].reshape(-1))
-        self.mount = tuple(mount.tolist())
+        self.step_size, base_quat = scene.control_step, np.empty(4)
+        mujoco.mju_mat2Quat(base_quat, scene.fixed_base_pose[1].reshape(-1))
+        self.fixed_base_quat = tuple(base_quat.tolist())
 
     @property
     def size(self) -> int:
@@ -108,7 +108,7 @@ class StateDelta(Transform):
     def _orientation(self, qpos: Tensor) -> Tensor:
         """Of the base, ``(*batch, 4)``."""
         if not self.base.is_floating:
-            return constant(qpos, self.mount).expand(*qpos.shape[:-1], 4)
+            return constant(qpos, self.fixed_base_quat).expand(*qpos.shape[:-1], 4)
         q = self.base.qpos_address + 3
         return qpos[..., q : q + 4]
 

@@ -72,7 +72,7 @@ def small(tmp_path) -> Options:
     """The smallest benchmark there is."""
     return Options(
         tasks=("cartpole/swingup",),
-        rows=2,
+        num_envs=2,
         rounds=LEAST_ROUNDS,
         spread=100.0,
         baseline=tmp_path / "baseline.json",
@@ -91,7 +91,7 @@ def test_a_small_benchmark_writes_its_baseline(small):
     written = read_json(small.baseline)
     assert "cartpole" in written["networks"] and written["ratios"]
     assert all(row["value"] > 0.0 for row in written["ratios"].values())
-    small.write, small.rows = False, 3
+    small.write, small.num_envs = False, 3
     with pytest.raises(ValueError, match="has other rows: write a new baseline"):
         main(small)
     small.rounds = 1

@@ -51,7 +51,7 @@ def _drop(scene: Scene, count: int, generator: Generator) -> TensorDict:
     """The final states of those drops that end at rest."""
     start = sample_states(scene, count, generator)
     start[QVEL] = 0.0 * start[QVEL]
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    if scene.terrain is not None and scene.terrain.is_per_env:
         start[TERRAIN] = torch.from_numpy(scene.terrain.default).expand(count, -1)
     steps = round(SETTLE / scene.control_step)
     path = rollout(MujocoDynamics(scene), start, steps, every=steps)
@@ -64,7 +64,7 @@ def clear_of_ground(scene: Scene, start: TensorDict) -> TensorDict:
     start = start.clone()
     if scene.base.is_floating:
         start[QPOS][:, scene.base.qpos_address + 2] += HIGH
-    if scene.terrain is not None and scene.terrain.is_per_row:
+    if scene.terrain is not None and scene.terrain.is_per_env:
         start[TERRAIN][:, 3] -= HIGH
     return start
 

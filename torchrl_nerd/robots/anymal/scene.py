@@ -78,15 +78,14 @@ def random_pd(
 ) -> Tensor:
     """Springs and dampers to random targets about the standing pose, N m, ``(n, 12)``.
 
-    target = pose + 0.5 a, a uniform in [-1, 1]. Rows of scale 1 are the reference's: Kp
-    and Kd are drawn at every step, here per row. A torque that is held over the control
-    step dt adds energy as a damping of -Kp dt / 2 would; this much is added to Kd, or a
-    quarter of all trajectories would diverge within 100 steps. Quiet rows (0 < scale < 1)
-    have the tasks' Kp and Kd and targets within ``scale`` of that range: they stand and
-    shuffle as a policy would. Rows of scale 0 are passive.
+    target = pose + 0.5 a, a uniform in [-1, 1]. Trajectories of scale 1 are the
+    reference's: Kp and Kd are drawn at every step, here per trajectory. A torque that
+    is held over the control step dt adds energy as a damping of -Kp dt / 2 would. This
+    much is added to Kd: without it a quarter of them would diverge within 100 steps.
+    Quiet ones (0 < scale < 1) have the tasks' Kp and Kd and targets within ``scale`` of
+    that range: they stand and shuffle as a policy would. Those of scale 0 are passive.
     """
-    rows = len(qpos)
-    draw = torch.rand(rows, 14, dtype=torch.float64, generator=generator)
+    draw = torch.rand(len(qpos), 14, dtype=torch.float64, generator=generator)
     (low_kp, high_kp), (low_kd, high_kd) = RANDOM_KP, RANDOM_KD
     is_quiet = scale < 1.0
     kp = torch.where(is_quiet, KP, low_kp + (high_kp - low_kp) * draw[:, :1])

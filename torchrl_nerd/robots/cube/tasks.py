@@ -64,7 +64,7 @@ class RealCubeToss(CubeToss):
 
 
 class SlopeToss(CubeToss):
-    """The same over a plane of its own in every row, up to 20 degrees steep."""
+    """The same over a plane of its own in every env, up to 20 degrees steep."""
 
     build_scene = staticmethod(cube_slope)
     num_uniforms = CubeToss.num_uniforms + 2

@@ -1,4 +1,4 @@
-"""Double pendulum of the NeRD paper over a plane that differs from row to row."""
+"""Double pendulum of the NeRD paper over a plane that differs from env to env."""
 
 from functools import cache
 from math import cos, pi, sin
@@ -70,7 +70,7 @@ def sample_level_ground(qpos: Tensor, generator: Generator) -> Tensor:
     """Planes ``(n, 4)`` that the links hit head-on; not in the paper.
 
     Four of its grounds have normals in the plane of motion, of which `sample_ground` draws
-    none. Here half of the rows have one, the others tilt out of it by up to
+    none. Here half of the trajectories have one, the others tilt out of it by up to
     `LEVEL_TILT`; offsets as there.
     """
     draw = torch.rand(len(qpos), 4, dtype=torch.float64, generator=generator)

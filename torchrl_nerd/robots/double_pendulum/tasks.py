@@ -19,11 +19,11 @@ MAX_START_SPEED = 2.0  # rad/s
 class DoublePendulumPassive(Task):
     """Zero reward, never terminated; the protocol of the paper's appendix C.2.
 
-    Every row stands over one of the seven evaluation grounds, drawn at each reset, or
+    Every env has one of the seven evaluation grounds, drawn at each reset, or
     over the one that ``ground`` names.
 
     Args:
-        ground: 0 (out of reach) to 6; None draws one per row.
+        ground: 0 (out of reach) to 6; None draws one per env.
     """
 
     build_scene = staticmethod(double_pendulum)

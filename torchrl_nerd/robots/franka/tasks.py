@@ -51,7 +51,7 @@ class FrankaReachTorque(Task):
 
     def end_effector(self, qpos: Tensor) -> Tensor:
         """The point between the fingertips, m, world, ``(*batch, 3)``."""
-        still = qpos.new_zeros(0, qpos.shape[-1])  # no rows: positions alone
+        still = qpos.new_zeros(0, qpos.shape[-1])  # no velocities: positions alone
         points, _ = placed(self._kinematics, qpos)(qpos, still)
         position, rotation = self.scene.base_pose(qpos)
         return position + (rotation @ points[..., 0, :, None]).squeeze(-1)

@@ -150,8 +150,8 @@ def sliding(trial: Trial) -> Iterator[Metric]:
     """Pushed along the ground at 1 m/s it stops."""
     start = trial.settled(16)
     v, q = trial.scene.base.dof_address, trial.scene.base.qpos_address
-    push = trial.normal(len(start), 2)
-    start[QVEL][:, v : v + 2] = push / norm(push)[:, None]  # 1 m/s
+    direction = trial.normal(len(start), 2)
+    start[QVEL][:, v : v + 2] = direction / norm(direction)[:, None]  # 1 m/s
     end = cast(TensorDict, trial.roll(start, 300)[:, -1])
     exact = cast(TensorDict, trial.roll_exactly(start, 300)[:, -1])
     left = largest(norm(end[QVEL][:, v : v + 3]))

@@ -1,4 +1,4 @@
-"""A varied row moves as a MuJoCo model of its own would, one `mj_step` after the other."""
+"""A varied env moves as a MuJoCo model of its own would, one `mj_step` after the other."""
 
 import mujoco
 import numpy as np
@@ -41,7 +41,7 @@ IDS = [f"{name}: {', '.join(ranges)}" for name, ranges in CASES]
 
 
 def alone(scene: Scene, start, torques, parameters) -> np.ndarray:
-    """States ``(steps, nq + nv)`` of one row, with a model of its own."""
+    """States ``(steps, nq + nv)`` of one env, with a model of its own."""
     variation = scene.variation
     model = varied_model(variation, parameters)
     model.opt.disableflags = engine_model(scene, False).opt.disableflags
@@ -88,7 +88,7 @@ def test_a_row_is_a_model_of_its_own_bit_for_bit(name, ranges, generator):
 
 
 def test_servos_of_a_row_are_as_strong_and_late_as_it_says(tmp_path, generator):
-    """With ``ctrl`` MuJoCo's own law acts in every substep, that of the row's model."""
+    """With ``ctrl`` MuJoCo's own law acts in every substep, that of the env's model."""
     ranges = {"motor:a": (0.5, 1.5), "damping": (0.1, 2.0), "delay": (0, 2)}
     path = tmp_path / "arm.xml"
     path.write_text(ARM)
@@ -114,7 +114,7 @@ def test_servos_of_a_row_are_as_strong_and_late_as_it_says(tmp_path, generator):
         assert np.array_equal(state[row][QVEL], data.qvel)
 
 
-def test_without_parameters_all_rows_are_the_scenes_own_again(generator):
+def test_without_parameters_all_envs_are_the_scenes_own_again(generator):
     scene = load_scene("cartpole").vary({"mass:pole": (3.0, 3.0), "delay": (1, 1)})
     start, torques, _ = random_drive(scene, ROWS, STEPS, generator)
     plain = start.select(QPOS, QVEL)
