@@ -181,6 +181,31 @@ def test_what_steps_one_robot_is_refused_for_many():
     assert PARAMETERS in make_env(task, "cartpole-adaptive").reset()
 
 
+@pytest.mark.parametrize(
+    "name", ["gymnasium/HalfCheetah-v5", "dm_control/walker-walk", "franka/reach_osc"]
+)
+def test_late_commands_are_those_of_the_recorded_actions(name, generator):
+    """Also of actuators with gears, and where an action lasts several control steps."""
+    task = make_task(name).vary({"delay": (2, 2)})
+    whole, warm = (GroundTruthEnv(task, num_envs=2, seed=0) for _ in range(2))
+    actions = random_actions(whole, 6, generator)
+    state, seen = whole.reset(), []
+    for action in actions[:-1]:
+        seen.append(whole.step(state.set("action", action)).clone())
+        state = seen[-1]["next"].exclude("reward")
+    warm.reset(state, set_state=True)
+    warm.warm_up(torch.stack(seen, 1))
+    found = [
+        env.step(state.select(QPOS).set("action", actions[-1]))["next", QPOS]
+        for env in (whole, warm)
+    ]
+    torch.testing.assert_close(*found, rtol=1e-6, atol=1e-6)
+    if name.startswith("gymnasium"):
+        told = torch.stack(seen, 1).exclude("action")
+        with pytest.raises(ValueError, match="'action' in the history of actuators"):
+            warm.warm_up(told)
+
+
 def test_a_history_that_shows_nothing_is_refused():
     env = GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), num_envs=2)
     state = env.reset().select(QPOS, QVEL, PARAMETERS)

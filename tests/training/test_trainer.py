@@ -176,6 +176,15 @@ def test_another_configuration_is_refused_and_nothing_lost(change, tmp_path):
     assert after == before and len(before) >= 4
 
 
+def test_other_data_are_refused(tmp_path):
+    """As many trajectories of the same robot, from another seed."""
+    make_trainer(SCENE, BRIEF, tmp_path).run(until=15)
+    data = trajectories(SCENE, 12)
+    other = simulate(SCENE, *data.batch_size, Generator().manual_seed(1))
+    with pytest.raises(ValueError, match=f"{tmp_path} holds a run with data"):
+        Trainer(SCENE, other, SCENE, BRIEF, tmp_path, quiet=True)
+
+
 def test_another_robot_is_refused(tmp_path):
     make_trainer(SCENE, BRIEF, tmp_path).run(until=15)
     with pytest.raises(ValueError, match=f"{tmp_path} holds a run with scene_hash"):

@@ -1,6 +1,7 @@
 """The interface of all dynamics: state, torque and controls in, next state out."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import mujoco
@@ -69,13 +70,19 @@ class Dynamics(Protocol):
         raise NotImplementedError
 
 
-def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
+def warm_up(
+    dynamics: Dynamics,
+    history: TensorDictBase,
+    num_envs: int,
+    advance: Callable[[TensorDictBase, TensorDictBase], Any] | None = None,
+) -> None:
     """Give a dynamics the past that a recorded motion has; what it had is forgotten.
 
     A rollout from the state after the motion then starts adapted to what the motion shows;
     the ground truth learns of late torques. ``history [num_envs, T]``, oldest first, holds
     ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any, ``ctrl``,
-    ``terrain`` and ``parameters``.
+    ``terrain`` and ``parameters``. ``advance`` makes a step of the motion from its state;
+    by default the dynamics does, with the torque.
 
     Raises:
         ValueError: another number of envs, no step at all, or a key that is missing.
@@ -93,7 +100,10 @@ def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
         if step == 0:
             dynamics.reset(state)
         given = (then.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
-        dynamics.step(state, *given)
+        if advance is None:
+            dynamics.step(state, *given)
+        else:
+            advance(state, then)
 
 
 class Engine(Dynamics):

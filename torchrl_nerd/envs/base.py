@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl_nerd.compat import tensordict_of
 from torchrl_nerd.compiled import Compiled, unaffected
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
-from torchrl_nerd.dynamics.base import warm_up
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import FaultRecorder
 from torchrl_nerd.envs.pixels import RenderedEnv
@@ -243,8 +242,11 @@ class SceneEnv(RenderedEnv):
 
     @unaffected
     def warm_up(self, history: TensorDictBase) -> None:
-        """Show the dynamics a recorded motion up to the present state, see `warm_up`."""
-        warm_up(self.dynamics, history, self.batch_size.numel())
+        """Show the dynamics a recorded motion up to the present state.
+
+        See `Transition.warm_up`.
+        """
+        self._transition.warm_up(history, self.batch_size.numel())
 
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:

@@ -14,10 +14,12 @@ from torch import Tensor
 
 from torchrl_nerd.compiled import Compiled, uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
+from torchrl_nerd.dynamics.base import warm_up
 from torchrl_nerd.envs.faults import find_faults
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import (
     ACTION,
+    CTRL,
     FAULT,
     OBSERVATION,
     PARAMETERS,
@@ -97,6 +99,31 @@ class Transition:
                 trusts.append(moved[TRUST])
         trust = reduce(torch.minimum, trusts) if trusts else None
         return self._judge(state, action, given, age, moved, drive, trust)
+
+    def warm_up(self, history: TensorDictBase, num_envs: int) -> None:
+        """Show the dynamics a recorded motion, see `dynamics.base.warm_up`.
+
+        Where the motion holds ``action``, the controller makes of it what it made of it
+        then: a torque for each control step, or the ``ctrl`` of the robot's own actuators.
+
+        Raises:
+            ValueError: neither action nor ``ctrl`` for actuators whose commands are late.
+        """
+        has_action, varied = ACTION in history.keys(), self.task.scene.variation
+        is_told = has_action or history.get(CTRL, None) is not None
+        is_late = varied is not None and varied.max_delay > 0
+        if is_late and not is_told and self.dynamics.kind == "ground truth":
+            if isinstance(self.task.controller, ActuatorController):
+                wanted = "'action' in the history of actuators that are late"
+                raise ValueError(f"expected {wanted}, got none")
+        warm_up(self.dynamics, history, num_envs, self._repeat if has_action else None)
+
+    def _repeat(self, state: TensorDictBase, then: TensorDictBase) -> None:
+        """Let the dynamics make the control steps of a recorded action once more."""
+        moved = dict(state.items())
+        for _ in range(self.task.frame_skip):
+            moving = {key: moved[key] for key in MOVING if key in moved}
+            moved, _ = self._control_step(moving, then[ACTION], then.get(TERRAIN, None))
 
     def _outcome(
         self,

@@ -3,10 +3,13 @@
 import hashlib
 from collections.abc import Mapping
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.dynamics.base import as_numpy
+from torchrl_nerd.keys import NEXT_QVEL, QPOS
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
@@ -76,4 +79,12 @@ def fingerprint(model: NeRD) -> str:
     digest = hashlib.sha256()
     for key, value in sorted(model.state_dict().items()):
         digest.update(key.encode() + value.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def data_fingerprint(data: TensorDictBase) -> str:
+    """Hash of how trajectories ``[n, T]`` begin and end: a run knows its data by it."""
+    digest = hashlib.sha256(str(list(data.batch_size)).encode())
+    for values in (data[QPOS][:, 0], data[NEXT_QVEL][:, -1]):
+        digest.update(as_numpy(values).tobytes())
     return digest.hexdigest()[:16]

@@ -39,7 +39,12 @@ from torchrl_nerd.training.optimizers import (
 from torchrl_nerd.training.rest import find_rest, resting
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Inputs, Sequences
-from torchrl_nerd.training.start import begin_from, fingerprint, make_model
+from torchrl_nerd.training.start import (
+    begin_from,
+    data_fingerprint,
+    fingerprint,
+    make_model,
+)
 from torchrl_nerd.training.symmetry import Symmetry
 
 STATE = "state.json"  # card of a run that can be resumed
@@ -102,6 +107,12 @@ class Trainer:
         self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
         self._build(data, init_from)
+        self.identity = {  # what a resumed run must have in common
+            "config": asdict(config),
+            "scene_hash": scene.hash,
+            "init_from": self.init_from,
+            "data": data_fingerprint(data),
+        }
         self.optimizers = self.make_optimizers()
         weights = self.model.network.named_parameters()
         self.average = {name: weight.detach().clone() for name, weight in weights}
@@ -251,7 +262,7 @@ class Trainer:
         """Write all that a resumed run needs; the card is written last."""
         self._save_model("last")
         self.state.save(self.folder, self.step, self.best)
-        write_json(self.folder / STATE, self._identity | {"seconds": self.seconds})
+        write_json(self.folder / STATE, self.identity | {"seconds": self.seconds})
 
     def _save_model(self, name: str) -> None:
         training = {
@@ -271,18 +282,9 @@ class Trainer:
         model = self.averaged_model()
         save_checkpoint(model, self.folder / name, make_card(model, about))
 
-    @property
-    def _identity(self) -> dict[str, Any]:
-        """What a resumed run must have in common with the one that stopped."""
-        return {
-            "config": asdict(self.config),
-            "scene_hash": self.scene.hash,
-            "init_from": self.init_from,
-        }
-
     def _resume(self) -> None:
         card = read_json(self.folder / STATE)
-        for key, value in self._identity.items():
+        for key, value in self.identity.items():
             if card.get(key) != value:
                 raise ValueError(
                     f"{self.folder} holds a run with {key} {card.get(key)}, asked for "
