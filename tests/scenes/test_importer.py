@@ -363,6 +363,11 @@ def test_a_checkpoint_finds_its_robot_again(is_file, tmp_path):
         lambda m: m.dof_solref.__imul__(2.0),
         lambda m: m.dof_dampingpoly[-1].__iadd__(0.1),
         lambda m: setattr(m.opt, "noslip_iterations", 3),
+        lambda m: m.actuator_gainprm.__imul__(2.0),
+        lambda m: m.actuator_biasprm.__iadd__(0.5),
+        lambda m: m.actuator_forcerange.__iadd__(0.5),
+        lambda m: m.actuator_ctrlrange.__imul__(2.0),
+        lambda m: m.jnt_bodyid[-1:].__iadd__(1),
     ],
 )
 def test_rare_physics_changes_the_hash(change, robot):

@@ -32,6 +32,15 @@ RARELY = {
     **dict.fromkeys(("tendon_frictionloss", "tendon_limited"), 0.0),
     **dict.fromkeys(("eq_obj1id", "eq_obj2id", "eq_type", "eq_objtype"), -1.0),
     **dict.fromkeys(("eq_data", "eq_active0", "eq_solref", "eq_solimp"), -1.0),
+    **dict.fromkeys(
+        ("actuator_gaintype", "actuator_biastype", "actuator_biasprm"), 0.0
+    ),
+    **dict.fromkeys(("actuator_ctrllimited", "actuator_ctrlrange"), 0.0),
+    **dict.fromkeys(("actuator_forcelimited", "actuator_forcerange"), 0.0),
+    **dict.fromkeys(("actuator_trntype", "actuator_cranklength"), 0.0),
+    **dict.fromkeys(("actuator_armature", "actuator_damping"), 0.0),
+    **dict.fromkeys(("jnt_actfrclimited", "jnt_actfrcrange", "jnt_actgravcomp"), 0.0),
+    "actuator_gainprm": (1.0, *(9 * [0.0])),
     "dof_solref": (0.02, 1.0),
     "dof_solimp": (0.9, 0.95, 0.001, 0.5, 2.0),
 }
@@ -104,6 +113,14 @@ def _unusual(model: mujoco.MjModel) -> dict[str, np.ndarray]:
         unusual["qpos_spring"] = model.qpos_spring
     if model.ntendon and (model.neq or any(k.startswith("tendon") for k in unusual)):
         unusual |= {name: np.asarray(getattr(model, name)) for name in TENDONS}
+    if np.any(model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE):
+        names = "site_bodyid", "site_pos", "site_quat"
+        unusual |= {name: np.asarray(getattr(model, name)) for name in names}
+    bodies = (
+        model.jnt_bodyid - model.jnt_bodyid[:1]
+    )  # from 0; one joint each by default
+    if np.any(bodies != np.arange(model.njnt)):
+        unusual["jnt_bodyid"] = bodies
     option, default = model.opt, mujoco.MjOption()
     has_override = option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
     for name in (*SOLVER, *(OVERRIDES if has_override else ())):
