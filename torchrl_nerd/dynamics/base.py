@@ -13,6 +13,7 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.variation import Ranges
 
 
 class Dynamics(Protocol):
@@ -20,11 +21,13 @@ class Dynamics(Protocol):
 
     The next state is on the device of the state before, wherever the dynamics computes.
     ``kind`` is ``"ground truth"``, ``"learned"``, ``"hybrid"`` or ``"analytic"``. A
-    subclass that keeps no past has `step` alone to give.
+    subclass that keeps no past has `step` alone to give. A model that is told
+    parameters has their ranges as ``told``.
     """
 
     scene: Scene
     kind: str
+    told: Ranges | None = None
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene

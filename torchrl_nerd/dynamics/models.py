@@ -15,6 +15,7 @@ from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.history import WindowNetwork
 from torchrl_nerd.modules.nerd import NeRD, Network
 from torchrl_nerd.scenes.commands import drive_of
+from torchrl_nerd.scenes.variation import ranges_of
 
 Inference = Literal["streaming", "window"]
 
@@ -193,6 +194,7 @@ class NeRDDynamics(TorchDynamics):
         if window < 1:
             raise ValueError(f"expected a window of at least 1 token, got {window}")
         self.model = model.eval()
+        self.told = ranges_of(model.scene_features.variation)
         self.network = cast(Network, model.network)
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.token_size)

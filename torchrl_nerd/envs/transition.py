@@ -30,6 +30,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.commands import actuate, num_ctrl
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.variation import expect_told
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
@@ -45,12 +46,21 @@ def drive_sizes(task: Task) -> dict[str, int]:
 
 
 class Transition:
-    """A task in a dynamics, from one state to the next."""
+    """A task in a dynamics, from one state to the next.
+
+    Raises ValueError for a dynamics of another scene, or told of other parameters.
+    """
 
     # the dynamics has compiled code of its own, and `step` compiles to what is round it
     is_round = False
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
+        if dynamics.scene.hash != task.scene.hash:
+            raise ValueError(
+                f"the task is for scene '{task.scene.name}', the dynamics for "
+                f"'{dynamics.scene.name}'"
+            )
+        expect_told(dynamics.told, task.scene.variation)
         self.task, self.dynamics = task, dynamics
         is_guarded = isinstance(dynamics, GuardedDynamics)
         self.is_truncating = is_guarded and dynamics.guard == "truncate"

@@ -197,6 +197,17 @@ def ranges_of(variation: Variation | None) -> dict[str, list[float]] | None:
     return None if variation is None else variation.ranges
 
 
+def expect_told(known: Ranges | None, found: Variation | None) -> None:
+    """Raise ValueError where a told model meets parameters that it does not know.
+
+    ``known``: ranges that it is told, whose order counts; None where it is told nothing.
+    """
+    if known is not None and str(known) != str(got := ranges_of(found)):
+        raise ValueError(
+            f"expected the parameters {known} that the model is told, got {got}"
+        )
+
+
 def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Parameter:
     """A parameter and its target's indices; refuses what cannot be."""
     kind, _, target = str(name).partition(":")
