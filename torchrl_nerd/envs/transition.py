@@ -215,7 +215,9 @@ def given_state(
     sizes: Mapping[str, int],
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
-    """The state that ``reset(td, set_state=True)`` asks for, copies, of unit quaternions.
+    """The state that ``reset(td, set_state=True)`` asks for, copies.
+
+    Quaternions and normals of the ground become unit ones.
 
     Of the keys in ``sizes``, which have these widths, ``qpos`` and ``qvel`` must be there.
     Only the state of ``rows (num_envs,)``, which are reset, must be finite.
@@ -239,6 +241,10 @@ def given_state(
             raise ValueError(f"expected finite {key} to set the state to")
         values[key] = value.to(rows.device, dtype, copy=True)
     values[QPOS] = normalize_pos(scene.layout, values[QPOS])
+    if TERRAIN in values and scene.terrain is not None:
+        values[TERRAIN] = scene.terrain.normalize(values[TERRAIN])
+        if not values[TERRAIN][rows].isfinite().all():
+            raise ValueError("expected normals of the ground with a length, got zero")
     if PARAMETERS in values and scene.variation is not None:
         scene.variation.check(values[PARAMETERS][rows])
     return values
