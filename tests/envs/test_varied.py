@@ -181,6 +181,20 @@ def test_what_steps_one_robot_is_refused_for_many():
     assert PARAMETERS in make_env(task, "cartpole-adaptive").reset()
 
 
+def not_finite(history, key):
+    """A copy with one number that is none."""
+    value = history[key].clone()
+    value[1, 1, 0] = torch.nan
+    return history.clone().set(key, value)
+
+
+def test_a_recorded_motion_needs_no_parameters_where_a_model_adapts():
+    task = make_task("cartpole/swingup").vary(RANGES)
+    env = NeRDEnv(task, "cartpole-adaptive", num_envs=2, seed=0)
+    path = env.rollout(3, break_when_any_done=False)
+    env.warm_up(path.exclude(PARAMETERS))
+
+
 def test_a_history_that_shows_nothing_is_refused():
     env = GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), num_envs=2)
     state = env.reset().select(QPOS, QVEL, PARAMETERS)
@@ -193,6 +207,9 @@ def test_a_history_that_shows_nothing_is_refused():
         (history[:, 0], "at least one step"),
         (history.exclude("next"), "joint_torque.*got none"),
         (history.exclude(QPOS), "'qpos' in a history"),
+        (history.exclude(PARAMETERS), "'parameters' in a history.*got none"),
+        (not_finite(history, QPOS), "finite 'qpos' in a history, got NaN"),
+        (not_finite(history, JOINT_TORQUE), "finite .*joint_torque.* in a history"),
     ):
         with pytest.raises(ValueError, match=words):
             env.warm_up(bad)

@@ -75,16 +75,24 @@ def warm_up(dynamics: Dynamics, history: TensorDictBase, num_envs: int) -> None:
     ``terrain`` and ``parameters``.
 
     Raises:
-        ValueError: another number of envs, no step at all, or a key that is missing.
+        ValueError: another number of envs, no step at all, a key that is missing (of the
+            ground truth, ``parameters`` too where they vary), or numbers not finite.
     """
     size = list(history.batch_size)
     if len(size) != 2 or size[0] != num_envs or not size[1]:
         raise ValueError(
             f"expected a history of {num_envs} envs and at least one step, got {size}"
         )
-    for key in (QPOS, QVEL, JOINT_TORQUE):
-        if history.get(key, None) is None:
+    is_varied = dynamics.scene.variation is not None and isinstance(dynamics, Engine)
+    optional = (CTRL,) if is_varied else (CTRL, PARAMETERS)
+    for key in (QPOS, QVEL, JOINT_TORQUE, CTRL, PARAMETERS):
+        value = history.get(key, None)
+        if value is None and key not in optional:
             raise ValueError(f"expected {key!r} in a history to warm up with, got none")
+        if value is not None and not value.isfinite().all():
+            raise ValueError(
+                f"expected finite {key!r} in a history, got NaN or infinity"
+            )
     for step, then in enumerate(history.unbind(1)):
         state = then.select(QPOS, QVEL, PARAMETERS, strict=False)
         if step == 0:
