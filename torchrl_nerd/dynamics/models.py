@@ -94,11 +94,13 @@ class TorchDynamics(Dynamics):
     @unaffected
     def restore(self, history: Any, rows: Tensor) -> None:
         """See `Dynamics.restore`."""
+        # a copy: autograd cannot save a mask that was made in inference mode
+        rows = rows.to(self.device, copy=self.differentiable)
         with torch.set_grad_enabled(self.differentiable):
             if history is not None:
-                self._memory.restore(history, rows.to(self.device))
+                self._memory.restore(history, rows)
             elif self._memory is not None:
-                self._memory.clear(rows.to(self.device))
+                self._memory.clear(rows)
 
     @unaffected
     def step(
