@@ -128,6 +128,15 @@ def test_another_precision_is_refused():
         make_env("cartpole/swingup", state_dtype=torch.int64)
 
 
+@pytest.mark.parametrize("device", ["cpu:0", torch.device("cpu", 0)])
+def test_there_is_one_cpu(device):
+    env = make_env("cartpole/swingup", device=device)
+    assert env.device == torch.device("cpu")
+    for name in ("cpu:1", "cuda:cpu:0"):
+        with pytest.raises(ValueError, match=f"that torch finds here .*, got '{name}'"):
+            expect_device(name)
+
+
 def test_a_device_without_float64_takes_float32_alone(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert expect_device("mps", torch.float32) == torch.device("mps")
