@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
 from torchrl_nerd.geometry.constants import constant
@@ -149,7 +149,7 @@ class StateDelta(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the change of the state."""
-        dtype = cast(TensorSpec, observation_spec[QVEL]).dtype
+        dtype = cast(Composite, observation_spec)[QVEL].dtype
         return add_to_spec(observation_spec, {STATE_DELTA: self.size}, dtype)
 
 
