@@ -1,6 +1,7 @@
 """A checkpoint comes back bit for bit, and a crash while saving leaves the old one."""
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -29,7 +30,7 @@ from torchrl_nerd.checkpoint import (
 )
 from torchrl_nerd.configs import FeatureConfig, TrainConfig
 from torchrl_nerd.dynamics import NeRDDynamics
-from torchrl_nerd.files import read_json, write_atomically, write_json
+from torchrl_nerd.files import check_writable, read_json, write_atomically, write_json
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import PRESETS, SCENES
 
@@ -170,6 +171,35 @@ def test_a_write_cut_short_leaves_the_old_file_whole(folder, share):
     assert path.read_bytes() == content
     assert sorted(p.name for p in folder.iterdir()) == [CARD, WEIGHTS]
     load_checkpoint(folder)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="not on Windows")
+def test_what_is_no_regular_file_is_left_alone(tmp_path):
+    """As a device is, which a rename would replace."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    (tmp_path / "link").symlink_to(pipe)
+    for path in (pipe, tmp_path / "link"):
+        for way in (check_writable, lambda where: write_json(where, {})):
+            with pytest.raises(
+                ValueError, match=r"expected a regular file .*, got a pipe"
+            ):
+                way(path)
+    assert pipe.is_fifo() and sorted(tmp_path.iterdir()) == [tmp_path / "link", pipe]
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_link_leads_to_the_file_that_is_written(is_there, tmp_path):
+    target, link = tmp_path / "folder" / "target.json", tmp_path / "link.json"
+    link.symlink_to(target)
+    target.parent.mkdir()
+    if is_there:
+        target.write_text("{}")
+    check_writable(link)
+    write_json(link, {"a": 1})
+    assert link.is_symlink() and not target.is_symlink()
+    assert read_json(target) == read_json(link) == {"a": 1}
+    assert [*target.parent.iterdir()] == [target]
 
 
 def test_a_card_that_json_cannot_hold_leaves_the_old_one(folder):

@@ -25,6 +25,7 @@ from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.robots.registry import MODELS, RESERVED
 from torchrl_nerd.scenes import Scene, is_import
+from torchrl_nerd.scenes.variation import expect_told
 from torchrl_nerd.selfcheck import PREFIX as CHECK
 from torchrl_nerd.selfcheck import (
     SelfCheck,
@@ -82,13 +83,15 @@ def read_checkpoint(
     _compare(card, solver_scene, folder)
     tensors = read_tensors(folder / WEIGHTS)
     model = _build(card, scene, solver_scene, tensors, folder)
+    if isinstance(model, NeRD):
+        model.reference_ratio = solver_scene.reference_ratio
+        if model.scene_features.config.parameters:
+            expect_told(card.get("variation"), scene.variation)
     weights = {k: v for k, v in tensors.items() if not k.startswith(CHECK)}
     about = f"weights in {folder}", f"scene '{scene.name}'"
     expect_fit(weights, model.state_dict(), *about)
     model.load_state_dict(weights)
     model.eval()
-    if isinstance(model, NeRD):
-        model.reference_ratio = solver_scene.reference_ratio
     if card.get("scene_hash") != solver_scene.hash:
         return model, None
     return model, self_check(model, solver_scene, tensors, str(folder / WEIGHTS))

@@ -6,7 +6,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable
-from errno import EISDIR
+from errno import EEXIST, EISDIR
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Replace ``path`` by what ``write(temporary path)`` leaves, durably.
 
     A crash at any moment leaves the old file or the new one, never a part; what it left
-    aside is removed by the next write.
+    aside is removed by the next write. A link stays: the file that it leads to is written.
 
     Raises:
         ValueError: in one sentence, why it cannot be written.
@@ -28,7 +28,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         raise ValueError(f"{path} cannot be written: {reason}") from None
 
 
+def _file_at(path: Path) -> Path:
+    """Where a file of that path is, or would be; an OSError where it is something else."""
+    if path.is_dir():
+        raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
+    if path.exists() and not path.is_file():
+        raise OSError(EEXIST, "expected a regular file there, got a pipe or a device")
+    return Path(os.path.realpath(path))
+
+
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
+    path = _file_at(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         if not _is_running(left.suffixes[-2]):
@@ -94,9 +104,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def check_writable(path: Path) -> None:
     """Raise a ValueError where a file cannot be written; nothing is made or changed."""
     try:
-        if path.is_dir():
-            raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
-        there = next(folder for folder in path.absolute().parents if folder.exists())
+        folders = _file_at(path).parents
+        there = next(folder for folder in folders if folder.exists())
         tempfile.TemporaryFile(dir=there).close()
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from None

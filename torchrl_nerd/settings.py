@@ -53,6 +53,7 @@ def expect_device(name: str, dtype: torch.dtype = torch.float64) -> torch.device
     Raises:
         SettingError: naming the devices that this machine has, if it is none of them.
     """
+    name = "cpu" if name == "cpu:0" else name  # there is one, by both names
     count = torch.cuda.device_count()
     found = ["cpu", *["cuda"][:count], *(f"cuda:{index}" for index in range(count))]
     if dtype != torch.float64 and torch.backends.mps.is_available():

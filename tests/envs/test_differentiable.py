@@ -58,6 +58,18 @@ def test_gradient_of_other_rows_outlives_a_partial_reset(env, generator):
     assert not gradient.any()
 
 
+def test_a_partial_reset_in_inference_mode_goes_on(env, generator):
+    gain = torch.randn(4, 1, generator=generator).requires_grad_()
+    reward = window(env, gain, env.reset())
+    with torch.inference_mode():
+        rows = torch.tensor([[True], [False], [False]])
+        start = env.reset(env.state.set("_reset", rows))
+    assert torch.equal(start["qpos"], env.state["qpos"])
+    for total in (reward, window(env, gain, start.clone())):
+        (gradient,) = torch.autograd.grad(total, gain, retain_graph=True)
+        assert gradient.isfinite().all() and gradient.any()
+
+
 @pytest.mark.parametrize("dynamics", ["mujoco", "dm_control"])
 def test_mujoco_dynamics_have_no_gradients(dynamics):
     with pytest.raises(ValueError, match=f"for gradients, got '{dynamics}'"):

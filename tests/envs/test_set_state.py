@@ -24,6 +24,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 
+from torchrl_nerd import make_env
 from torchrl_nerd.envs import StatelessEnv
 from torchrl_nerd.envs.frame_stack import stack_frames
 
@@ -215,6 +216,31 @@ def test_quaternions_of_any_length_stand_for_unit_ones(task_id, dynamics, genera
         given = state.select("qpos", "qvel")
         ends.append(env.dynamics.step(given, torque, state.get("terrain", None)))
     assert_same_motion(*ends, 1e-9 if dynamics in MODELS else 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("task_id", ["cube_slope/toss", "double_pendulum/passive"])
+def test_normals_of_any_length_stand_for_unit_ones(task_id, dtype, generator):
+    """The offset is a distance, m, along the normal; a unit normal stays as it is."""
+    env = make_env(task_id, "mujoco", ROWS, state_dtype=dtype)
+    unit = random_state(env, generator)
+    assert torch.equal(
+        env.reset(unit, set_state=True)["terrain"], unit["terrain"].to(dtype)
+    )
+    scaled = unit.clone()
+    scaled["terrain"][:, :3] *= torch.tensor([[1.0], [0.6], [2.5], [1 + 1e-9]])
+    after = env.reset(scaled, set_state=True)["terrain"]
+    torch.testing.assert_close(after, unit["terrain"].to(dtype))
+    before = env.state
+    for row in range(2):
+        scaled["terrain"][row, :3] = 0.0
+        given = scaled.clone().set("_reset", torch.tensor([[False], *3 * [[True]]]))
+        if row == 0:  # what stands in other rows is nobody's business
+            assert env.reset(given, set_state=True)["terrain"].isfinite().all()
+        else:
+            with pytest.raises(ValueError, match="with a length, got zero"):
+                env.reset(given, set_state=True)
+    assert torch.equal(env.state["terrain"], before["terrain"])
 
 
 @pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])

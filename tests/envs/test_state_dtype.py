@@ -9,7 +9,9 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
+from transform_helpers import CLASSES, TASK_OF, make_transform
 
 from torchrl_nerd import NeRDEnv, make_env
 from torchrl_nerd.checkpoint import from_pretrained
@@ -53,6 +55,22 @@ def test_suite_tasks_hand_out_float32():
     env = make_env("dm_control/cartpole-swingup", "dm_control", **how)
     check_env_specs(env)
     assert env.rollout(2)["qpos"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", [*CLASSES])
+def test_transforms_take_float32_states(name):
+    """Their features are those of the same states in float64."""
+    for scene in ("ant", "cube_slope"):
+        env = make_env(TASK_OF[scene], "mujoco", ROWS, 0, state_dtype=torch.float32)
+        env = TransformedEnv(env, make_transform(name, scene))
+        check_env_specs(env)
+        path = env.rollout(STEPS, break_when_any_done=False)
+        fine = path.apply(lambda x: x.double() if x.dtype == torch.float32 else x)
+        fine = make_transform(name, scene)(fine.exclude(*env.transform.out_keys))
+        shown = path["next"] if name == "StateDelta" else path
+        for key in env.transform.out_keys:
+            want = fine[key].float()
+            torch.testing.assert_close(shown[key], want, rtol=0.0, atol=1e-4)
 
 
 class _NoFloat64(TorchDispatchMode):
@@ -108,6 +126,15 @@ def test_another_precision_is_refused():
         ValueError, match=r"float32 or torch\.float64, got torch\.int64"
     ):
         make_env("cartpole/swingup", state_dtype=torch.int64)
+
+
+@pytest.mark.parametrize("device", ["cpu:0", torch.device("cpu", 0)])
+def test_there_is_one_cpu(device):
+    env = make_env("cartpole/swingup", device=device)
+    assert env.device == torch.device("cpu")
+    for name in ("cpu:1", "cuda:cpu:0"):
+        with pytest.raises(ValueError, match=f"that torch finds here .*, got '{name}'"):
+            expect_device(name)
 
 
 def test_a_device_without_float64_takes_float32_alone(monkeypatch):

@@ -19,7 +19,9 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, make_env
-from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.tasks import SceneTask
@@ -179,6 +181,14 @@ def test_what_steps_one_robot_is_refused_for_many():
         with pytest.raises(ValueError, match=f"got '{name}', which steps one robot"):
             make_env(task, name)
     assert PARAMETERS in make_env(task, "cartpole-adaptive").reset()
+    other = task.scene.vary({"motor": (0.5, 2.0)})
+    for dynamics in (
+        NeRDDynamics(from_pretrained("cartpole")),
+        MujocoDynamics(load_scene("cartpole")),
+        MujocoDynamics(other),
+    ):
+        with pytest.raises(ValueError, match="expected dynamics of the varied scene"):
+            SceneEnv(task, dynamics, ROWS)
 
 
 @pytest.mark.parametrize(
@@ -206,6 +216,20 @@ def test_late_commands_are_those_of_the_recorded_actions(name, generator):
             warm.warm_up(told)
 
 
+def not_finite(history, key):
+    """A copy with one number that is none."""
+    value = history[key].clone()
+    value[1, 1, 0] = torch.nan
+    return history.clone().set(key, value)
+
+
+def test_a_recorded_motion_needs_no_parameters_where_a_model_adapts():
+    task = make_task("cartpole/swingup").vary(RANGES)
+    env = NeRDEnv(task, "cartpole-adaptive", num_envs=2, seed=0)
+    path = env.rollout(3, break_when_any_done=False)
+    env.warm_up(path.exclude(PARAMETERS))
+
+
 def test_a_history_that_shows_nothing_is_refused():
     env = GroundTruthEnv(make_task("cartpole/swingup").vary(RANGES), num_envs=2)
     state = env.reset().select(QPOS, QVEL, PARAMETERS)
@@ -218,6 +242,9 @@ def test_a_history_that_shows_nothing_is_refused():
         (history[:, 0], "at least one step"),
         (history.exclude("next"), "joint_torque.*got none"),
         (history.exclude(QPOS), "'qpos' in a history"),
+        (history.exclude(PARAMETERS), "'parameters' in a history.*got none"),
+        (not_finite(history, QPOS), "finite 'qpos' in a history, got NaN"),
+        (not_finite(history, JOINT_TORQUE), "finite .*joint_torque.* in a history"),
     ):
         with pytest.raises(ValueError, match=words):
             env.warm_up(bad)

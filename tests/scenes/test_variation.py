@@ -117,6 +117,42 @@ def test_stiffness_keeps_the_damping_ratio():
         assert depths[0] / depths[1] == pytest.approx(4.0, rel=0.05)
 
 
+PAIRS = """<mujoco><option timestep="0.005"/><worldbody>
+<geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+<body name="a" pos="0 0 .1"><freejoint/><geom name="a" type="box" size=".1 .1 .1"/></body>
+<body name="b" pos="9 0 .1"><freejoint/><geom name="b" type="box" size=".1 .1 .1"/></body>
+</worldbody><contact><pair geom1="floor" geom2="a"/><pair geom1="b" geom2="floor"/>
+</contact></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("target", "moved"), [("", "ab"), (":floor", "ab"), (":a", "a")]
+)
+def test_explicit_pairs_vary_with_their_geoms(target, moved):
+    """With 0.01 of its friction a box slides; with 1/16 of its stiffness it sinks."""
+    model = mujoco.MjModel.from_xml_string(PAIRS)
+    ranges = {f"friction{target}": (0.01, 1.0), f"stiffness{target}": (0.0625, 1.0)}
+    found = Variation(model, [], ranges)
+    data = []
+    for own in ([1.0, 1.0], [0.01, 0.0625]):
+        each = varied_model(found, torch.tensor(own, dtype=torch.float64))
+        data.append(mujoco.MjData(each))
+        data[-1].qvel[[0, 6]] = 2.0
+        mujoco.mj_step(each, data[-1], nstep=200)
+    nominal, varied = (x.qpos.reshape(2, 7) for x in data)
+    for box, name in enumerate("ab"):
+        assert (varied[box, 0] > nominal[box, 0] + 0.5) == (name in moved)
+        assert (varied[box, 2] < nominal[box, 2] - 1e-4) == (name in moved)
+
+
+@pytest.mark.parametrize("kind", ["friction", "stiffness:floor"])
+def test_contacts_that_are_overridden_cannot_vary(kind):
+    xml = PAIRS.replace('"0.005"/>', '"0.005"><flag override="enable"/></option>')
+    model = mujoco.MjModel.from_xml_string(xml)
+    with pytest.raises(ValueError, match=f"expected contacts .* '{kind}', got a model"):
+        Variation(model, [], {kind: (0.5, 2.0)})
+
+
 def test_nothing_varied_leaves_hash_and_model_alone():
     scene = load_scene("ant")
     before = copy.copy(scene.model)
@@ -137,7 +173,8 @@ def test_presets_name_what_is_there(name):
     ("ranges", "words"),
     [
         ({"weight:pole": (1, 2)}, "expected a kind of mass"),
-        ({"mass:poel": (1, 2)}, "expected a body of world, cart, pole"),
+        ({"mass:poel": (1, 2)}, "expected a body of cart, pole, got"),
+        ({"mass:world": (1, 2)}, "expected a body of cart, pole, got 'mass:world'"),
         ({"mass:pole": (2, 1)}, "possible range for 'mass:pole', got 2:1"),
         ({"mass:pole": (0, 1)}, "possible range"),
         ({"damping:hinge": (-1, 1)}, "possible range"),

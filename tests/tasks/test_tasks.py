@@ -6,7 +6,7 @@ import torch
 from dynamics_helpers import random_drive
 from tensordict import TensorDict
 
-from torchrl_nerd.robots import TASKS, make_task
+from torchrl_nerd.robots import TASKS, load_scene, make_task
 
 ROWS = 64
 ALMOST_ONE = 1.0 - 2.0**-53
@@ -180,6 +180,23 @@ def test_pendulum_observation_reward_and_end(generator):
     )
     assert not task.reward(before, torch.zeros(ROWS, 2), state).any()
     assert not task.terminated(state).any()
+
+
+@pytest.mark.parametrize("other", ["anymal", "double_pendulum", "cartpole"])
+def test_a_scene_of_another_robot_is_refused(other):
+    for task in (
+        make_task("ant/run"),
+        make_task("cube/toss"),
+        make_task("cartpole/swingup"),
+    ):
+        scene = load_scene(other)
+        if task.scene.name == other:
+            finer = task.with_scene(scene.with_substeps(3))
+            assert finer.scene.substeps == 3 and type(finer) is type(task)
+        else:
+            said = f"the robot of '{task.scene.name}', got another robot in '{other}'"
+            with pytest.raises(ValueError, match=said):
+                task.with_scene(scene)
 
 
 def test_unknown_tasks_and_grounds_are_refused_in_one_sentence():

@@ -4,7 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_nerd.checkpoint import load_checkpoint
+from torchrl_nerd import NeRDEnv, make_env
+from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.cli import main
 from torchrl_nerd.configs import FeatureConfig, TrainConfig
 from torchrl_nerd.data.generate import is_sound
@@ -17,7 +18,7 @@ from torchrl_nerd.files import read_json
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import load_scene, source_of
+from torchrl_nerd.robots import load_scene, make_task, source_of
 from torchrl_nerd.training.losses import rollout_loss
 from torchrl_nerd.training.samples import data_stats
 from torchrl_nerd.training.sequences import Sequences, change_times
@@ -102,6 +103,41 @@ def test_a_trained_model_comes_back_with_its_variation(is_told, data, tmp_path):
             load_checkpoint(tmp_path / "last", load_scene("cartpole"))
     else:
         assert load_checkpoint(tmp_path / "last", load_scene("cartpole"))
+
+
+OTHERS = {
+    "ranges": {"mass:pole": (0.3, 3.0), "motor": (0.5, 1.4)},
+    "order": {"motor": (0.6, 1.4), "mass:pole": (0.3, 3.0)},
+    "names": {"mass:cart": (0.3, 3.0), "motor": (0.6, 1.4)},
+    "number": {"mass:pole": (0.3, 3.0)},
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_told_model_knows_its_own_parameters_alone(other, is_told, data, tmp_path):
+    """By folder, as an object, guarded, and over another ground; others adapt to all."""
+    task = make_task("cartpole/swingup").vary(OTHERS[other])
+    model = model_of(data, "mlp-2x32", FeatureConfig(parameters=is_told))
+    model.training_range.feature_high.fill_(1e9)  # as if fitted
+    folder = save_checkpoint(model, tmp_path, make_card(model))
+    for way in (
+        lambda: load_checkpoint(folder, task.scene),
+        lambda: make_env(task, folder),
+        lambda: NeRDEnv(task, model),
+        lambda: NeRDEnv(task, model, guard="flag"),
+        lambda: model.with_terrain(task.scene),
+    ):
+        if is_told:
+            with pytest.raises(
+                ValueError, match=r"expected the .*0\.3.*, got"
+            ) as caught:
+                way()
+            assert str(task.scene.variation.ranges) in str(caught.value)
+        else:
+            way()
+    own = task.vary(SCENE.variation.ranges)
+    assert NeRDEnv(own, folder, 2).rollout(2)["next", QPOS].isfinite().all()
 
 
 @pytest.mark.parametrize("length", [5, 24])

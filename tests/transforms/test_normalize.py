@@ -147,6 +147,17 @@ def test_nested_keys_and_absent_ones(generator):
     assert "x" not in transform(as_rows(z=y.clone())).keys()
 
 
+def test_keys_that_are_spelt_alike_have_statistics_of_their_own(generator):
+    values = {"a_b": samples(generator), ("a", "b"): samples(generator, offset=9.0)}
+    stats = {key: Stats.of(value) for key, value in values.items()}
+    for order in (list(stats), list(stats)[::-1]):
+        transform = Normalize({key: stats[key] for key in order})
+        assert list(transform.state_dict())[0] == "key_a_b_mean"
+        for key in order:
+            want = (values[key] - stats[key].mean) / stats[key].std
+            assert torch.equal(transform.normalize(key, values[key]), want)
+
+
 def test_inv_acts_on_the_keys_it_was_told_and_no_others(generator):
     x, y = samples(generator), samples(generator, offset=9.0)
     stats = {"x": Stats.of(x), "y": Stats.of(y)}

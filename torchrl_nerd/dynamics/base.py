@@ -14,6 +14,7 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.variation import Ranges
 
 
 class Dynamics(Protocol):
@@ -21,11 +22,13 @@ class Dynamics(Protocol):
 
     The next state is on the device of the state before, wherever the dynamics computes.
     ``kind`` is ``"ground truth"``, ``"learned"``, ``"hybrid"`` or ``"analytic"``. A
-    subclass that keeps no past has `step` alone to give.
+    subclass that keeps no past has `step` alone to give. A model that is told
+    parameters has their ranges as ``told``.
     """
 
     scene: Scene
     kind: str
+    told: Ranges | None = None
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -85,16 +88,24 @@ def warm_up(
     by default the dynamics does, with the torque.
 
     Raises:
-        ValueError: another number of envs, no step at all, or a key that is missing.
+        ValueError: another number of envs, no step at all, a key that is missing (of the
+            ground truth, ``parameters`` too where they vary), or numbers not finite.
     """
     size = list(history.batch_size)
     if len(size) != 2 or size[0] != num_envs or not size[1]:
         raise ValueError(
             f"expected a history of {num_envs} envs and at least one step, got {size}"
         )
-    for key in (QPOS, QVEL, JOINT_TORQUE):
-        if history.get(key, None) is None:
+    is_varied = dynamics.scene.variation is not None and isinstance(dynamics, Engine)
+    optional = (CTRL,) if is_varied else (CTRL, PARAMETERS)
+    for key in (QPOS, QVEL, JOINT_TORQUE, CTRL, PARAMETERS):
+        value = history.get(key, None)
+        if value is None and key not in optional:
             raise ValueError(f"expected {key!r} in a history to warm up with, got none")
+        if value is not None and not value.isfinite().all():
+            raise ValueError(
+                f"expected finite {key!r} in a history, got NaN or infinity"
+            )
     for step, then in enumerate(history.unbind(1)):
         state = then.select(QPOS, QVEL, PARAMETERS, strict=False)
         if step == 0:

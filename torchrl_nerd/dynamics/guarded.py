@@ -56,7 +56,8 @@ class GuardedDynamics(Dynamics):
                 f"starts anew at every step, got up to {varied.max_delay} steps"
             )
         super().__init__(learned.scene)
-        self.kind, self.learned, self.guard = learned.kind, learned, guard
+        self.kind, self.told = learned.kind, learned.told
+        self.learned, self.guard = learned, guard
         self._calm = torch.zeros(0, dtype=torch.long)  # trusted steps in a row
         self.ground_truth = MujocoDynamics(self.scene) if guard == "fallback" else None
 

@@ -15,6 +15,7 @@ from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.history import WindowNetwork
 from torchrl_nerd.modules.nerd import NeRD, Network
 from torchrl_nerd.scenes.commands import drive_of
+from torchrl_nerd.scenes.variation import ranges_of
 
 Inference = Literal["streaming", "window"]
 
@@ -93,11 +94,13 @@ class TorchDynamics(Dynamics):
     @unaffected
     def restore(self, history: Any, is_restored: Tensor) -> None:
         """See `Dynamics.restore`."""
+        # a copy: autograd cannot save a mask that was made in inference mode
+        envs = is_restored.to(self.device, copy=self.differentiable)
         with torch.set_grad_enabled(self.differentiable):
             if history is not None:
-                self._memory.restore(history, is_restored.to(self.device))
+                self._memory.restore(history, envs)
             elif self._memory is not None:
-                self._memory.clear(is_restored.to(self.device))
+                self._memory.clear(envs)
 
     @unaffected
     def step(
@@ -193,6 +196,7 @@ class NeRDDynamics(TorchDynamics):
         if window < 1:
             raise ValueError(f"expected a window of at least 1 token, got {window}")
         self.model = model.eval()
+        self.told = ranges_of(model.scene_features.variation)
         self.network = cast(Network, model.network)
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.token_size)

@@ -80,11 +80,6 @@ class SceneEnv(RenderedEnv):
             raise ValueError(
                 f"expected state_dtype torch.float32 or torch.float64, got {state_dtype!r}"
             )
-        if dynamics.scene.hash != task.scene.hash:
-            raise ValueError(
-                f"the task is for scene '{task.scene.name}', the dynamics for "
-                f"'{dynamics.scene.name}'"
-            )
         place = expect_device(str(device), state_dtype)
         super().__init__(device=place, batch_size=torch.Size([num_envs]))
         self.scene, self.task, self.dynamics = task.scene, task, dynamics

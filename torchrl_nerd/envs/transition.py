@@ -32,6 +32,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.commands import actuate, num_ctrl
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.variation import expect_told
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
@@ -47,12 +48,29 @@ def drive_sizes(task: Task) -> dict[str, int]:
 
 
 class Transition:
-    """A task in a dynamics, from one state to the next."""
+    """A task in a dynamics, from one state to the next.
+
+    Raises ValueError for a dynamics of another scene, or told of other parameters.
+    """
 
     # the dynamics has compiled code of its own, and `step` compiles to what is round it
     is_round = False
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
+        if dynamics.scene.hash != task.scene.hash:
+            raise ValueError(
+                f"the task is for scene '{task.scene.name}', the dynamics for "
+                f"'{dynamics.scene.name}'"
+            )
+        own, varied = dynamics.scene.variation, task.scene.variation
+        if varied is not None:
+            steps_any = own is not None and dynamics.kind != "ground truth"
+            if own is None or not (steps_any or own.ranges == varied.ranges):
+                raise ValueError(
+                    f"expected dynamics of the varied scene '{task.scene.name}', got "
+                    f"some of {'one robot' if own is None else 'another variation'}"
+                )
+        expect_told(dynamics.told, varied)
         self.task, self.dynamics = task, dynamics
         is_guarded = isinstance(dynamics, GuardedDynamics)
         self.is_truncating = is_guarded and dynamics.guard == "truncate"
@@ -232,7 +250,9 @@ def given_state(
     sizes: Mapping[str, int],
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
-    """The state that ``reset(td, set_state=True)`` asks for, copies, of unit quaternions.
+    """The state that ``reset(td, set_state=True)`` asks for, copies.
+
+    Quaternions and normals of the ground become unit ones.
 
     Of the keys in ``sizes``, which have these widths, ``qpos`` and ``qvel`` must be there.
     Only the state of envs where ``is_reset (num_envs,)`` must be finite.
@@ -256,6 +276,10 @@ def given_state(
             raise ValueError(f"expected finite {key} to set the state to")
         values[key] = value.to(is_reset.device, dtype, copy=True)
     values[QPOS] = normalize_pos(scene.layout, values[QPOS])
+    if TERRAIN in values and scene.terrain is not None:
+        values[TERRAIN] = scene.terrain.normalize(values[TERRAIN])
+        if not values[TERRAIN][is_reset].isfinite().all():
+            raise ValueError("expected normals of the ground with a length, got zero")
     if PARAMETERS in values and scene.variation is not None:
         scene.variation.check(values[PARAMETERS][is_reset])
     return values

@@ -23,6 +23,7 @@ from torchrl_nerd.modules.history import History
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.variation import expect_told, ranges_of
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 from torchrl_nerd.transforms.scene_features import SceneFeatures
 
@@ -159,13 +160,15 @@ class NeRD(nn.Module):
         """The same weights for the same robot over another ground.
 
         Raises:
-            ValueError: another robot, or a ground that is described by other features.
+            ValueError: another robot, a ground that is described by other features, or
+                other parameters than the model is told.
         """
         if scene.robot_hash != self.scene.robot_hash:
             raise ValueError(
                 f"expected the robot of scene '{self.scene.name}' over another ground, "
                 f"got another robot in '{scene.name}'"
             )
+        expect_told(ranges_of(self.scene_features.variation), scene.variation)
         with torch.random.fork_rng(devices=[]):  # weights are drawn, then replaced
             model = self.copy_for(scene)
         sizes = self.scene_features.contact.sizes

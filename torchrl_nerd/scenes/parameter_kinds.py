@@ -62,13 +62,30 @@ def _to(name: str) -> Write:
     return write
 
 
-def _stiffness(fields: Fields, geoms: list[int], factor: np.ndarray) -> None:
-    """``solref`` is minus stiffness and damping, or time constant and damping ratio."""
-    solref, root = fields["geom_solref"], np.sqrt(factor)
-    first, second = solref[:, geoms].transpose(2, 0, 1)  # (num_envs, geoms) each
-    is_direct = first < 0.0
-    solref[:, geoms, 0] = np.where(is_direct, first * factor, first / root)
-    solref[:, geoms, 1] = np.where(is_direct, second * root, second)
+def _stiffer(name: str) -> Write:
+    """A ``solref``: minus stiffness and damping, or time constant and damping ratio."""
+
+    def write(fields: Fields, chosen: list[int], factor: np.ndarray) -> None:
+        solref, root = fields[name], np.sqrt(factor)
+        first, second = solref[:, chosen].transpose(2, 0, 1)  # (num_envs, chosen) each
+        is_direct = first < 0.0
+        solref[:, chosen, 0] = np.where(is_direct, first * factor, first / root)
+        solref[:, chosen, 1] = np.where(is_direct, second * root, second)
+
+    return write
+
+
+def _contacts(field: str, change: Callable[[str], Write]) -> Write:
+    """Change the contacts of geoms: their own, and the explicit pairs that they are in."""
+
+    def write(fields: Fields, geoms: list[int], value: np.ndarray) -> None:
+        change(f"geom_{field}")(fields, geoms, value)
+        ends = fields.model.pair_geom1, fields.model.pair_geom2
+        pairs = np.flatnonzero(np.isin(ends, geoms).any(0)).tolist()
+        if pairs:
+            change(f"pair_{field}")(fields, pairs, value)
+
+    return write
 
 
 def _slope(fields: Fields, axes: list[int], angle: np.ndarray) -> None:
@@ -118,8 +135,8 @@ KINDS = {
     "armature": Kind("joint", "kg or kg m^2", _to("dof_armature"), 0.0),
     "motor": Kind("joint", "factor", least=TINIEST),
     "delay": Kind("", "control steps", least=0.0),
-    "friction": Kind("geom", "factor", _times("geom_friction"), TINIEST),
-    "stiffness": Kind("geom", "factor", _stiffness, TINIEST),
+    "friction": Kind("geom", "factor", _contacts("friction", _times), TINIEST),
+    "stiffness": Kind("geom", "factor", _contacts("solref", _stiffer), TINIEST),
     "slope": Kind("axis", "rad", _slope, -STEEPEST, STEEPEST),
 }
 """By name, in the order in which they change a model."""

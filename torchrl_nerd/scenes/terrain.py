@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.geometry import surfaces
 from torchrl_nerd.geometry.base import keep_constants
+from torchrl_nerd.geometry.manifold import UNIT
 from torchrl_nerd.geometry.rotations import (
     quat_conjugate,
     quat_matrix,
@@ -118,6 +119,18 @@ class Terrain:
     def split(self, terrain: Tensor) -> tuple[Tensor, ...]:
         """The planes ``(*batch, 4)`` of ``terrain (*batch, size)``."""
         return terrain.split(surfaces.PLANE_PARAMETERS, -1) if self.planes else ()
+
+    def normalize(self, terrain: Tensor) -> Tensor:
+        """``terrain (*batch, size)`` with unit normals; offsets (m) stay as they are.
+
+        So does a normal of length one, to rounding; one of length zero becomes NaN.
+        """
+        planes = terrain.unflatten(-1, (-1, surfaces.PLANE_PARAMETERS))
+        normal, offset = planes.split((3, 1), -1)
+        length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+        rounding = max(UNIT, 4.0 * torch.finfo(normal.dtype).eps)
+        normal = torch.where((length - 1.0).abs() > rounding, normal / length, normal)
+        return torch.cat((normal, offset), -1).flatten(-2)
 
     def check(self, terrain: Tensor, shape: tuple[int, ...]) -> None:
         """Raise ValueError where parameters are of another shape or not finite.

@@ -19,7 +19,8 @@ A parameter is named ``KIND`` or ``KIND:TARGET``. With V its value:
 
 Without a target: all bodies that move, all joints, all geoms. Of two geoms in contact
 MuJoCo takes the greater friction, unless one has a higher priority, as the geoms of this
-package's robots have. Factors are drawn log-uniform, all other values uniform.
+package's robots have. An explicit pair has a friction and a stiffness of its own, which
+change with those of either geom. Factors are drawn log-uniform, all other values uniform.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -198,6 +199,17 @@ def ranges_of(variation: Variation | None) -> dict[str, list[float]] | None:
     return None if variation is None else variation.ranges
 
 
+def expect_told(known: Ranges | None, found: Variation | None) -> None:
+    """Raise ValueError where a told model meets parameters that it does not know.
+
+    ``known``: ranges that it is told, whose order counts; None where it is told nothing.
+    """
+    if known is not None and str(known) != str(got := ranges_of(found)):
+        raise ValueError(
+            f"expected the parameters {known} that the model is told, got {got}"
+        )
+
+
 def _parameter(model: mujoco.MjModel, name: str, given: Sequence[float]) -> Parameter:
     """A parameter and its target's indices; refuses what cannot be."""
     kind, _, target = str(name).partition(":")
@@ -231,6 +243,12 @@ def _indices(model: mujoco.MjModel, kind: Kind, target: str, name: str) -> list[
         if target:
             raise ValueError(f"expected 'delay' without a target, got '{name}'")
         return []
+    has_override = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
+    if kind.target == "geom" and has_override:
+        raise ValueError(
+            f"expected contacts of their own for '{name}', got a model with <flag "
+            'override="enable"/>, where all are the same'
+        )
     every = {
         "body": model.body_dofnum[model.body_weldid] > 0,
         "joint": np.isin(model.jnt_type, (HINGE, SLIDE)),
@@ -238,11 +256,12 @@ def _indices(model: mujoco.MjModel, kind: Kind, target: str, name: str) -> list[
     }[kind.target]
     chosen = np.flatnonzero(every)
     if target:
-        names = [getattr(model, kind.target)(i).name for i in range(len(every))]
+        found = chosen if kind.target == "body" else range(len(every))
+        names = {getattr(model, kind.target)(int(i)).name: int(i) for i in found}
         if target not in names:
             known = ", ".join(filter(None, names)) or "none"
             raise ValueError(f"expected a {kind.target} of {known}, got '{name}'")
-        chosen = [names.index(target)]
+        chosen = [names[target]]
     if kind.target == "joint":
         chosen = np.flatnonzero(np.isin(model.dof_jntid, chosen))  # its dofs
     return [int(i) for i in chosen]

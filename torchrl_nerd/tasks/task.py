@@ -48,7 +48,16 @@ class Task(ABC):
         return self.with_scene(self.scene.vary(ranges))
 
     def with_scene(self, scene: Scene) -> "Task":
-        """The same task in another scene of the same robot."""
+        """The same task in another scene of the same robot.
+
+        Raises ValueError where its joints or its motors are others.
+        """
+        own, other = ([*s.model.jnt_type, s.actuated] for s in (self.scene, scene))
+        if own != other:
+            raise ValueError(
+                f"expected a scene of the robot of '{self.scene.name}', got another robot "
+                f"in '{scene.name}'"
+            )
         twin = copy.copy(self)
         vars(twin)["scene"] = scene  # in place of `build_scene`'s
         return twin

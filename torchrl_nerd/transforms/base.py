@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE
+
 
 class StateTransform(Transform):
     """`_call` at an env's reset and step, in a replay buffer, and alone."""
@@ -50,7 +52,13 @@ class FeatureTransform(StateTransform):
         if not self.sizes:  # such as contacts of a scene without a ground
             return next_tensordict
         expect_keys(type(self).__name__, self.in_keys, next_tensordict)
-        for key, value in self._features(next_tensordict).items():
+        given = next_tensordict
+        own = next((x.dtype for x in self.buffers() if x.is_floating_point()), None)
+        if own not in (None, given[self.in_keys[0]].dtype):  # computed in its precision
+            given = given.select(*self.in_keys, JOINT_TORQUE, CTRL, strict=False).to(
+                own
+            )
+        for key, value in self._features(given).items():
             next_tensordict.set(key, value.to(torch.float32))
         return next_tensordict
 

@@ -83,7 +83,10 @@ class Normalize(StateTransform):
         self.names = {}
         for key, of_key in stats.items():
             parts = (key,) if isinstance(key, str) else key
-            name = self.names[key] = "_".join(("key", *parts))  # pyright: ignore
+            name = "_".join(("key", *parts))  # pyright: ignore
+            if name in self.names.values():  # "a_b" beside ("a", "b")
+                name = f"key_{key!r}"
+            self.names[key] = name
             self.register_buffer(f"{name}_mean", of_key.mean.clone())
             self.register_buffer(f"{name}_std", of_key.std.clone())
 

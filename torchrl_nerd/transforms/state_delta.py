@@ -6,13 +6,14 @@ rotations live in the tangent space: 2 nv numbers, no quaternion.
 """
 
 from collections.abc import Callable
+from typing import cast
 
 import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
 from torchrl_nerd.geometry.constants import constant
@@ -148,7 +149,8 @@ class StateDelta(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the change of the state."""
-        return add_to_spec(observation_spec, {STATE_DELTA: self.size}, torch.float64)
+        dtype = cast(Composite, observation_spec)[QVEL].dtype
+        return add_to_spec(observation_spec, {STATE_DELTA: self.size}, dtype)
 
 
 def _replace(x: Tensor, start: int, value: Tensor) -> Tensor:
