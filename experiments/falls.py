@@ -6,14 +6,12 @@ The folder is one of `policies_in_the_model.py`, with its last model and the pol
 learned there. The model's errors are measured on new trajectories along the policy.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import torch
-import tyro
-from learner import use_one_thread
+from learner import run, use_one_thread
 from noisy_dynamics import step_errors
 from policies_in_the_model import Config as Learning
 from policies_in_the_model import env_in, pieces_along, task_of
@@ -29,6 +27,7 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.seeds import fold_in
+from torchrl_nerd.settings import expect_at_least, expect_count
 from torchrl_nerd.tasks.floating import uprightness
 
 
@@ -66,7 +65,13 @@ def main(cfg: Config) -> None:
     task = task_of(learning)
     if not task.scene.base.is_floating:
         raise ValueError(f"expected a robot whose base moves freely, got '{cfg.name}'")
-    last = max(cfg.folder.glob("model_*"), key=lambda x: int(x.name.split("_")[1]))
+    expect_count(1, robots=cfg.robots, actions=cfg.actions, every=cfg.every)
+    for share in cfg.noise:
+        expect_at_least(0.0, noise=share)
+    models = {int(x.name.split("_")[1]): x for x in cfg.folder.glob("model_*")}
+    if not models:
+        raise ValueError(f"expected models in {cfg.folder}, got none")
+    last = models[max(models)]
     model = cast(NeRD, load_checkpoint(last / "last"))
     actor = make_actor(load_policy(cfg.folder / "policy", task))
     draw, length = fold_in(cfg.seed, 0), learning.length
@@ -93,7 +98,4 @@ def main(cfg: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config))
-    except ValueError as error:
-        sys.exit(str(error))
+    run(main, Config, __doc__)

@@ -1,4 +1,7 @@
-"""PPO that keeps policy, critic and step size when it changes envs, and what it took."""
+"""What studies of policies share: PPO that may change envs, its time, a command line.
+
+PPO keeps policy, critic and step size from env to env.
+"""
 
 import copy
 import os
@@ -6,8 +9,10 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
+import tyro
 from torchrl.envs import EnvBase
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
@@ -15,6 +20,18 @@ import ppo
 
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation.policy import make_actor
+from torchrl_nerd.files import check_writable
+
+
+def run(main: Callable[[Any], None], settings: type, about: str | None) -> None:
+    """Call ``main`` with the settings of the command line; bad ones end in a sentence."""
+    try:
+        cfg = tyro.cli(settings, description=about)
+        if cfg.json is not None:  # refuse it before any work
+            check_writable(cfg.json)
+        main(cfg)
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
 
 
 def use_one_thread() -> None:

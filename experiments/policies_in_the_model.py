@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import cast
 
 import torch
-import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
@@ -32,7 +31,7 @@ from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
-from learner import Clock, Learner, processor_time, use_one_thread
+from learner import Clock, Learner, processor_time, run, use_one_thread
 from noisy_dynamics import NoisyDynamics, StepErrors, step_errors
 
 from torchrl_nerd import make_env
@@ -290,7 +289,16 @@ def few_frames(cfg: Config, robot_frames: int) -> Tensor:
 
 
 def main(cfg: Config) -> None:
-    """Both ways side by side, then the report."""
+    """Both ways side by side, then the report.
+
+    Raises:
+        ValueError: an unknown task, or a folder that holds models already.
+    """
+    task_of(cfg)
+    if any(cfg.folder.glob("model_*")):
+        raise ValueError(
+            f"expected no models in {cfg.folder}, got some: choose another --out"
+        )
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         ways = pool.submit(in_the_model, cfg), pool.submit(in_mujoco, cfg)
         learned, rival = (way.result() for way in ways)
@@ -326,4 +334,4 @@ def main(cfg: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    run(main, Config, __doc__)

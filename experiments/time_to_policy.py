@@ -18,16 +18,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-import tyro
 from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import ppo
-from learner import Clock, Learner, use_one_thread
+from learner import Clock, Learner, run, use_one_thread
 
 from torchrl_nerd import make_env
 from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns
 from torchrl_nerd.evaluation.results import write_results
@@ -83,7 +83,10 @@ def env_of(name: str, task: str, num_envs: int, seed: int) -> SceneEnv:
     """Of a dynamics; steps of models are compiled."""
     if name.startswith(FEW):
         own = make_task(task)
-        few = own.scene.with_substeps(int(name.removeprefix(FEW)))
+        count = name.removeprefix(FEW)
+        if not count.isdecimal():
+            raise ValueError(f"expected {FEW} and a number of substeps, got '{name}'")
+        few = own.scene.with_substeps(int(count))
         return make_env(own.with_scene(few), "mujoco", num_envs, seed)
     return make_env(task, name, num_envs, seed, compile=name not in ENGINES)
 
@@ -100,6 +103,7 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
     torch.manual_seed(cfg.seed)
     how, clock, curve = cfg.ppo, Clock(), []
     env = env_of(name, cfg.task, how.num_envs, cfg.seed)
+    env = stack_frames(env, how.frame_stack)
     learner = Learner(how, env)
     for point in range(cfg.points + 1):
         if point:
@@ -144,6 +148,8 @@ def main(cfg: Config) -> None:
         raise ValueError(
             f"expected --wanted, or mujoco among {', '.join(cfg.dynamics)}"
         )
+    for name in cfg.dynamics:  # a wrong one is refused before anything learns
+        env_of(name, cfg.task, 1, cfg.seed)
     with ProcessPoolExecutor(2, get_context("spawn"), max_tasks_per_child=1) as pool:
         runs = {name: pool.submit(learn_in, name, cfg) for name in cfg.dynamics}
         curves = {name: run.result() for name, run in runs.items()}
@@ -160,4 +166,4 @@ if __name__ == "__main__":
     os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # so that it is counted
     with TemporaryDirectory() as nothing_compiled:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = nothing_compiled
-        main(tyro.cli(Config))
+        run(main, Config, __doc__)

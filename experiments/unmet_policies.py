@@ -9,7 +9,6 @@ learned in. Return differences are paired, as shares of the policy's own return 
 and of the best policy's: one that falls at once earns nearly nothing to be a share of.
 """
 
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -18,8 +17,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-import tyro
-from learner import use_one_thread
+from learner import run, use_one_thread
 from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import shipped_models
@@ -117,7 +115,4 @@ def main(cfg: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config))
-    except ValueError as error:
-        sys.exit(str(error))
+    run(main, Config, __doc__)

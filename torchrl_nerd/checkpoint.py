@@ -132,7 +132,11 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
         raise ValueError(_not_shipped(asked, hybrid_of))
     if Path(found).name != found:
         raise ValueError(_no_folder(Path(found)))
-    meant = did_you_mean(str(found), (*RESERVED, *STEPS, *shipped_models()))
+    known, first = (
+        (*RESERVED, *STEPS, *shipped_models()),
+        ["nerd"][: found == "learned"],
+    )
+    meant = did_you_mean(str(found), known, first)
     raise ValueError(f"unknown dynamics {str(found)!r}{meant}, expected {_known()}")
 
 

@@ -42,6 +42,18 @@ def test_a_refusal_lists_all_that_there_is():
     assert "unconstrained" in said and "ant-mlp" in said
 
 
+def test_a_step_that_knows_no_ground_is_refused_on_one():
+    assert "falls through" in refusal(lambda: make_env("ant/run", "unconstrained"))
+    assert make_env("cartpole/swingup", "unconstrained").dynamics.kind == "analytic"
+
+
+@pytest.mark.parametrize("name", ["hybrid", "analytic", "penalty-contact", "nerd"])
+def test_a_model_of_a_scene_needs_one(name):
+    said = refusal(lambda: from_pretrained(name))
+    assert said.startswith(f"expected a scene beside '{name}'")
+    assert "did you mean 'nerd'" in refusal(lambda: make_env(TASK, "learned"))
+
+
 def test_a_folder_that_is_not_there_is_told_apart_from_a_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = refusal(lambda: make_env(TASK, "runs/ant/best"))

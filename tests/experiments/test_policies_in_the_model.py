@@ -104,6 +104,19 @@ def test_errors_are_those_of_one_step():
     torch.testing.assert_close(after[QVEL], one["next", QVEL], rtol=1e-3, atol=1e-5)
 
 
+def test_models_of_another_run_are_left_alone(tmp_path):
+    cfg = Config("gymnasium/Hopper-v5", out=tmp_path)
+    (cfg.folder / "model_0").mkdir(parents=True)
+    with pytest.raises(ValueError, match="expected no models in .*Hopper-v5, got some"):
+        main(cfg)
+
+
+@pytest.mark.parametrize("given", [{}, {"every": 0}, {"noise": (float("nan"),)}])
+def test_falls_need_models_and_settings_in_range(given, tmp_path):
+    with pytest.raises(ValueError, match="expected "):
+        falls.main(falls.Config("gymnasium/Ant-v5", tmp_path, **given))
+
+
 @pytest.mark.slow
 def test_a_round_of_seconds(tmp_path):
     """Both ways, the report, and the table of the site that is made of it."""

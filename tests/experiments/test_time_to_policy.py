@@ -38,6 +38,14 @@ def test_a_wanted_return_has_to_be_known():
         time_to_policy.main(how)
 
 
+@pytest.mark.parametrize("name", ["mujoco-x", "cartpole-lstm"])
+def test_unknown_dynamics_are_refused_before_any_learns(name, tmp_path):
+    how = time_to_policy.Config("cartpole/swingup", ("mujoco", name), out=tmp_path)
+    with pytest.raises(ValueError, match=name):
+        time_to_policy.main(how)
+    assert not list(tmp_path.iterdir())
+
+
 def test_fewer_substeps_are_those_of_the_scene():
     """The same start and actions as MuJoCo with that scene, by itself."""
     few = make_task("cartpole/swingup").scene.with_substeps(1)

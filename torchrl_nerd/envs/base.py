@@ -284,8 +284,9 @@ class SceneEnv(RenderedEnv):
         kept = self._buffers  # setting a module's attributes costs more than sums
         kept.update(counts)
         for key in self._state_sizes:
-            kept[f"_state_{key}"] = found[key]
-            found[key] = found[key].clone()
+            # compiled code that got another layout in memory would be compiled again
+            kept[f"_state_{key}"] = found[key].contiguous()
+            found[key] = kept[f"_state_{key}"].clone()
         if not self.guard:
             found.pop(TRUST, None)
         return tensordict_of(found, self.batch_size, self.device)

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from torchrl_nerd.analytic import STEPS
+from torchrl_nerd.analytic import STEPS, UnconstrainedStep
 from torchrl_nerd.checkpoint import (
     CARD,
     from_pretrained,
@@ -122,6 +122,11 @@ class NeRDEnv(SceneEnv):
             model = cast_constants(copy.deepcopy(model, kept), state_dtype)
         model = model.to(expect_device(str(device), state_dtype))
         how = {"differentiable": differentiable, "inference": inference}
+        if isinstance(model, UnconstrainedStep) and len(task.scene.contacts):
+            raise ValueError(
+                f"expected dynamics that know the ground of '{task.scene.name}', got "
+                f"'{name}', by which the robot falls through it"
+            )
         dynamics = dynamics_of(model, **how)
         if not isinstance(dynamics, NeRDDynamics):
             _refuse_network_options(name, guard, inference)

@@ -180,7 +180,8 @@ def explain(scene: Scene) -> SceneReport:
         contact_bodies=tuple(body_label(model, b) for b in scene.contacts.bodies),
         self_contacts=_self_contacts(scene),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),
-        controller=f"{type(controller).__name__}, {controller.num_actions} actions"
+        controller=f"{type(controller).__name__}, "
+        + _count(controller.num_actions, "action")
         + SERVOS * servos,
         analytic_step=step,
         why_no_step=reason,
@@ -215,6 +216,10 @@ def _state_meaning(scene: Scene) -> str:
     return ", ".join(parts)
 
 
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
 def _terrain(scene: Scene, has_normal: bool) -> str:
     terrain = scene.terrain
     if terrain is None:
@@ -222,7 +227,6 @@ def _terrain(scene: Scene, has_normal: bool) -> str:
     planes = sum(surface.kind == PLANE for surface in terrain.surfaces)
     where = "drawn for each trajectory" if terrain.is_per_env else "fixed"
     normal = "a feature" if has_normal else "no feature: it follows from the state"
-    shapes = f"{planes} plane{'s' * (planes != 1)}"
-    if planes < len(terrain.surfaces):
-        shapes += f", {len(terrain.surfaces) - planes} other surfaces"
+    kinds = {"plane": planes, "other surface": len(terrain.surfaces) - planes}
+    shapes = ", ".join(_count(n, name) for name, n in kinds.items() if n)
     return f"{shapes}, {where}; the normal is {normal}"

@@ -109,6 +109,7 @@ def _unknown(what: str, name: object, known: Collection[str]) -> ValueError:
     return ValueError(
         f"unknown {what} {name!r}{meant}, expected one of {', '.join(known)}, "
         "dm_control/DOMAIN-TASK, gymnasium/ID or an MJCF file"
+        + " (MuJoCo's `compile` makes one of a URDF)" * given.endswith(".urdf")
         + "".join(f"; {sentence}" for sentence in NOT_LOADED)
     )
 
