@@ -2,12 +2,14 @@
 
     python benchmarks/draw_benchmarks.py
 
-A PNG in docs/figures for every ``results/bench_*.json``.
+An SVG in docs/figures for every ``results/bench_*.json``.
 """
 
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from string import ascii_lowercase
+from typing import Any
 
 import tyro
 from equal_error import RESULTS, reports
@@ -35,13 +37,13 @@ def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> Non
 
     Args:
         report: of `bench`.
-        path: of the PNG.
+        path: of the picture.
         batch: trajectories stepped together; `BenchReport.batch` by default.
     """
     batch = batch or report.batch
     units = {row.quantity: row.unit for row in report.errors}
     shown = list(units) if len(units) <= PANELS else [list(units)[0], list(units)[-1]]
-    figure = Figure(figsize=(7.0, 4.0 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(8.5, 4.0 * len(shown)), layout="constrained")
     panels = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     kinds = {row.name: row.kind for row in report.rates}
     for axes, quantity in zip(panels, shown, strict=True):
@@ -58,24 +60,32 @@ def plot_bench(report: BenchReport, path: Path, batch: int | None = None) -> Non
         best = pareto_front(points)
         front = [points[name] for name in best]
         axes.plot(*zip(*front, strict=True), "-", color="0.4", label="Pareto front")
-        for name in best:  # names of the others would cover each other
-            axes.annotate(
-                name, points[name], (6, -3), textcoords="offset points", fontsize=7
-            )
+        models = [n for n in points if kinds[n] != "simulator" and n not in best]
+        marks = dict(zip(best, map(str, range(1, 1 + len(best))), strict=True))
+        marks |= dict(zip(models, ascii_lowercase, strict=False))
+        for count, (name, mark) in enumerate(marks.items()):  # names would collide
+            place = (5, 4) if count % 2 else (-9, -10)
+            how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8}
+            axes.annotate(mark, points[name], place, weight="bold", **how)
+            axes.plot([], [], " ", label=f"{mark}: {name}")
+        axes.margins(0.1)
         for row in report.errors:
             if row.quantity != quantity or row.kind not in ("sensitivity", "published"):
                 continue
             style = ":" if row.kind == "sensitivity" else "--"
             axes.axvline(row.mean, ls=style, color="0.6", label=row.name)
         axes.set(
-            title=f"{report.scene}: {quantity} (better: up and to the left)",
+            title=f"{report.scene}: {quantity}",
             xscale="log",
             yscale="log",
             xlabel=f"mean error over {report.steps} steps ({units[quantity]})",
             ylabel=f"control steps/s, batch {batch}",
         )
+        corner = {"xycoords": "axes fraction", "textcoords": "axes fraction"}
+        arrow = {"arrowstyle": "->", "color": "0.3"}
+        axes.annotate("better", (0.02, 0.97), (0.12, 0.87), **corner, arrowprops=arrow)
         axes.tick_params(which="minor", labelsize=7)  # larger ones cover each other
-        axes.legend(frameon=False, fontsize=7)
+        axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=150)
 
@@ -84,7 +94,7 @@ def main(options: Options) -> list[Path]:
     """Draw them; returns where."""
     drawn = []
     for path, report in reports(options.results).items():
-        drawn.append(options.figures / path.with_suffix(".png").name)
+        drawn.append(options.figures / path.with_suffix(".svg").name)
         plot_bench(report, drawn[-1])
     return drawn
 
