@@ -60,4 +60,4 @@ def test_files_of_results_are_read_and_drawn(tmp_path):
     assert "| cube |" in equal_error.table(equal_error.read(tmp_path))
     drawn = draw_benchmarks.main(draw_benchmarks.Options(tmp_path, tmp_path))
     assert drawn == [tmp_path / "bench_cube.svg"]
-    assert drawn[0].read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in drawn[0].read_text()

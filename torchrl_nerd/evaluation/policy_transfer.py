@@ -143,7 +143,8 @@ def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
     for name, s in summaries.items():
         about = name, s.kind, s.model, str(s.episodes)
         mean = f"{s.mean:.1f} ± {s.interval:.1f}"
-        difference = f"{s.difference:+.3%} ± {s.difference_interval:.3%}"
+        shown = round(s.difference, 5) + 0.0  # no minus before a zero
+        difference = f"{shown:+.3%} ± {s.difference_interval:.3%}"
         shown = difference if isfinite(s.difference) else "-"
         body.append([*about, mean, f"{s.std:.1f}", shown])
     return f"{text_table(head, body)}\n{NOTE}"
