@@ -1,10 +1,6 @@
 """Tables of the pages, rendered from results/ when the site is built: a hook of MkDocs.
 
-A page asks for one by a comment: ``<!-- table: eval -->``, ``bench``, ``stability``,
-``compiled_env``, ``kinematics_libraries``, ``transfer``, ``state_dtype``, ``gpu_rates``,
-``gpu_errors``, ``hidden_parameters``, ``robots_that_load``, ``policies``, ``open_loop``,
-``time_to_policy``, ``unmet_policies``, ``falls``, ``gallery``, ``returns`` or
-``network_off``.
+A page asks for one of `TABLES` by its name in a comment: ``<!-- table: eval -->``.
 """
 
 import json
@@ -421,6 +417,22 @@ def policies_table(folder: Path = RESULTS) -> str:
     return with_sources([[*head, "in the model"], *lines.values()], records)
 
 
+def policy_curves_table(folder: Path = RESULTS) -> str:
+    """The same policies on their way: return in MuJoCo after each fifth of the actions."""
+    parts = 5
+    table = [["task", "learned in", *(f"{i} of {parts}" for i in range(1, parts + 1))]]
+    for _, record in sorted(read("policies", folder).items()):
+        found, how = record["results"], record["results"]["configuration"]
+        for way, name in (("model", f"model, {how['network']}"), ("mujoco", "MuJoCo")):
+            count = len(found[way])
+            places = (max(1, count * i // parts) - 1 for i in range(1, parts + 1))
+            earned = (f"{found[way][i]['return']:,.0f}" for i in places)
+            line = [how["name"], name, *earned]
+            if line not in table:  # rivals of several models are one
+                table.append(line)
+    return rows(table) if table[1:] else ""
+
+
 def time_to_policy_table(folder: Path = RESULTS) -> str:
     """What PPO took in each dynamics until its policy had earned enough in MuJoCo."""
     table = [["task", "learned in", "return wanted", "minutes to it", "minutes in all"]]
@@ -545,6 +557,7 @@ TABLES = {
     "hidden_parameters": hidden_parameters_tables,
     "robots_that_load": robots_table,
     "policies": policies_table,
+    "policy_curves": policy_curves_table,
     "open_loop": open_loop_table,
     "time_to_policy": time_to_policy_table,
     "unmet_policies": unmet_policies_table,
@@ -560,7 +573,7 @@ COMMANDS |= {"hidden_parameters": "python -m experiments.hidden_parameters"}
 ROBOTS = "python experiments/robots_that_load.py --json results/robots_that_load.json"
 COMMANDS |= {"robots_that_load": ROBOTS}
 POLICIES = "python experiments/policies_in_the_model.py TASK --json FILE"
-COMMANDS |= {"policies": POLICIES}
+COMMANDS |= {"policies": POLICIES, "policy_curves": POLICIES}
 COMMANDS |= {"open_loop": "python experiments/open_loop.py ROBOT --json FILE"}
 TIMES = "python experiments/time_to_policy.py TASK --json FILE"
 UNMET = "python experiments/unmet_policies.py TASK --policies FOLDER --json FILE"

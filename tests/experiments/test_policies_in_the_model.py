@@ -130,6 +130,7 @@ def test_a_round_of_seconds(tmp_path):
     assert found["model"][-1]["robot_frames"] >= 20 * SEGMENT
     assert {"data", "model", "policy"} == found["seconds"]["model"].keys()
     assert tables.policies_table(tmp_path).count("| gymnasium/Hopper-v5 |") == 4
+    assert tables.policy_curves_table(tmp_path).count("| gymnasium/Hopper-v5 |") == 2
 
 
 @pytest.mark.slow
