@@ -132,11 +132,8 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
         raise ValueError(_not_shipped(asked, hybrid_of))
     if Path(found).name != found:
         raise ValueError(_no_folder(Path(found)))
-    known, first = (
-        (*RESERVED, *STEPS, *shipped_models()),
-        ["nerd"][: found == "learned"],
-    )
-    meant = did_you_mean(str(found), known, first)
+    asked = "nerd" if found == "learned" else str(found)
+    meant = did_you_mean(asked, (*RESERVED, *STEPS, *shipped_models()))
     raise ValueError(f"unknown dynamics {str(found)!r}{meant}, expected {_known()}")
 
 
