@@ -27,13 +27,13 @@ def curves(axes: Any, found: dict[str, Any], steps: str) -> None:
         axes.plot(seen, errors, marker="o", markersize=3, label=name)
     learned = [row for row in rows if "fitted" not in row["name"]]
     lowest = min(row["errors"][steps][quantity]["mean"] for row in learned)
-    axes.set_title("smaller is better", fontsize=9)
+    axes.set_title(f"{steps} steps after the history: lower is better", fontsize=9)
     axes.set_xscale("symlog", linthresh=1)
     axes.set_xticks(lengths, lengths)
     axes.set_yscale("log")
     axes.set_ylim(bottom=lowest / 3)  # a fit of the right engine goes to zero
     axes.set_xlabel("steps of history")
-    axes.set_ylabel(f"error of {quantity} over {steps} steps (rad)")
+    axes.set_ylabel(f"mean error of {quantity} (rad)")
 
 
 def points(axes: Any, found: dict[str, Any], parameter: str) -> None:
@@ -45,19 +45,21 @@ def points(axes: Any, found: dict[str, Any], parameter: str) -> None:
     )
     axes.plot(actual, guess, ".", markersize=3)
     axes.set_xlabel(f"actual {parameter}")
-    axes.set_ylabel("linear in the hidden state")
-    axes.set_title(f"explained: {row['explained'][parameter]:.2f}", fontsize=9)
+    axes.set_ylabel("read from the network's memory")
+    share = f"{row['explained'][parameter]:.0%} of the variance"
+    axes.set_title(f"what {row['name']} knows: {share}", fontsize=9)
 
 
 def main(results: tyro.conf.Positional[Path], path: tyro.conf.Positional[Path]) -> None:
     """Draw the results of `hidden_parameters`."""
     found = read_results(results)["results"]
     best = max(found["probe"][0]["explained"].items(), key=lambda item: item[1])[0]
-    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+    figure = Figure(figsize=(11.0, 4.0), layout="constrained")
     panels = figure.subplots(1, 3)
     for axes, steps in zip(panels, ("20", "100"), strict=False):
         curves(axes, found, steps)
-    panels[0].legend(fontsize=7, loc="upper right", ncols=3)
+    names = panels[0].get_legend_handles_labels()
+    figure.legend(*names, fontsize=8, loc="outside lower center", ncols=6)
     points(panels[2], found, best)
     figure.savefig(path)
 
