@@ -285,8 +285,8 @@ class SceneEnv(RenderedEnv):
         kept.update(counts)
         for key in self._state_sizes:
             # compiled code that got another layout in memory would be compiled again
-            kept[f"_state_{key}"] = found[key].contiguous()
-            found[key] = kept[f"_state_{key}"].clone()
+            kept[f"_state_{key}"] = own = found[key].contiguous()
+            found[key] = own.clone()
         if not self.guard:
             found.pop(TRUST, None)
         return tensordict_of(found, self.batch_size, self.device)
