@@ -3,9 +3,9 @@
     python experiments/policies_in_the_model.py dm_control/walker-walk --json FILE
 
 1. Random trajectories of the robot in MuJoCo, and a network that learns from them.
-2. In rounds: PPO in the model alone, where steps have errors like those on motion that the
-   model has not seen, and an episode fails as soon as a step is unlike the data;
-   trajectories along the policy in MuJoCo, from which the model goes on learning.
+2. In rounds: PPO in the model alone, where an episode fails as soon as a step is unlike the
+   data; trajectories along the policy in MuJoCo, from which the model goes on learning.
+   With ``--model-noise 1`` steps have errors like those on motion it has not seen.
 3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
    policy had in the model, one for as many as the model's data cost the robot, and one
    whose episodes fail where those in the model do.
@@ -71,7 +71,7 @@ class Config:
     length: int = 1000  # control steps of each
     more_updates: int = 2500  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
-    model_noise: float = 1.0  # share of the model's own errors that its steps are given
+    model_noise: float = 0.0  # share of the model's own errors that its steps are given
     network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
