@@ -186,6 +186,7 @@ def test_what_steps_one_robot_is_refused_for_many():
         NeRDDynamics(from_pretrained("cartpole")),
         MujocoDynamics(load_scene("cartpole")),
         MujocoDynamics(other),
+        MujocoDynamics(task.scene.vary(dict(reversed(RANGES.items())))),
     ):
         with pytest.raises(ValueError, match="expected dynamics of the varied scene"):
             SceneEnv(task, dynamics, ROWS)

@@ -32,7 +32,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.commands import actuate, num_ctrl
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
-from torchrl_nerd.scenes.variation import expect_told
+from torchrl_nerd.scenes.variation import expect_told, ranges_of
 from torchrl_nerd.tasks import Task
 
 Tensors = dict[str, Tensor]
@@ -63,13 +63,13 @@ class Transition:
                 f"'{dynamics.scene.name}'"
             )
         own, varied = dynamics.scene.variation, task.scene.variation
-        if varied is not None:
-            steps_any = own is not None and dynamics.kind != "ground truth"
-            if own is None or not (steps_any or own.ranges == varied.ranges):
-                raise ValueError(
-                    f"expected dynamics of the varied scene '{task.scene.name}', got "
-                    f"some of {'one robot' if own is None else 'another variation'}"
-                )
+        is_exact = dynamics.kind == "ground truth"  # reads parameters by their order
+        is_other = is_exact and str(ranges_of(own)) != str(ranges_of(varied))
+        if varied is not None and (own is None or is_other):
+            raise ValueError(
+                f"expected dynamics of the varied scene '{task.scene.name}', got some of "
+                f"{'one robot' if own is None else 'another variation'}"
+            )
         expect_told(dynamics.told, varied)
         self.task, self.dynamics = task, dynamics
         is_guarded = isinstance(dynamics, GuardedDynamics)

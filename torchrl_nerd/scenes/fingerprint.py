@@ -32,13 +32,12 @@ RARELY = {
     **dict.fromkeys(("tendon_frictionloss", "tendon_limited"), 0.0),
     **dict.fromkeys(("eq_obj1id", "eq_obj2id", "eq_type", "eq_objtype"), -1.0),
     **dict.fromkeys(("eq_data", "eq_active0", "eq_solref", "eq_solimp"), -1.0),
-    **dict.fromkeys(
-        ("actuator_gaintype", "actuator_biastype", "actuator_biasprm"), 0.0
-    ),
-    **dict.fromkeys(("actuator_ctrllimited", "actuator_ctrlrange"), 0.0),
+    **dict.fromkeys(("actuator_gaintype", "actuator_biastype"), 0.0),
+    **dict.fromkeys(("actuator_biasprm", "actuator_ctrllimited"), 0.0),
+    **dict.fromkeys(("actuator_ctrlrange", "actuator_trntype"), 0.0),
     **dict.fromkeys(("actuator_forcelimited", "actuator_forcerange"), 0.0),
-    **dict.fromkeys(("actuator_trntype", "actuator_cranklength"), 0.0),
-    **dict.fromkeys(("actuator_armature", "actuator_damping"), 0.0),
+    **dict.fromkeys(("actuator_cranklength", "actuator_armature"), 0.0),
+    "actuator_damping": 0.0,
     **dict.fromkeys(("jnt_actfrclimited", "jnt_actfrcrange", "jnt_actgravcomp"), 0.0),
     "actuator_gainprm": (1.0, *(9 * [0.0])),
     "dof_solref": (0.02, 1.0),
@@ -116,9 +115,7 @@ def _unusual(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     if np.any(model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE):
         names = "site_bodyid", "site_pos", "site_quat"
         unusual |= {name: np.asarray(getattr(model, name)) for name in names}
-    bodies = (
-        model.jnt_bodyid - model.jnt_bodyid[:1]
-    )  # from 0; one joint each by default
+    bodies = model.jnt_bodyid - model.jnt_bodyid[:1]  # by default a joint each
     if np.any(bodies != np.arange(model.njnt)):
         unusual["jnt_bodyid"] = bodies
     option, default = model.opt, mujoco.MjOption()
