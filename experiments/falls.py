@@ -12,9 +12,9 @@ from typing import cast
 
 import torch
 from learner import run, use_one_thread
-from noisy_dynamics import step_errors
+from noisy_dynamics import NoisyDynamics, step_errors
 from policies_in_the_model import Config as Learning
-from policies_in_the_model import env_in, pieces_along, task_of
+from policies_in_the_model import pieces_along, task_of
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tyro.conf import Positional
 
@@ -81,8 +81,8 @@ def main(cfg: Config) -> None:
         "MuJoCo": falls(make_env(task, "mujoco", cfg.robots, cfg.seed), actor, *how)
     }
     for share in cfg.noise:
-        noisy = Learning(cfg.name, model_noise=share)
-        env = env_in(noisy, task, model, errors, cfg.robots, cfg.seed)
+        noisy = NoisyDynamics(model, errors, share)
+        env = SceneEnv(task, noisy, cfg.robots, cfg.seed)
         rows[f"model, noise {share:g}"] = falls(env, actor, *how)
     head = [
         "actions",

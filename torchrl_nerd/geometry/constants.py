@@ -43,7 +43,9 @@ def placed(module: Module, like: Tensor) -> Module:
     """
     if like.dtype == torch.float64:
         return module.to(like.device)
-    copies = vars(module).setdefault("_coarse", {})
+    copies = getattr(module, "_coarse", None)
+    if copies is None:
+        copies = vars(module)["_coarse"] = {}
     if like.dtype not in copies:
         with torch.inference_mode(False):  # kept, whoever asks first
             copies[like.dtype] = cast_constants(copy.deepcopy(module), like.dtype)

@@ -40,7 +40,7 @@ class Controller(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # torch 2.11 compiles no other made in a step
 class TorqueController:
     """Torque proportional to the action: ``gain * clip(action, -1, 1)``."""
 
@@ -56,7 +56,7 @@ class TorqueController:
         return action.to(qpos.dtype).clamp(-1.0, 1.0) * constant(qpos, self.gain)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # torch 2.11 compiles no other made in a step
 class PDController:
     """A spring and damper to a target: ``clip(kp (target - q) - kd v, -limit, limit)``.
 
