@@ -68,7 +68,7 @@ class Config:
     rounds: int = 10  # of PPO in the model; data are added between two of them
     along: int = 64  # trajectories along the policy before a round, more where it falls
     length: int = 1000  # control steps of each
-    more_updates: int = 1000  # of the model, after the first round
+    more_updates: int = 2500  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
@@ -192,8 +192,8 @@ def train_model(
         single_step_fraction=1.0,
         bf16_fraction=0.85,
         loss_eps=0.02,
-        lr=0.01 if start is None else 0.005,
-        adamw_lr=3e-3 if start is None else 1.5e-3,
+        lr=0.01 if start is None else 0.0025,
+        adamw_lr=3e-3 if start is None else 7.5e-4,
         validate_every=10**9,  # at the end alone
         save_every=10**9,
         seed=cfg.seed,

@@ -23,7 +23,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive_of
 from torchrl_nerd.transforms import StateDelta, Stats
 
-PART = 1024  # trajectories turned into tokens at a time
+PART = 64  # trajectories turned into tokens at a time: fit the cache
 
 
 def raw_tokens(
