@@ -416,12 +416,12 @@ def policies_table(folder: Path = RESULTS) -> str:
         ours, theirs = (
             [spent[way], minutes_to(found[way], wanted)] for way in ("model", "mujoco")
         )
-        network = f"model, {how['network']}"
+        network, none = f"model, {how['network']}", ["-", "-"]
         for name, way, frames, minutes, in_model in (
             ("the model, in MuJoCo", network, few, ours, promised),
             ("MuJoCo", "MuJoCo", most, theirs, "-"),
-            ("MuJoCo, the rule of trust", "MuJoCo, rule of trust", most, ["-"] * 2, "-"),
-            ("MuJoCo, the model's robot frames", "MuJoCo", few, ["-"] * 2, "-"),
+            ("MuJoCo, the rule of trust", "MuJoCo, rule of trust", most, none, "-"),
+            ("MuJoCo, the model's robot frames", "MuJoCo", few, none, "-"),
         ):
             if (returns := found["returns"].get(f"learned in {name}")) is not None:
                 about = how["name"], way, f"{frames:,}"
