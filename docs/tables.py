@@ -480,7 +480,7 @@ def unmet_policies_table(folder: Path = RESULTS) -> str:
 
 
 def falls_table(folder: Path = RESULTS) -> str:
-    """Share of robots on their back along one policy, by the number of actions."""
+    """Robots on their back along one policy, and how far those of a model run ahead."""
     shown, records = [], read("falls", folder).values()
     for record in records:
         found = record["results"]
@@ -491,6 +491,12 @@ def falls_table(folder: Path = RESULTS) -> str:
             [name, *(f"{100.0 * x:.0f}%" for x in shares)]
             for name, shares in found["on_their_back"].items()
         ]
+        shown += [rows([head, *body])]
+        head = ["m farther than MuJoCo", *(f"after {k}" for k in found["after"])]
+        body = [["MuJoCo's way", *(f"{x:.2f}" for x in found["progress_m"])]]
+        for name, ahead in found["ahead_m"].items():
+            both = (f"{x['mean']:.3f} ± {x['interval']:.3f}" for x in ahead)
+            body.append([name, *both])
         shown += [rows([head, *body]), made_by(record)]
     return "\n\n".join(shown)
 
@@ -537,6 +543,29 @@ def places_of(front: dict[str, bool], cases: list[str]) -> Iterator[str]:
         yield f"{sum(own)}/{len(own)}"
 
 
+def self_contact_table(folder: Path = RESULTS) -> str:
+    """Errors without features of the robot's contacts with itself, and with them."""
+    if (record := one("self_contact", folder)) is None:
+        return ""
+    table = [["robot", "error of", "touching: without", "with", "others: without"]]
+    table[0].append("with")
+    for scene in dict.fromkeys(row["scene"] for row in record["results"]):
+        own = [row for row in record["results"] if row["scene"] == scene]
+        for key, what in (
+            ("qvel_1", "velocities, 1 step"),
+            ("m_20", "positions, 20 steps, m"),
+            ("rad_20", "rotations, 20 steps, rad"),
+        ):
+            line = [scene, what]
+            for which in ("touching", "other"):
+                for has_features in (False, True):  # a mean over seeds
+                    alike = [x for x in own if x["self_contact"] is has_features]
+                    mean = sum(x[f"{key}_{which}"] for x in alike) / len(alike)
+                    line.append(f"{mean:.3g}")
+            table.append(line)
+    return with_sources(table, [record])
+
+
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
     """Mean errors of the joints (rad) over 20 and 100 steps, the least of some rows."""
     places = [f"{case}, {steps} steps, rad" for steps in (20, 100)]
@@ -579,6 +608,7 @@ TABLES = {
     "gallery": gallery_table,
     "returns": returns_table,
     "network_off": network_off_table,
+    "self_contact": self_contact_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -597,6 +627,7 @@ COMMANDS |= {
     "network_off": "python experiments/network_off.py",
     "gallery": "make results",
 }
+COMMANDS |= {"self_contact": "python experiments/self_contact.py --json FILE"}
 COMMANDS |= {"returns": "nerd transfer TASK --json results/transfer_TASK.json"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 

@@ -111,7 +111,9 @@ def test_models_of_another_run_are_left_alone(tmp_path):
         main(cfg)
 
 
-@pytest.mark.parametrize("given", [{}, {"every": 0}, {"noise": (float("nan"),)}])
+@pytest.mark.parametrize(
+    "given", [{}, {"every": 0}, {"ahead": (5, 0)}, {"noise": (float("nan"),)}]
+)
 def test_falls_need_models_and_settings_in_range(given, tmp_path):
     with pytest.raises(ValueError, match="expected "):
         falls.main(falls.Config("gymnasium/Ant-v5", tmp_path, **given))
@@ -141,9 +143,13 @@ def test_falls_are_counted_in_mujoco_and_in_the_model(tmp_path):
     learned = Config("gymnasium/Ant-v5", out=tmp_path, minibatch=512, **sizes)
     in_the_model(learned)
     path, how = tmp_path / "falls_Ant.json", {"robots": 4, "actions": 20, "every": 10}
+    how |= {"ahead": (1, 5)}
     falls.main(falls.Config(learned.name, learned.folder, json=path, **how))
-    rows = json.loads(path.read_text())["results"]["on_their_back"]
-    assert len(rows) == 4
+    found = json.loads(path.read_text())["results"]
+    rows, ahead = found["on_their_back"], found["ahead_m"]
+    assert len(rows) == 4 and len(ahead) == 3 and len(found["progress_m"]) == 2
+    one, _ = (abs(x["mean"]) for x in ahead["model, noise 0"])
+    assert 0 < one < 0.05  # m, from equal states
     assert all(len(x) == 2 and all(0 <= y <= 1 for y in x) for x in rows.values())
     assert "| MuJoCo |" in tables.falls_table(tmp_path)
     with pytest.raises(ValueError, match="expected a robot whose base moves freely"):
