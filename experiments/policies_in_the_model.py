@@ -190,10 +190,9 @@ def train_model(
         steps=cfg.updates if start is None else cfg.more_updates,
         rollout_steps=0,
         single_step_fraction=1.0,
-        bf16_fraction=0.85,
         loss_eps=0.02,
-        lr=0.01 if start is None else 0.0025,
-        adamw_lr=3e-3 if start is None else 7.5e-4,
+        lr=0.01 if start is None else 0.005,
+        adamw_lr=3e-3 if start is None else 1.5e-3,
         validate_every=10**9,  # at the end alone
         save_every=10**9,
         seed=cfg.seed,
