@@ -104,6 +104,24 @@ def test_a_metric_beyond_its_limit_fails(value, limit, mujoco_limit):
     assert set(result.tested) == {"x"} == set(result.ground_truth)
 
 
+class Pumped(MujocoDynamics):
+    """MuJoCo that gains speed at every step."""
+
+    def step(self, *given, **how):
+        after = super().step(*given, **how)
+        return after.set("qvel", 1.001 * after["qvel"])
+
+
+@pytest.mark.parametrize(("kind", "passes"), [(MujocoDynamics, True), (Pumped, False)])
+def test_energy_need_not_be_kept_better_than_by_mujoco(kind, passes):
+    """Euler changes that of the double pendulum by hundredths in 100 steps."""
+    dynamics = kind(load_scene("double_pendulum"))
+    (result,) = run_cases(dynamics, [CASES["energy"]], scale=0.01)
+    drift, limit = (next(iter(x.values())) for x in (result.tested, result.tolerances))
+    assert result.ground_truth_passes and result.passes == passes
+    assert 0.005 < limit - 0.005 < 0.1 and (drift <= limit) == passes
+
+
 def test_momentum_and_energy_are_those_of_a_falling_cube(generator):
     make = EnvMaker("cube/toss", "mujoco", generator)
     scene = make.task.scene

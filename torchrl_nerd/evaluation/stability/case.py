@@ -63,9 +63,11 @@ class Trial:
         """`rollout` in the dynamics under test."""
         return rollout(self.dynamics, start, steps, *how, **more)
 
-    def roll_exactly(self, start: TensorDict, steps: int, *how: Any) -> TensorDict:
+    def roll_exactly(
+        self, start: TensorDict, steps: int, *how: Any, **more: Any
+    ) -> TensorDict:
         """`rollout` in MuJoCo."""
-        return rollout(MujocoDynamics(self.scene), start, steps, *how)
+        return rollout(MujocoDynamics(self.scene), start, steps, *how, **more)
 
     def scaled(self, count: int, least: int) -> int:
         """A number of steps or trajectories times the scale."""
