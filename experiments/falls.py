@@ -9,6 +9,7 @@ Falls: the share of robots on their back, from starts as episodes have. Progress
 farther along x the robots of a model are than MuJoCo's, from equal states on the way.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -55,37 +56,36 @@ class Config:
 
 
 @torch.no_grad()
-def falls(env: SceneEnv, actor: Actor, actions: int, every: int) -> list[float]:
-    """Share of robots on their back, a mean over every so many actions."""
-    state, shares = env.reset(), []
+def motion(
+    env: SceneEnv, actor: Actor, actions: int, start: TensorDictBase | None = None
+) -> Iterator[TensorDictBase]:
+    """States after each action, from states ``[n]`` or as an episode starts."""
+    state = env.reset() if start is None else env.reset(start, set_state=True)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(actions):
             state = env.step(actor(state))["next"]
-            shares.append((uprightness(state) < 0.0).double().mean())
+            yield state
+
+
+def falls(env: SceneEnv, actor: Actor, actions: int, every: int) -> list[float]:
+    """Share of robots on their back, a mean over every so many actions."""
+    states = motion(env, actor, actions)
+    shares = [(uprightness(state) < 0.0).double().mean() for state in states]
     return [float(part.mean()) for part in torch.stack(shares).split(every)]
 
 
-@torch.no_grad()
 def positions(
     env: SceneEnv, actor: Actor, start: TensorDictBase, actions: int
 ) -> Tensor:
     """Positions along x ``(n, actions)`` after each action from states ``[n]``."""
-    state, found = env.reset(start, set_state=True), []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(actions):
-            state = env.step(actor(state))["next"]
-            found.append(state[QPOS][:, 0])
-    return torch.stack(found, 1)
+    states = motion(env, actor, actions, start)
+    return torch.stack([state[QPOS][:, 0] for state in states], 1)
 
 
-@torch.no_grad()
 def upright_on_the_way(env: SceneEnv, actor: Actor, actions: int) -> TensorDictBase:
     """States ``[n]`` of the robots that still stand after so many actions."""
-    state = env.reset()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(actions):
-            state = env.step(actor(state))["next"]
-    return state.select(QPOS, QVEL)[uprightness(state) > 0.0]
+    *_, last = motion(env, actor, actions)
+    return last.select(QPOS, QVEL)[uprightness(last) > 0.0]
 
 
 def main(cfg: Config) -> None:
