@@ -552,7 +552,7 @@ def self_contact_table(folder: Path = RESULTS) -> str:
     for scene in dict.fromkeys(row["scene"] for row in record["results"]):
         own = [row for row in record["results"] if row["scene"] == scene]
         for key, what in (
-            ("qvel_1", "velocities, 1 step"),
+            ("qvel_1", "`qvel`, 1 step, m/s and rad/s"),
             ("m_20", "positions, 20 steps, m"),
             ("rad_20", "rotations, 20 steps, rad"),
         ):
