@@ -10,7 +10,8 @@ from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD
 from torchrl_nerd.modules.networks import MLPConfig
-from torchrl_nerd.training.samples import PART, data_stats, raw_tokens
+from torchrl_nerd.training import samples as samples_module
+from torchrl_nerd.training.samples import data_stats, raw_tokens
 from torchrl_nerd.training.sequences import Sequences
 
 STEPS = 6
@@ -88,8 +89,9 @@ def test_batches_depend_on_the_generator_alone(sequences, seed):
     assert not torch.equal(first[0].token, third[0].token)
 
 
-def test_statistics_are_those_of_the_whole_data_set(scene, generator):
-    data = simulate(scene, 2 * PART + 300, 2, generator)
+def test_statistics_are_those_of_the_whole_data_set(scene, generator, monkeypatch):
+    monkeypatch.setattr(samples_module, "PART", 256)
+    data = simulate(scene, 428, 2, generator)
     data = data[is_sound(data)]
     model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 4))
     stats = data_stats(scene, data)

@@ -23,7 +23,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive_of
 from torchrl_nerd.transforms import StateDelta, Stats
 
-PART = 64  # trajectories turned into tokens at a time: fit the cache
+PART = 6400  # samples turned into tokens at a time: fit the cache
 
 
 def raw_tokens(
@@ -53,11 +53,16 @@ def stats_of(
     """
     device = data[QPOS].device
     encode = tokens.to(device), cast(StateDelta, state_delta.to(device))
-    parts = (raw_tokens(*encode, part) for part in data.split(PART))
+    parts = (raw_tokens(*encode, part) for part in data.split(_together(data)))
     both = ([Stats.of(values) for values in part] for part in parts)
     found = map(Stats.merge_all, zip(*both, strict=True))
     token, target = (Stats(x.count, x.mean.cpu(), x.m2.cpu()) for x in found)
     return {TOKEN: token, TARGET: target}
+
+
+def _together(data: TensorDict) -> int:
+    """Trajectories of a part, however long they are."""
+    return max(1, PART * len(data) // max(1, data.numel()))
 
 
 def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
@@ -66,7 +71,7 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
         torch.empty(*data.batch_size, size, device=data[QPOS].device)
         for size in (model.scene_features.size, model.state_delta.size)
     )
-    parts = data.split(PART), tokens.split(PART), targets.split(PART)
+    parts = (x.split(_together(data)) for x in (data, tokens, targets))
     for part, *places in zip(*parts, strict=True):  # filled in place: memory is short
         raw = raw_tokens(model.scene_features, model.state_delta, part)
         for place, key, value in zip(places, (TOKEN, TARGET), raw, strict=True):
