@@ -97,7 +97,7 @@ class Config:
 def along_policy(
     scene: Scene, cfg: Config, rows: int, seed: int, noise: float
 ) -> TensorDict:
-    """Pieces ``[n, STEPS]`` of trajectories along the policy, until the robot falls."""
+    """Pieces ``[n, STEPS]`` of trajectories along the policy, see `pieces_along`."""
     assert cfg.policy is not None
     task = policy_task(cfg.policy)
     if task.scene.hash != scene.hash:

@@ -19,7 +19,6 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from math import ceil
 from multiprocessing import get_context
 from pathlib import Path
 from typing import cast
@@ -66,7 +65,7 @@ class Config:
     trajectories: int = 1000  # random ones of 100 control steps
     updates: int = 4000  # of the model, on them
     rounds: int = 10  # of PPO in the model; data are added between two of them
-    along: int = 64  # trajectories along the policy before a round, more where it falls
+    along: int = 64  # trajectories along the policy before a round
     length: int = 1000  # control steps of each
     more_updates: int = 2500  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
@@ -154,31 +153,22 @@ def watched(cfg: Config, actor: Actor) -> float:
 def pieces_along(
     task: Task, actor: Actor, rows: int, length: int, draw: Generator, noise: float
 ) -> TensorDict:
-    """Pieces ``[n, SEGMENT]`` of trajectories in MuJoCo, begun before the robot fell."""
-    length = length // SEGMENT * SEGMENT
-    data = policy_data(task, actor, rows, length, draw, noise=noise)
-    data = cast(TensorDict, data[is_sound(data)])
-    fell = task.terminated({QPOS: data[NEXT_QPOS], QVEL: data[NEXT_QVEL]})  # (rows, T)
-    late = fell.long().cumsum(1)[:, SEGMENT - 1 :: SEGMENT] > 0  # by the end of a piece
-    begins = torch.cat((torch.ones_like(late[:, :1]), ~late[:, :-1]), 1)
-    pieces = cast(TensorDict, data.reshape(len(data), -1, SEGMENT))
-    return cast(TensorDict, pieces[begins])
+    """Pieces ``[n, SEGMENT]`` of trajectories in MuJoCo, without those that diverge.
 
-
-def data_along(
-    cfg: Config, task: Task, actor: Actor, draw: Generator
-) -> list[TensorDict]:
-    """As many pieces as `along` trajectories to the end have, of a robot that falls too."""
-    left, rows, length = cfg.along * (cfg.length // SEGMENT), cfg.along, cfg.length
-    parts: list[TensorDict] = []
-    while left > 0 and rows:
-        found = pieces_along(task, actor, rows, length, draw, cfg.noise)
-        parts.append(cast(TensorDict, found[:left]))
-        left -= len(found)
-        each = len(found) / rows  # pieces until it falls
-        rows = ceil(left / each) if each else 0
-        length = min(cfg.length, SEGMENT * ceil(2.0 * each))  # most fall before
-    return parts
+    A robot that fell starts anew at the end of its piece.
+    """
+    start, pieces = None, []
+    for _ in range(length // SEGMENT):
+        piece = policy_data(task, actor, rows, SEGMENT, draw, noise, start)
+        after = {QPOS: piece[NEXT_QPOS], QVEL: piece[NEXT_QVEL]}
+        sound = is_sound(piece)  # (rows,)
+        stays = sound & ~task.terminated(after).any(1)
+        u = torch.rand(rows, task.num_uniforms, dtype=torch.float64, generator=draw)
+        fresh = TensorDict(task.initial_state(u), [rows])
+        last = piece[:, -1].update({key: value[:, -1] for key, value in after.items()})
+        start = last.select(*fresh.keys()).where(stays, fresh)
+        pieces.append(piece[sound])
+    return cast(TensorDict, TensorDict.cat(pieces))
 
 
 def train_model(
@@ -215,17 +205,23 @@ def in_the_model(cfg: Config) -> dict:
     task, clock = begin(cfg, cfg.device)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
     data, curve = cast(TensorDict, data[is_sound(data)]), []
-    model: NeRD | None = None
     learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
-    for number in range(cfg.rounds + 1):
+    model: NeRD | None = None
+
+    def learned(number: int) -> NeRD:
+        """The model, once it learned along the policy as well."""
+        nonlocal data
         draw = fold_in(cfg.seed, 1 + number)
-        more = data_along(cfg, task, learner.on_the_processor(), draw)
-        data = cast(TensorDict, TensorDict.cat((data, *more)))
+        along = task, learner.on_the_processor(), cfg.along, cfg.length
+        more = pieces_along(*along, draw, cfg.noise)
+        data = cast(TensorDict, TensorDict.cat((data, more)))
         clock.note("data")
-        model = train_model(task, data, cfg, number, model)
+        found = train_model(task, data, cfg, number, model)
         clock.note("model")
-        if number == cfg.rounds:
-            break
+        return found
+
+    for number in range(cfg.rounds):
+        model = learned(number)
         env = env_in(task, model, cfg.num_envs, cfg.seed + number, cfg.device)
         env = TransformedEnv(env, Trusted(cfg.trust))
         last = learner.learn(env, 1.0 / cfg.rounds)
@@ -235,7 +231,7 @@ def in_the_model(cfg: Config) -> dict:
         curve.append(point | {"seconds": clock.spent()})
         print(f"model, round {number + 1}: {curve[-1]}", flush=True)
         clock.note("watching")  # no part of the method
-    assert model is not None
+    model = learned(cfg.rounds)
     save_policy(learner.policy, cfg.folder / "policy", {})
     seed, count, actor = cfg.seed + 10_000, cfg.episodes, learner.on_the_processor()
     promised = policy_returns(env_in(task, model.cpu(), count, seed), actor)

@@ -11,12 +11,10 @@ from policies_in_the_model import (
     SEGMENT,
     Config,
     Trusted,
-    data_along,
     in_the_model,
     main,
     pieces_along,
 )
-from tensordict import TensorDict
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_nerd import NeRDEnv, from_pretrained, make_env
@@ -50,26 +48,20 @@ def test_the_same_rule_ends_episodes_in_mujoco():
     assert after["terminated"].flatten().tolist() == [False, True]
 
 
-def test_pieces_begin_before_the_robot_fell():
+def test_a_robot_that_fell_starts_anew_and_others_go_on():
     task = make_task("gymnasium/Hopper-v5")
     actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
-    rows = 6
-    found = pieces_along(task, actor, rows, 3 * SEGMENT, fold_in(0, 1), noise=1.0)
-    assert found.batch_size[1] == SEGMENT
-    assert rows <= len(found) < 3 * rows  # it falls within seconds
-    start = found[:, 0]
-    assert not task.terminated({key: start[key] for key in (QPOS, QVEL)}).any()
-    assert isinstance(found, TensorDict)
+    rows, pieces = 6, 3
+    found = pieces_along(task, actor, rows, pieces * SEGMENT, fold_in(0, 1), noise=1.0)
+    assert found.batch_size == (rows * pieces, SEGMENT)
     torch.testing.assert_close(found[:, 1:][QPOS], found[:, :-1]["next", QPOS])
-
-
-def test_a_robot_that_falls_gives_as_much_data():
-    task = make_task("gymnasium/Hopper-v5")
-    actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
-    cfg = Config("gymnasium/Hopper-v5", along=4, length=5 * SEGMENT, noise=1.0)
-    parts = data_along(cfg, task, actor, fold_in(0, 1))
-    assert len(parts) > 1 and len(parts[0]) < 20
-    assert sum(len(x) for x in parts) == 20
+    by_piece = found.reshape(pieces, rows, SEGMENT)
+    after = {key: by_piece["next", key] for key in (QPOS, QVEL)}
+    fell = task.terminated(after).any(-1)[:-1]  # (pieces - 1, rows)
+    ends, starts = by_piece[:-1, :, -1]["next", QPOS], by_piece[1:, :, 0][QPOS]
+    torch.testing.assert_close(starts[~fell], ends[~fell], rtol=0, atol=0)
+    assert fell.any() and (starts[fell] - ends[fell]).abs().amax(-1).min() > 0.01
+    assert not task.terminated({key: found[:, 0][key] for key in (QPOS, QVEL)}).any()
 
 
 def test_noise_is_a_share_of_the_change():

@@ -108,15 +108,25 @@ class Transition:
         """
         # an action that is not finite is a fault, found below; the physics gets zeros
         given = torch.where(action.isfinite().all(-1, keepdim=True), action, 0.0)
-        terrain = state.get(TERRAIN)
-        moved, drive, trusts = state, {}, []
-        for _ in range(self.task.frame_skip):
-            moving = {key: moved[key] for key in MOVING if key in moved}
-            moved, drive = self._advance(moving, given, terrain)
-            if TRUST in moved:
-                trusts.append(moved[TRUST])
+        steps = self._control_steps(self._advance, state, given, state.get(TERRAIN))
+        moved, drive = steps[-1]
+        trusts = [after[TRUST] for after, _ in steps if TRUST in after]
         trust = reduce(torch.minimum, trusts) if trusts else None
         return self._judge(state, action, given, age, moved, drive, trust)
+
+    def _control_steps(
+        self,
+        advance: Callable[..., tuple[Tensors, Tensors]],
+        state: Tensors,
+        action: Tensor,
+        terrain: Tensor | None,
+    ) -> list[tuple[Tensors, Tensors]]:
+        """What ``advance`` makes of a state in each control step of an action."""
+        found = [(state, {})]
+        for _ in range(self.task.frame_skip):
+            moving = {key: found[-1][0][key] for key in MOVING if key in found[-1][0]}
+            found.append(advance(moving, action, terrain))
+        return found[1:]
 
     def warm_up(self, history: TensorDictBase, num_envs: int) -> None:
         """Show the dynamics a recorded motion, see `dynamics.base.warm_up`.
@@ -138,10 +148,8 @@ class Transition:
 
     def _repeat(self, state: TensorDictBase, then: TensorDictBase) -> None:
         """Let the dynamics make the control steps of a recorded action once more."""
-        moved = dict(state.items())
-        for _ in range(self.task.frame_skip):
-            moving = {key: moved[key] for key in MOVING if key in moved}
-            moved, _ = self._control_step(moving, then[ACTION], then.get(TERRAIN, None))
+        given = then[ACTION], then.get(TERRAIN, None)
+        self._control_steps(self._control_step, dict(state.items()), *given)
 
     def _outcome(
         self,

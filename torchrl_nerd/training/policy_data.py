@@ -30,12 +30,14 @@ def policy_data(
     steps: int,
     generator: Generator,
     noise: float = 0.5,
+    start: TensorDictBase | None = None,
 ) -> TensorDict:
     """Draw ``[trajectories, steps]`` of a policy in MuJoCo, diverged ones included.
 
-    They start with the task's resets and continue where an episode would end. Actions are
-    the policy's mean plus normal noise, clipped to [-1, 1]; the noise of each trajectory
-    has a standard deviation from U(0, ``noise``), in units of the action.
+    They start with the task's resets, or in the states ``start [trajectories]``, and
+    continue where an episode would end. Actions are the policy's mean plus normal noise,
+    clipped to [-1, 1]; the noise of each trajectory has a standard deviation from
+    U(0, ``noise``), in units of the action.
 
     Raises:
         ValueError: a task that drives a robot with servos by torques.
@@ -45,7 +47,8 @@ def policy_data(
     u = torch.rand(size, dtype=torch.float64, generator=generator)
     share = torch.rand(trajectories, 1, dtype=torch.float64, generator=generator)
     spread = noise * share
-    current = TensorDict(task.initial_state(u), [trajectories])
+    fresh = TensorDict(task.initial_state(u), [trajectories])
+    current = fresh if start is None else start.select(*fresh.keys())
     terrain = current.get(TERRAIN, None)
     dynamics = MujocoDynamics(scene)
     dynamics.reset(current)
