@@ -426,7 +426,8 @@ def policies_table(folder: Path = RESULTS) -> str:
             if (returns := found["returns"].get(f"learned in {name}")) is not None:
                 about = how["name"], way, f"{frames:,}"
                 line = [*about, *minutes, spread(returns), in_model]
-                lines.setdefault(about, line)
+                if about not in lines or lines[about][4] == "-":  # without times
+                    lines[about] = line
     columns = [*head, "return in MuJoCo", "in the model"]
     return with_sources([columns, *lines.values()], records)
 

@@ -65,11 +65,11 @@ class Config:
     trajectories: int = 1000  # random ones of 100 control steps
     updates: int = 2000  # of the model, on them
     rounds: int = 10  # of PPO in the model; data are added between two of them
-    along: int = 32  # trajectories along the policy before a round
+    along: int = 64  # trajectories along the policy before a round
     length: int = 1000  # control steps of each
     more_updates: int = 1500  # of the model, after the first round
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
-    network: str = "mlp-2x64"
+    network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
     num_envs: int = 512
