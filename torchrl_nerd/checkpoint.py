@@ -198,9 +198,8 @@ def shipped_models(scene: Scene | None = None) -> list[str]:
     """
     own = {name for name, folder in MODELS.items() if (Path(folder) / CARD).is_file()}
     names = sorted({path.parent.name for path in PRETRAINED.glob(f"*/{CARD}")} | own)
-    if scene is None:
-        return names
-    return [name for name in names if shipped_card(name)["scene"] == scene.name]
+    here = None if scene is None else scene.name
+    return [x for x in names if here is None or shipped_card(x)["scene"] == here]
 
 
 def shipped_card(name: str) -> dict[str, Any]:
@@ -233,7 +232,8 @@ def _build(
                 return NeRD(scene, features, network)
             if kind == "hybrid":
                 step = make_step(solver_scene, config_of(card, "step", folder))
-                return HybridNeRD(scene, step, features, network)
+                is_gated = not card.get("variation")
+                return HybridNeRD(scene, step, features, network, is_gated=is_gated)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"the model in {folder}, kind {kind!r} with network {card.get('network')}, "

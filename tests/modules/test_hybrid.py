@@ -177,6 +177,21 @@ def test_where_the_defect_is_zero_the_network_has_no_influence(generator):
     assert difference.abs().max() > 1e-3
 
 
+def test_of_a_varied_robot_the_network_always_counts(generator, tmp_path):
+    """Also from disk, where the scene of an env is that of one robot."""
+    scene = load_scene("cartpole")
+    rows = random_transitions(scene, 2, generator)
+    for key in (QPOS, QVEL, JOINT_TORQUE):
+        rows[key] = torch.zeros_like(rows[key])  # at rest: the defect is zero
+    still = advance(lively(scene, "unconstrained", generator), rows)
+    model = lively(scene.vary({"motor": (0.5, 2.0)}), "unconstrained", generator)
+    folder = save_checkpoint(model, tmp_path, make_card(model))
+    moved = advance(load_checkpoint(folder, scene), rows)
+    assert (still[QVEL].abs() < 1e-12).all() and (moved[QVEL].abs() > 1e-6).all()
+    again = advance(load_checkpoint(folder).with_terrain(scene), rows)
+    torch.testing.assert_close(again[QVEL], moved[QVEL], rtol=0, atol=0)
+
+
 @pytest.mark.slow
 @each_analytic
 def test_compiled_equals_eager(scene, step, generator):

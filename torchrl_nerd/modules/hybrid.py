@@ -31,7 +31,9 @@ class HybridNeRD(NeRD):
     data, so the sum is bounded by the largest speeds alone.
 
     ``step`` is one of the scene or of its reference solver; all else as for `NeRD`. The
-    network's last layer is zero at first.
+    network's last layer is zero at first. A model that is not ``is_gated`` has a gate of 1:
+    that of a varied scene, where not told, since the step's estimate of its own error does
+    not know how another robot moves.
     """
 
     kind: ClassVar[str] = "hybrid"
@@ -44,6 +46,7 @@ class HybridNeRD(NeRD):
         features: FeatureConfig,
         network: NetworkConfig,
         stats: Mapping[NestedKey, Stats] | None = None,
+        is_gated: bool | None = None,
     ) -> None:
         if features.parameters:
             raise ValueError(
@@ -52,6 +55,7 @@ class HybridNeRD(NeRD):
         self._num_defects = step.num_defects  # the base class asks for `token_size`
         super().__init__(scene, features, network, stats)
         self.analytic_step = step
+        self.is_gated = scene.variation is None if is_gated is None else is_gated
         last = [m for m in self.network.head.modules() if isinstance(m, nn.Linear)][-1]
         for weight in last.parameters():
             nn.init.zeros_(weight)
@@ -76,7 +80,9 @@ class HybridNeRD(NeRD):
         rms = (squared + TINY).sqrt() - TINY**0.5  # finite slope at rest
         token = self.training_range.clamp_features(features)
         token = torch.cat((token, defect, change), -1).to(self.dtype)
-        return Encoded(features, token, change, (rms / GATE_SCALE).clamp_max(1.0))
+        gate = (rms / GATE_SCALE).clamp_max(1.0)
+        gate = gate if self.is_gated else torch.ones_like(gate)
+        return Encoded(features, token, change, gate)
 
     def bounded(self, change: Tensor) -> Tensor:
         """Denormalised change, bounded by the largest speeds of the data."""
@@ -86,7 +92,8 @@ class HybridNeRD(NeRD):
     def copy_for(self, scene: Scene) -> "HybridNeRD":
         """See `NeRD.copy_for`."""
         step = make_step(scene, self.analytic_step.config)
-        return HybridNeRD(scene, step, self.scene_features.config, self.config)
+        how = self.scene_features.config, self.config
+        return HybridNeRD(scene, step, *how, is_gated=self.is_gated)
 
 
 def _finite(x: Tensor) -> Tensor:
