@@ -184,7 +184,7 @@ def main(options: Options) -> None:
         "errors": measure(scene, candidates, options),
         "changes": changes(scene, models, options.seed + 10),
         "probe": probe(scene, models, options.seed + 20),
-        "rates": rates(load_scene(options.scene)),
+        "rates": rates(load_scene(options.scene), models),
     }
     if options.json is not None:
         write_results(options.json, results, options.seed)

@@ -151,33 +151,46 @@ def probe(scene: Scene, models: dict[str, NeRD], seed: int) -> list[dict[str, An
     return rows
 
 
-def rates(scene: Scene) -> list[dict[str, Any]]:
-    """Control steps per second of a transformer 2x64 by its band, and its ring's size.
+def rates(scene: Scene, models: dict[str, NeRD]) -> list[dict[str, Any]]:
+    """Control steps per second and size of the history, of ``models`` and by band.
 
-    The bands take turns, so that a machine that others use slows all alike.
+    The bands are those of a transformer 2x64 with random weights. All take turns, so that a
+    machine that others use slows all alike.
     """
-    found: dict[int, list[float]] = {band: [] for band in BANDS}
+    found: dict[str, list[float]] = {}
     start = scene.sample_initial(ENVS, Generator().manual_seed(0))[0]
     terrain, state = start.pop(TERRAIN, None), TensorDict(start, [ENVS])
     torque = torch.zeros(ENVS, len(scene.actuated), dtype=torch.float64)
     features = FeatureConfig()
-    dynamics = {
-        band: NeRDDynamics(
-            NeRD(scene, features, network_config(f"transformer-2x64@{band}"))
+    bands = {
+        f"transformer 2x64, band {band}": NeRD(
+            scene, features, network_config(f"transformer-2x64@{band}")
         )
         for band in BANDS
     }
+    # a model that is told parameters steps no robot without them
+    own = {k: m for k, m in models.items() if not m.scene_features.config.parameters}
+    dynamics = {name: NeRDDynamics(m) for name, m in (bands | own).items()}
     for turn in range(TURNS + 1):
-        for band, each in dynamics.items():
+        for name, each in dynamics.items():
             began = time.perf_counter()
             for _ in range(10):
                 each.step(state, torque, terrain)
             if turn:  # the first one warms up
-                found[band].append(10 * ENVS / (time.perf_counter() - began))
+                rate = 10 * ENVS / (time.perf_counter() - began)
+                found.setdefault(name, []).append(rate)
     rows = []
-    for band, values in found.items():
-        kilobytes = 2 * 2 * band * 64 * 4 / 1024
+    for name, values in found.items():
+        kib = size_of(dynamics[name].history()) / ENVS / 1024
         rate = statistics.median(values)
-        rows.append({"band": band, "steps_per_s": rate, "ring_kib_per_env": kilobytes})
-    print("rates", {row["band"]: round(row["steps_per_s"]) for row in rows}, flush=True)
+        rows.append({"name": name, "steps_per_s": rate, "history_kib_per_env": kib})
+    print("rates", {row["name"]: round(row["steps_per_s"]) for row in rows}, flush=True)
     return rows
+
+
+def size_of(history: object) -> int:
+    """Bytes of the tensors of a history, or of lists of them."""
+    if isinstance(history, Tensor):
+        return history.numel() * history.element_size()
+    parts = history if isinstance(history, list) else vars(history).values()
+    return sum(map(size_of, parts))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from dynamics_helpers import random_model
 from hidden_parameters.__main__ import HISTORIES, Options, main
-from hidden_parameters.adaptation import watch
+from hidden_parameters.adaptation import rates, watch
 from hidden_parameters.identify import identify, identify_by_mujoco
 from hidden_parameters.motions import draw_parameters, motions
 from hidden_parameters.policies import Options as PolicyOptions
@@ -74,6 +74,20 @@ def test_errors_and_hidden_states_are_those_of_the_model(generator):
     errors, hidden, unlike = watch(model, data)
     assert errors.shape == (ROWS, 9) and (errors > 0).all()
     assert hidden.shape == (ROWS, 9, 2 * 64) and unlike.shape == errors.shape
+
+
+def test_rates_are_of_bands_and_models_that_are_not_told(generator, monkeypatch):
+    """A GRU keeps 128 numbers of 4 bytes; a band of 64 twice as much as one of 32."""
+    monkeypatch.setattr("hidden_parameters.adaptation.TURNS", 1)
+    scene, told = load_scene("cartpole"), FeatureConfig(parameters=True)
+    models = {"gru": random_model(scene, generator, "gru")}
+    models["told"] = random_model(SCENE, generator, "mlp-2x32", told)
+    found = {row["name"]: row for row in rates(scene, models)}
+    kib = {name: row["history_kib_per_env"] for name, row in found.items()}
+    assert kib.pop("gru") == 0.5 and "told" not in kib and len(kib) == 4
+    small, large = (kib[f"transformer 2x64, band {band}"] for band in (32, 64))
+    assert 1.9 < large / small < 2.0  # beside the ring some numbers that stay
+    assert all(row["steps_per_s"] > 0 for row in found.values())
 
 
 def test_returns_are_averaged_in_equal_parts_of_a_parameter(generator):
