@@ -52,6 +52,7 @@ def dying_draw(folder: Path, is_deadly: bool):
     return draw
 
 
+@pytest.mark.slow
 def test_a_killed_worker_changes_no_bit(cluster, small_chunks, tmp_path, seed):
     deaths = tmp_path / "deaths"
     deaths.mkdir()

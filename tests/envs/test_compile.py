@@ -105,12 +105,22 @@ def act_next(actions: Iterator[torch.Tensor], td: TensorDictBase) -> TensorDictB
     return td.set("action", next(actions))
 
 
-@pytest.mark.parametrize("guard", slow_but([None], [None, *get_args(Guard)]))
-def test_torchrl_rolls_it_out(guard, seed):
+@pytest.mark.parametrize(
+    ("model", "guard"),
+    [
+        ("cartpole-mlp", None),
+        *(
+            pytest.param("cartpole", guard, marks=pytest.mark.slow)
+            for guard in (None, *get_args(Guard))
+        ),
+    ],
+)
+def test_torchrl_rolls_it_out(model, guard, seed):
     """With automatic resets, whatever looks at its steps."""
     task = make_task(TASK)
     task.horizon = 3
-    envs = [NeRDEnv(task, num_envs=ROWS, seed=1, guard=guard) for _ in range(2)]
+    how = {"num_envs": ROWS, "seed": 1, "guard": guard}
+    envs = [NeRDEnv(task, model, **how) for _ in range(2)]
     envs[1].compile()
     paths = []
     for env in envs:

@@ -1,5 +1,7 @@
 """Models of varied robots: told their parameters or not, trained after a history."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -18,7 +20,7 @@ from torchrl_nerd.files import read_json
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
-from torchrl_nerd.robots import load_scene, make_task, source_of
+from torchrl_nerd.robots import load_scene, make_task, protocol_of, source_of
 from torchrl_nerd.training.losses import rollout_loss
 from torchrl_nerd.training.samples import data_stats
 from torchrl_nerd.training.sequences import Sequences, change_times
@@ -164,8 +166,13 @@ def test_symmetry_augmentation_of_varied_robots_are_refused(data, tmp_path):
         Trainer(SCENE, data, SCENE, config, tmp_path)
 
 
-def test_the_command_line_measures_after_a_history(tmp_path, capsys):
+def test_the_command_line_measures_after_a_history(tmp_path, capsys, monkeypatch):
     """Beside MuJoCo, which knows every robot, and one that is nominal for all."""
+
+    def short(scene):
+        return replace(protocol_of(scene), horizons=(100,))
+
+    monkeypatch.setattr("torchrl_nerd.cli.eval.protocol_of", short)
     path = tmp_path / "eval.json"
     how = ("--model", "cartpole-adaptive", "--num-trajectories", "16", "--quiet")
     seen = ("--vary", "preset", "--history", "20", "--json", str(path))
