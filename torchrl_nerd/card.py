@@ -53,6 +53,8 @@ def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str,
         card["reference_ratio"] = model.reference_ratio
     if not isinstance(step, NeRD):
         card["step"] = _described("step", step.config)
+    if isinstance(model, HybridNeRD):
+        card["is_gated"] = model.is_gated
     return card | {
         "training_ranges": scene.sampling.ranges(),
         "versions": {

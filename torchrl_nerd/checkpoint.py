@@ -232,7 +232,7 @@ def _build(
                 return NeRD(scene, features, network)
             if kind == "hybrid":
                 step = make_step(solver_scene, config_of(card, "step", folder))
-                is_gated = not card.get("variation")
+                is_gated = card.get("is_gated", True) is not False
                 return HybridNeRD(scene, step, features, network, is_gated=is_gated)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(

@@ -39,8 +39,8 @@ def begin_from(
 ) -> NeRD:
     """A model with weights and statistics of another one, which is left as it is.
 
-    What the network's inputs mean, their statistics, is part of what it learned. The
-    training range is left to be fitted.
+    What the network's inputs mean, their statistics, is part of what it learned, and so is
+    a hybrid's gate. The training range is left to be fitted.
 
     Raises:
         ValueError: in one sentence, a configuration of another network, kind or step,
@@ -64,6 +64,8 @@ def begin_from(
             f"expected a model to start from with {widths[0]} inputs and {widths[1]} "
             f"outputs as scene '{scene.name}' has, got {found[0]} and {found[1]}"
         )
+    if isinstance(model, HybridNeRD) and isinstance(start, HybridNeRD):
+        model.is_gated = start.is_gated
     model.network.load_state_dict(start.network.state_dict())
     model.normalize.load_state_dict(start.normalize.state_dict())
     if symmetry is not None and not symmetry.keeps(model.normalize):
