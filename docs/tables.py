@@ -39,6 +39,8 @@ def number(value: float | None) -> str:
     """Two digits; what is not finite diverges."""
     if value is None:
         return "-"
+    if 99.5 <= abs(value) < 1e6:
+        return f"{float(f'{value:.2g}'):,.0f}"  # no power of ten
     return f"{value:.2g}" if abs(value) < float("inf") else "diverges"
 
 
@@ -353,7 +355,7 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
             # records of before name the band alone
             name = row.get("name") or f"transformer 2x64, band {row['band']}"
             kib = row.get("history_kib_per_env", row.get("ring_kib_per_env"))
-            table.append([name, f"{row['steps_per_s']:,.0f}", number(kib)])
+            table.append([name, f"{row['steps_per_s']:,.0f}", f"{kib:.3g}"])
         parts += ["Rates, not compiled:", rows(table)]
         parts.append(made_by(record))
     return "\n\n".join(parts)

@@ -436,6 +436,12 @@ def test_tables_of_the_site_are_rendered_from_results(tmp_path):
     assert "not measured" in tables_hook.render(page, tmp_path / "nowhere")
 
 
+def test_numbers_have_two_digits_and_no_power_of_ten_that_a_reader_must_count():
+    values = 0.01234, 99.4, 128.26, 2149.0, float("inf"), None
+    shown = [tables_hook.number(value) for value in values]
+    assert shown == ["0.012", "99", "130", "2,100", "diverges", "-"]
+
+
 @each(PAGES)
 def test_a_page_asks_for_tables_that_exist(page):
     asked = re.findall("<!-- table: (.*) -->", page.read_text())
