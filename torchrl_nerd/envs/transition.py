@@ -122,11 +122,12 @@ class Transition:
         terrain: Tensor | None,
     ) -> list[tuple[Tensors, Tensors]]:
         """What ``advance`` makes of a state in each control step of an action."""
-        found = [(state, {})]
+        moved, found = state, []
         for _ in range(self.task.frame_skip):
-            moving = {key: found[-1][0][key] for key in MOVING if key in found[-1][0]}
-            found.append(advance(moving, action, terrain))
-        return found[1:]
+            moving = {key: moved[key] for key in MOVING if key in moved}
+            moved, drive = advance(moving, action, terrain)
+            found.append((moved, drive))
+        return found
 
     def warm_up(self, history: TensorDictBase, num_envs: int) -> None:
         """Show the dynamics a recorded motion, see `dynamics.base.warm_up`.

@@ -31,9 +31,9 @@ class HybridNeRD(NeRD):
     data, so the sum is bounded by the largest speeds alone.
 
     ``step`` is one of the scene or of its reference solver; all else as for `NeRD`. The
-    network's last layer is zero at first. A model that is not ``is_gated`` has a gate of 1:
-    that of a varied scene, where not told, since the step's estimate of its own error does
-    not know how another robot moves.
+    network's last layer is zero at first. A model that is not ``is_gated`` has a gate of 1.
+    By default that is one of a varied scene: the step's estimate of its own error does not
+    know how another robot moves.
     """
 
     kind: ClassVar[str] = "hybrid"
