@@ -62,12 +62,13 @@ class Config:
 
     name: Positional[str]  # a task with rewards, such as dm_control/cheetah-run
     hold: int = 4  # control steps that an action of a suite task is held
-    trajectories: int = 1000  # random ones of 100 control steps
-    updates: int = 2000  # of the model, on them
+    trajectories: int = 500  # random ones of 100 control steps
+    updates: int = 1500  # of the model, on them
     rounds: int = 10  # of PPO in the model; data are added between two of them
-    along: int = 64  # trajectories along the policy before a round
+    along: int = 32  # trajectories along the policy before a round
     length: int = 1000  # control steps of each
-    more_updates: int = 1500  # of the model, after the first round
+    more_updates: int = 1000  # of the model, after the first round
+    batch: int = 512  # transitions of an update
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     network: str = "mlp-4x64"
     noise: float = 0.3  # of actions along the policy, largest standard deviation
@@ -180,10 +181,12 @@ def train_model(
         network=cfg.network,
         steps=cfg.updates if start is None else cfg.more_updates,
         rollout_steps=0,
-        single_step_fraction=1.0,
+        batch_size=cfg.batch,
+        sequence_length=1,
+        bf16_fraction=0.85,
         loss_eps=0.02,
-        lr=0.01 if start is None else 0.005,
-        adamw_lr=3e-3 if start is None else 1.5e-3,
+        lr=0.02 if start is None else 0.01,
+        adamw_lr=3e-3,
         validate_every=10**9,  # at the end alone
         save_every=10**9,
         seed=cfg.seed,
