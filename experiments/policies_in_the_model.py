@@ -52,7 +52,8 @@ from torchrl_nerd.tasks.suite import SuiteTask
 from torchrl_nerd.training.policy_data import policy_data
 from torchrl_nerd.training.trainer import Trainer
 
-SEGMENT = 100  # control steps of a training trajectory
+SEGMENT = 100  # control steps of a random trajectory
+PIECE = 10  # control steps along the policy until a robot that fell starts anew
 WATCHED = 64  # episodes of a point of the learning curves
 
 
@@ -152,15 +153,21 @@ def watched(cfg: Config, actor: Actor) -> float:
 
 
 def pieces_along(
-    task: Task, actor: Actor, rows: int, length: int, draw: Generator, noise: float
+    task: Task,
+    actor: Actor,
+    rows: int,
+    length: int,
+    draw: Generator,
+    noise: float,
+    steps: int = PIECE,
 ) -> TensorDict:
-    """Pieces ``[n, SEGMENT]`` of trajectories in MuJoCo, without those that diverge.
+    """Pieces ``[n, steps]`` of trajectories in MuJoCo, without those that diverge.
 
     A robot that fell starts anew at the end of its piece.
     """
     start, pieces = None, []
-    for _ in range(length // SEGMENT):
-        piece = policy_data(task, actor, rows, SEGMENT, draw, noise, start)
+    for _ in range(length // steps):
+        piece = policy_data(task, actor, rows, steps, draw, noise, start)
         after = {QPOS: piece[NEXT_QPOS], QVEL: piece[NEXT_QVEL]}
         sound = is_sound(piece)  # (rows,)
         stays = sound & ~task.terminated(after).any(1)
@@ -208,7 +215,8 @@ def in_the_model(cfg: Config) -> dict:
     """A policy learned in models alone, what it took, and how it does."""
     task, clock = begin(cfg, cfg.device)
     data = simulate(task.scene, cfg.trajectories, SEGMENT, fold_in(cfg.seed, 0))
-    data, curve = cast(TensorDict, data[is_sound(data)]), []
+    data = cast(TensorDict, data[is_sound(data)].reshape(-1, PIECE))
+    curve = []
     learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     model: NeRD | None = None
 
@@ -231,7 +239,7 @@ def in_the_model(cfg: Config) -> dict:
         last = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
         found = watched(cfg, learner.on_the_processor())
-        point = {"robot_frames": SEGMENT * len(data), "return": found, **last}
+        point = {"robot_frames": data.numel(), "return": found, **last}
         curve.append(point | {"seconds": clock.spent()})
         print(f"model, round {number + 1}: {curve[-1]}", flush=True)
         clock.note("watching")  # no part of the method

@@ -8,6 +8,7 @@ import tables
 import torch
 from noisy_dynamics import NoisyDynamics, StepErrors, step_errors
 from policies_in_the_model import (
+    PIECE,
     SEGMENT,
     Config,
     Trusted,
@@ -51,11 +52,11 @@ def test_the_same_rule_ends_episodes_in_mujoco():
 def test_a_robot_that_fell_starts_anew_and_others_go_on():
     task = make_task("gymnasium/Hopper-v5")
     actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
-    rows, pieces = 6, 3
-    found = pieces_along(task, actor, rows, pieces * SEGMENT, fold_in(0, 1), noise=1.0)
-    assert found.batch_size == (rows * pieces, SEGMENT)
+    rows, pieces = 6, 8
+    found = pieces_along(task, actor, rows, pieces * PIECE, fold_in(0, 1), noise=1.0)
+    assert found.batch_size == (rows * pieces, PIECE)
     torch.testing.assert_close(found[:, 1:][QPOS], found[:, :-1]["next", QPOS])
-    by_piece = found.reshape(pieces, rows, SEGMENT)
+    by_piece = found.reshape(pieces, rows, PIECE)
     after = {key: by_piece["next", key] for key in (QPOS, QVEL)}
     fell = task.terminated(after).any(-1)[:-1]  # (pieces - 1, rows)
     ends, starts = by_piece[:-1, :, -1]["next", QPOS], by_piece[1:, :, 0][QPOS]
