@@ -400,7 +400,7 @@ def robots_table(folder: Path = RESULTS) -> str:
 def minutes_to(curve: list[dict[str, float]], wanted: float) -> str:
     """Until a policy first earned so much; of old records, where no time is, nothing."""
     times = [x["seconds"] for x in curve if x["return"] >= wanted and "seconds" in x]
-    return f"{times[0] / 60:.0f}" if times else "-"
+    return f"{times[0] / 60:.1f}" if times else "-"
 
 
 def policies_table(folder: Path = RESULTS) -> str:

@@ -53,7 +53,7 @@ from torchrl_nerd.training.policy_data import policy_data
 from torchrl_nerd.training.trainer import Trainer
 
 SEGMENT = 100  # control steps of a random trajectory
-PIECE = 10  # control steps along the policy until a robot that fell starts anew
+PIECE = 20  # control steps along the policy until a robot that fell starts anew
 WATCHED = 64  # episodes of a point of the learning curves
 
 

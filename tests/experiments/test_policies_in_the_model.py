@@ -52,7 +52,7 @@ def test_the_same_rule_ends_episodes_in_mujoco():
 def test_a_robot_that_fell_starts_anew_and_others_go_on():
     task = make_task("gymnasium/Hopper-v5")
     actor = make_actor(Policy.for_env(make_env(task, "mujoco", 2, 0), 4, (8,), 1.0, 1))
-    rows, pieces = 6, 8
+    rows, pieces = 6, 5
     found = pieces_along(task, actor, rows, pieces * PIECE, fold_in(0, 1), noise=1.0)
     assert found.batch_size == (rows * pieces, PIECE)
     torch.testing.assert_close(found[:, 1:][QPOS], found[:, :-1]["next", QPOS])
