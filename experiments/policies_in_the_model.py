@@ -69,6 +69,7 @@ class Config:
     along: int = 32  # trajectories along the policy before a round
     length: int = 1000  # control steps of each
     more_updates: int = 1000  # of the model, after the first round
+    last_updates: int = 3000  # of the model that promises what the last policy earns
     batch: int = 512  # transitions of an update
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     network: str = "mlp-4x64"
@@ -184,9 +185,10 @@ def train_model(
     task: Task, data: TensorDict, cfg: Config, number: int, start: NeRD | None
 ) -> NeRD:
     """The model of a round, from scratch or from the one before."""
+    updates = cfg.last_updates if number == cfg.rounds else cfg.more_updates
     how = TrainConfig(
         network=cfg.network,
-        steps=cfg.updates if start is None else cfg.more_updates,
+        steps=cfg.updates if start is None else updates,
         rollout_steps=0,
         batch_size=cfg.batch,
         sequence_length=1,
@@ -302,31 +304,37 @@ def main(cfg: Config) -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         ways = pool.submit(in_the_model, cfg), pool.submit(in_mujoco, cfg)
         learned, rival = (way.result() for way in ways)
+        report(cfg, learned, rival, {})  # the other rivals take as long again
         robot_frames = learned["curve"][-1]["robot_frames"]
         fewer = pool.submit(few_frames, cfg, robot_frames)
-        judged = pool.submit(in_mujoco, cfg, True).result()
-        few = fewer.result()
-    reached, promised = learned.pop("reached"), learned.pop("promised")
-    theirs = rival.pop("reached")
-    how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
-    same = "ground truth"
+        judged = pool.submit(in_mujoco, cfg, True).result()["reached"]
+        others = {
+            "the model's robot frames": fewer.result(),
+            "the rule of trust": judged,
+        }
+    report(cfg, learned, rival, others)
+
+
+def report(cfg: Config, learned: dict, rival: dict, others: dict[str, Tensor]) -> None:
+    """Print what all policies earn, and write it down."""
+    reached, promised = learned["reached"], learned["promised"]
+    theirs, same = rival["reached"], "ground truth"
     returns = {
         "learned in the model, in MuJoCo": summarize(reached, theirs, same),
         "learned in the model, in the model": summarize(promised, reached),
         "learned in MuJoCo": summarize(theirs, theirs, same),
-        "learned in MuJoCo, the model's robot frames": summarize(few, theirs, same),
-        "learned in MuJoCo, the rule of trust": summarize(
-            judged["reached"], theirs, same
-        ),
     }
+    for name, found in others.items():
+        returns[f"learned in MuJoCo, {name}"] = summarize(found, theirs, same)
     for name, found in returns.items():
-        print(f"{name}: {found.mean:.1f} +- {found.interval:.1f}")
+        print(f"{name}: {found.mean:.1f} +- {found.interval:.1f}", flush=True)
     spent = {
         name: {k: v for k, v in way["seconds"].items() if k != "watching"}
         for name, way in (("model", learned), ("mujoco", rival))
     }
     print({name: round(sum(times.values())) for name, times in spent.items()}, "s")
     if cfg.json is not None:
+        how = asdict(replace(cfg, json=None)) | {"out": str(cfg.out)}
         found = {name: asdict(summary) for name, summary in returns.items()}
         results = {"configuration": how, "returns": found, "seconds": spent}
         results |= {"model": learned["curve"], "mujoco": rival["curve"]}
