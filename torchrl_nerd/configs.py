@@ -112,7 +112,7 @@ class TrainConfig:
     rollout_lr_ratio: float = 0.1  # learning rates of rollouts, as a share of the peaks
     rollout_restarts: int = 1  # times that the learning rate of rollouts starts anew
     warmup: int = 200  # updates over which the learning rate rises from zero
-    # share of the one-step updates, the first ones, in bfloat16
+    # share of the one-step updates, the first ones, in bfloat16 where the device has it
     bf16_fraction: float = 0.0
     loss_eps: float = 0.01  # of the relative loss: keeps samples at rest finite
     clip: float = 1.0  # largest norm of the gradient

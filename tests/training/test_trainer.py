@@ -113,18 +113,25 @@ def test_a_hybrid_learns_too(name, step, tmp_path, seed):
         make_trainer(scene, replace(config, use_symmetry=True), tmp_path / "other")
 
 
+def learn(network, share, folder, seed):
+    """A trainer after a brief run, a share of it in bfloat16; its loss before."""
+    config = replace(BRIEF, network=network, bf16_fraction=share, seed=seed)
+    trainer = make_trainer(SCENE, config, folder)
+    before = loss_of(trainer, seed)
+    for _ in range(BRIEF.steps):
+        trainer.update()
+        trainer.step += 1
+    return trainer, before
+
+
 @pytest.mark.parametrize("network", NETWORK_NAMES)
 def test_bfloat16_learns_as_much_and_leaves_weights_and_outputs_alone(
-    network, tmp_path, seed
+    network, tmp_path, seed, monkeypatch
 ):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
     losses, learned = [], []
     for share in (0.0, 1.0):
-        config = replace(BRIEF, network=network, bf16_fraction=share, seed=seed)
-        trainer = make_trainer(SCENE, config, tmp_path / str(share))
-        before = loss_of(trainer, seed)
-        for _ in range(BRIEF.steps):
-            trainer.update()
-            trainer.step += 1
+        trainer, before = learn(network, share, tmp_path / str(share), seed)
         losses.append(loss_of(trainer, seed))
         weights = list(trainer.model.network.parameters())
         assert {weight.dtype for weight in weights} == {torch.float32}
@@ -133,6 +140,16 @@ def test_bfloat16_learns_as_much_and_leaves_weights_and_outputs_alone(
     # It was used. Weights tell: two losses of a GRU may round to one float.
     assert not torch.equal(*learned)
     assert abs(losses[1] / losses[0] - 1.0) < 0.1
+
+
+def test_a_processor_without_bfloat16_learns_in_float32(tmp_path, seed, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True})
+    learned = []
+    for share in (0.0, 1.0):
+        trainer, _ = learn("mlp-2x64", share, tmp_path / str(share), seed)
+        weights = trainer.model.network.parameters()
+        learned.append(torch.nn.utils.parameters_to_vector(weights))
+    assert torch.equal(*learned)
 
 
 def test_the_log_has_every_validation_once(tmp_path):

@@ -23,6 +23,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     passive_errors,
 )
 from torchrl_nerd.files import check_writable, read_json, write_json
+from torchrl_nerd.modules.linear import in_bfloat16
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
@@ -119,7 +120,7 @@ class Trainer:
         self.state = RunState(self.model.network, self.average, self.optimizers)
         one = torch.ones((), device=self.device)
         self.lr_ratio, self.ema_share = one, one.clone()
-        coarse = torch.autocast(self.device.type, torch.bfloat16)(self._one_step)
+        coarse = in_bfloat16(self._one_step, self.device)
         losses = {"one_step": self._one_step, "bfloat16": coarse}
         if compile:
             how = {"warmup": 0, "dynamic": False}
@@ -130,8 +131,7 @@ class Trainer:
             written = self.state.tensors
             self._follow = {k: Captured(x, written) for k, x in self._follow.items()}
         self.step, self.seconds, self.best = 0, 0.0, float("inf")
-        # of the last validation, by horizon in control steps and by quantity
-        self.errors: dict[int, dict[str, ErrorSummary]] = {}
+        self.errors: dict[int, dict[str, ErrorSummary]] = {}  # of validation, by steps
         if (self.folder / STATE).exists():
             self._resume()
 
