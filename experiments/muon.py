@@ -1,23 +1,22 @@
-"""Muon of PyTorch against the same update computed in float32.
+"""Muon of PyTorch against the package's, which computes the same update in float32.
 
     python experiments/muon.py --json results/muon.json
 
-`torch.optim.Muon` orthogonalises updates in bfloat16, one matrix after the other.
-`GramMuon` below, which was part of the package, iterates on Gram matrices in float32. Both
-train the same networks on the same data from the same seeds. The script writes the error on
-test rollouts, in m and rad at 100 and 500 steps, and the time of an update of the matrices.
+`torch.optim.Muon` orthogonalises updates in bfloat16, one matrix after the other. Both
+train the same networks on the same data from the same seeds. The script writes the error
+on test rollouts, in m and rad at 100 and 500 steps, and the time of an update of the
+matrices.
 """
 
 import tempfile
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 import tyro
-from torch import Generator, Tensor
+from torch import Generator
 
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import simulate
@@ -28,11 +27,6 @@ from torchrl_nerd.robots import load_scene, source_of
 from torchrl_nerd.training.optimizers import make_adamw, split_parameters
 from torchrl_nerd.training.trainer import Trainer
 
-COEFFICIENTS = (
-    3.4445,
-    -4.7750,
-    2.0315,
-)  # quintic of https://kellerjordan.github.io/posts/muon
 HORIZONS = (100, 500)  # control steps
 TEST_SEED, TEST_ROLLOUTS = 7, 512
 
@@ -51,78 +45,20 @@ class Options:
     """Write the results to this file."""
 
 
-class GramMuon(torch.optim.Optimizer):
-    """Muon in float32, all matrices of one shape at once.
-
-    Args:
-        params: weight matrices.
-        lr: step size.
-        momentum: Nesterov momentum.
-    """
-
-    def __init__(
-        self, params: Iterable[Tensor], lr: float, momentum: float = 0.95
-    ) -> None:
-        super().__init__(params, {"lr": lr, "momentum": momentum})
-
-    @torch.no_grad()
-    def step(self, closure: None = None) -> None:  # pyright: ignore
-        """Update every matrix that has a gradient."""
-        for group in self.param_groups:
-            by_shape: dict[torch.Size, list[Tensor]] = {}
-            for weight in group["params"]:
-                by_shape.setdefault(weight.shape, []).append(weight)
-            for shape, weights in by_shape.items():
-                updates = []
-                for weight in weights:
-                    state, gradient = self.state[weight], cast(Tensor, weight.grad)
-                    buffer = state.setdefault(
-                        "momentum_buffer", torch.zeros_like(weight)
-                    )
-                    buffer.lerp_(gradient, 1.0 - group["momentum"])
-                    updates.append(gradient.lerp(buffer, group["momentum"]))
-                scale = group["lr"] * max(1.0, shape[0] / shape[1]) ** 0.5
-                directions = orthogonalize(torch.stack(updates))
-                for weight, direction in zip(weights, directions, strict=True):
-                    weight.add_(direction, alpha=-scale)
-
-
-def orthogonalize(matrices: Tensor, iterations: int = 5) -> Tensor:
-    """Matrices ``(*batch, m, n)`` with all singular values brought to about one."""
-    is_tall = matrices.shape[-2] > matrices.shape[-1]
-    x = matrices.mT if is_tall else matrices
-    x = x / (torch.linalg.matrix_norm(x, keepdim=True) + 1e-12)
-    gram = x @ x.mT
-    product = factor = quintic(gram)
-    for _ in range(iterations - 1):
-        gram = factor @ gram @ factor
-        factor = quintic(gram)
-        product = factor @ product
-    x = product @ x
-    return x.mT if is_tall else x
-
-
-def quintic(gram: Tensor) -> Tensor:
-    """The matrix that one Newton-Schulz iteration multiplies with."""
-    a, b, c = COEFFICIENTS
-    factor = b * gram + c * gram @ gram
-    factor.diagonal(dim1=-2, dim2=-1).add_(a)
-    return factor
-
-
-class GramTrainer(Trainer):
-    """A trainer whose matrices are updated by `GramMuon`."""
+class TorchTrainer(Trainer):
+    """A trainer whose matrices are updated by PyTorch's Muon."""
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """See `Trainer.make_optimizers`."""
         matrices, others = split_parameters(self.model.network)
+        how = {"weight_decay": 0.0, "adjust_lr_fn": "original"}
         return {
-            "muon": GramMuon(matrices, self.config.lr),
+            "muon": torch.optim.Muon(matrices, self.config.lr, **how),
             "adamw": make_adamw(others, self.config.adamw_lr, self.device),
         }
 
 
-TRAINERS = {"float32": GramTrainer, "torch": Trainer}
+TRAINERS = {"float32": Trainer, "torch": TorchTrainer}
 
 
 def train(options: Options, name: str, network: str, seed: int) -> dict[str, Any]:

@@ -22,11 +22,11 @@ from torchrl_nerd.robots import PRESETS, SCENES, load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.log import TrainingLog
 from torchrl_nerd.training.losses import one_step_loss
+from torchrl_nerd.training.muon import Muon
 from torchrl_nerd.training.optimizers import (
     follow_gradient,
     learning_rate_ratio,
     make_adamw,
-    make_muon,
     split_parameters,
 )
 from torchrl_nerd.training.trainer import Trainer
@@ -292,7 +292,7 @@ def test_a_share_of_an_update_is_one_at_that_share_of_the_learning_rate(
         weights = [nn.Parameter(start.clone()) for _ in range(2)]
         lr = 0.1 if is_shared else 0.1 * ratio
         optimizers = {
-            "muon": make_muon(weights[:1], lr),
+            "muon": Muon(weights[:1], lr),
             "adamw": make_adamw(weights[1:], lr, torch.device("cpu")),
         }
         for grad in grads:

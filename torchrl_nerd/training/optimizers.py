@@ -5,10 +5,11 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from torch.optim import AdamW, Muon, Optimizer
+from torch.optim import AdamW, Optimizer
 
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
+from torchrl_nerd.training.muon import Muon
 
 STATE = "state.safetensors"
 
@@ -20,11 +21,6 @@ def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
         is_matrix = weight.ndim == 2 and "offset_bias" not in name
         (matrices if is_matrix else others).append(weight)
     return matrices, others
-
-
-def make_muon(matrices: list[Tensor], lr: float) -> Muon:
-    """Muon without weight decay, steps scaled by ``sqrt(max(1, rows / columns))``."""
-    return Muon(matrices, lr, weight_decay=0.0, adjust_lr_fn="original")
 
 
 def make_adamw(weights: list[Tensor], lr: float, device: torch.device) -> AdamW:
@@ -39,7 +35,7 @@ def make_optimizers(
     """Muon for the weights of linear layers, AdamW for all others."""
     matrices, others = split_parameters(network)
     return {
-        "muon": make_muon(matrices, config.lr),
+        "muon": Muon(matrices, config.lr),
         "adamw": make_adamw(others, config.adamw_lr, device),
     }
 

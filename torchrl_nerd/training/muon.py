@@ -1,0 +1,69 @@
+"""Muon in float32: momentum whose singular values are all brought to about one.
+
+Source: https://kellerjordan.github.io/posts/muon. `torch.optim.Muon` multiplies in
+bfloat16, one matrix after the other: an update takes it twice as long on a processor with
+bfloat16, and 10 to 29 times as long on one that emulates it. See ``experiments/muon.py``.
+"""
+
+from collections.abc import Iterable
+from math import sqrt
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic, steep at zero
+ITERATIONS = 5
+
+
+class Muon(Optimizer):
+    """Steps of a matrix of size ``lr * sqrt(max(1, rows / columns))``, without decay.
+
+    Args:
+        params: matrices ``(rows, columns)``.
+        lr: step size.
+        momentum: Nesterov's.
+    """
+
+    def __init__(
+        self, params: Iterable[Tensor], lr: float, momentum: float = 0.95
+    ) -> None:
+        super().__init__(params, {"lr": lr, "momentum": momentum})
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # pyright: ignore
+        """Update every matrix that has a gradient, those of one shape together."""
+        for group in self.param_groups:
+            momentum, by_shape = group["momentum"], {}
+            for weight in group["params"]:
+                if weight.grad is None:
+                    continue
+                state = self.state[weight]
+                if not state:
+                    state["momentum_buffer"] = torch.zeros_like(weight)
+                mean = state["momentum_buffer"].lerp_(weight.grad, 1.0 - momentum)
+                update = weight.grad.lerp(mean, momentum)
+                by_shape.setdefault(weight.shape, []).append((weight, update))
+            for (rows, columns), pairs in by_shape.items():
+                weights, updates = zip(*pairs, strict=True)
+                size = group["lr"] * sqrt(max(1.0, rows / columns))
+                directions = orthogonalize(torch.stack(updates))
+                for weight, direction in zip(weights, directions, strict=True):
+                    weight.add_(direction, alpha=-size)
+
+
+def orthogonalize(matrices: Tensor) -> Tensor:
+    """Matrices ``(n, rows, columns)`` with singular values of about one, 0.5 to 1.5.
+
+    Five iterations of Newton and Schulz, ``x <- a x + b (x x') x + c (x x')^2 x``.
+    """
+    a, b, c = COEFFICIENTS
+    is_tall = matrices.shape[-2] > matrices.shape[-1]
+    x = matrices.mT if is_tall else matrices
+    x = x / (torch.linalg.matrix_norm(x, keepdim=True) + 1e-7)
+    for _ in range(ITERATIONS):
+        gram = x @ x.mT
+        x = torch.baddbmm(
+            x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a
+        )
+    return x.mT if is_tall else x
