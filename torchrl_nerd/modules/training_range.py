@@ -147,14 +147,13 @@ class OODScore(nn.Module):
     def fit(self, features: Tensor) -> None:
         """Take mean, covariance and quantile of ``(samples, F)``."""
         some = features[:: max(1, len(features) // MAX_SAMPLES)].double()
-        center = some.mean(0)
-        covariance = (some - center).T @ (some - center) / len(some)
-        ridge = RIDGE * torch.eye(len(center), dtype=some.dtype, device=some.device)
-        values, axes = torch.linalg.eigh(covariance + ridge)
-        self.center.copy_(center)
+        self.center.copy_(some.mean(0))
+        some = some - self.center
+        ridge = RIDGE * torch.eye(some.shape[1], dtype=some.dtype, device=some.device)
+        values, axes = torch.linalg.eigh(some.T @ some / len(some) + ridge)
         # the ridge bounds eigenvalues from below, but for rounding beside a huge one
         self.whitening.copy_((axes / values.clamp_min(RIDGE).sqrt()).T)
-        length = self.mahalanobis(some.to(features.dtype))
+        length = torch.linalg.vector_norm(some @ self.whitening.T, dim=-1)
         self.reach.copy_(torch.quantile(length, QUANTILE))
 
     def mahalanobis(self, features: Tensor) -> Tensor:
