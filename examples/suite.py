@@ -117,7 +117,7 @@ def main(cfg: Config) -> None:
     """Data, model, policy, report."""
     torch.manual_seed(cfg.seed)
     began = time.monotonic()
-    task = SuiteTask(f"dm_control/{cfg.name}", cfg.hold)
+    task = SuiteTask(f"dm_control/{cfg.name}/{cfg.hold}")
     folder = cfg.out / cfg.name
     model = make_model(task.scene, cfg, folder)
     print(f"model in {model} after {time.monotonic() - began:.0f} s")

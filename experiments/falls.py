@@ -107,7 +107,7 @@ def main(cfg: Config) -> None:
     model = cast(NeRD, load_checkpoint(last / "last"))
     actor = make_actor(load_policy(cfg.folder / "policy", task))
     draw, length = fold_in(cfg.seed, 0), learning.length
-    data = pieces_along(task, actor, learning.along, length, draw, learning.noise)
+    data, _ = pieces_along(task, actor, learning.along, length, draw, learning.noise)
     errors, how = step_errors(model, data), (cfg.actions, cfg.every)
     exact = make_env(task, "mujoco", cfg.robots, cfg.seed)
     rows = {"MuJoCo": falls(exact, actor, *how)}

@@ -1,11 +1,11 @@
 """Policies learned in a learned model alone, beside PPO in MuJoCo at equal frames.
 
-    python experiments/policies_in_the_model.py dm_control/walker-walk --json FILE
+    python experiments/policies_in_the_model.py dm_control/walker-walk/4 --json FILE
 
 1. Random trajectories of the robot in MuJoCo, and a network that learns from them.
 2. In rounds: trajectories along the policy in MuJoCo, from which the model goes on
    learning; PPO in the model alone, where an episode fails as soon as a step is unlike the
-   data.
+   data. A policy that earned less in MuJoCo than an earlier one makes way for that one.
    After the last round the model learns once more, and says what the policy earns.
 3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
    policy had in the model, one for as many as the model's data cost the robot, and one
@@ -15,10 +15,11 @@
 The two ways take a processor each at the same time, and each counts what it took of it.
 """
 
+import copy
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import cast
@@ -27,6 +28,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
@@ -43,12 +45,19 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TRUST
+from torchrl_nerd.keys import (
+    ACTION,
+    NEXT_QPOS,
+    NEXT_QVEL,
+    OBSERVATION,
+    QPOS,
+    QVEL,
+    TRUST,
+)
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tasks import Task
-from torchrl_nerd.tasks.suite import SuiteTask
 from torchrl_nerd.training.policy_data import policy_data
 from torchrl_nerd.training.trainer import Trainer
 
@@ -61,8 +70,7 @@ WATCHED = 64  # episodes of a point of the learning curves
 class Config:
     """What to learn, and for how long."""
 
-    name: Positional[str]  # a task with rewards, such as dm_control/cheetah-run
-    hold: int = 4  # control steps that an action of a suite task is held
+    name: Positional[str]  # a task with rewards, such as dm_control/cheetah-run/4
     trajectories: int = 500  # random ones of 100 control steps
     updates: int = 1500  # of the model, on them
     rounds: int = 10  # of PPO in the model; data are added between two of them
@@ -130,9 +138,13 @@ class Trusted(Transform):
 
 
 def task_of(cfg: Config) -> Task:
-    """The task; actions of the suite's are held, as is usual there."""
+    """The task, whose actions end where pieces do."""
     task = make_task(cfg.name)
-    return SuiteTask(cfg.name, cfg.hold) if isinstance(task, SuiteTask) else task
+    if PIECE % task.frame_skip:
+        raise ValueError(
+            f"expected a frame skip that divides {PIECE}, got {task.frame_skip}"
+        )
+    return task
 
 
 def begin(cfg: Config, device: str = "cpu") -> tuple[Task, Clock]:
@@ -161,24 +173,60 @@ def pieces_along(
     draw: Generator,
     noise: float,
     steps: int = PIECE,
-) -> TensorDict:
-    """Pieces ``[n, steps]`` of trajectories in MuJoCo, without those that diverge.
+) -> tuple[TensorDict, Tensor]:
+    """Trajectories along the policy in MuJoCo, in pieces.
 
     A robot that fell starts anew at the end of its piece.
+
+    Returns:
+        Pieces ``[n, steps]``, without those that diverge, and the return of each robot's
+        first episode ``(rows,)``, whose actions count without their noise.
     """
-    start, pieces = None, []
+    start, pieces, goes_on = None, [], torch.ones(rows, dtype=torch.bool)
+    returns = torch.zeros(rows, dtype=torch.float64)
     for _ in range(length // steps):
         piece = policy_data(task, actor, rows, steps, draw, noise, start)
-        after = {QPOS: piece[NEXT_QPOS], QVEL: piece[NEXT_QVEL]}
-        sound = is_sound(piece)  # (rows,)
-        stays = sound & ~task.terminated(after).any(1)
+        held = task.frame_skip  # an action is judged by where it ended
+        before = cast(TensorDict, piece[:, ::held])
+        ended = cast(TensorDict, piece[:, held - 1 :: held])
+        after = {QPOS: ended[NEXT_QPOS], QVEL: ended[NEXT_QVEL]}
+        sound, fell = (
+            is_sound(piece),
+            task.terminated(after),
+        )  # (rows,), (rows, actions)
+        seen = {OBSERVATION: task.observation(before).float()}
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            action = actor(TensorDict(seen, before.batch_size))[ACTION]
+        runs = goes_on[:, None] & (fell.cumsum(1) - fell.long() == 0)
+        returns += torch.where(runs, task.reward(before, action, after), 0.0).sum(1)
+        stays = sound & ~fell.any(1)
+        goes_on &= stays
         u = torch.rand(rows, task.num_uniforms, dtype=torch.float64, generator=draw)
         fresh = TensorDict(task.initial_state(u), [rows])
         last = cast(TensorDict, piece[:, -1])
         last = last.update({key: value[:, -1] for key, value in after.items()})
         start = last.select(*fresh.keys()).where(stays, fresh)
         pieces.append(piece[sound])
-    return cast(TensorDict, TensorDict.cat(pieces))
+    return cast(TensorDict, TensorDict.cat(pieces)), returns
+
+
+@dataclass
+class Best:
+    """The policy that is not known to be worse than another, and what it earned."""
+
+    learner: Learner
+    returns: Tensor | None = None
+    state: list[dict] = field(default_factory=list)
+
+    def keep_or_restore(self, returns: Tensor) -> bool:
+        """Whether the learner's policy stays: it is worse by two standard errors else."""
+        if self.returns is not None:
+            error = (returns.var() + self.returns.var()) / len(returns)
+            if self.returns.mean() - returns.mean() > 2.0 * error.sqrt():
+                self.learner.load_state(copy.deepcopy(self.state))
+                return False
+        self.returns, self.state = returns, copy.deepcopy(self.learner.state())
+        return True
 
 
 def train_model(
@@ -221,14 +269,19 @@ def in_the_model(cfg: Config) -> dict:
     curve = []
     learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     model: NeRD | None = None
+    best = Best(learner)
 
     def learned(number: int) -> NeRD:
-        """The model, once it learned along the policy as well."""
+        """The model, once it learned along the policy, which stays or makes way."""
         nonlocal data
         draw = fold_in(cfg.seed, 1 + number)
         along = task, learner.on_the_processor(), cfg.along, cfg.length
-        more = pieces_along(*along, draw, cfg.noise)
+        more, returns = pieces_along(*along, draw, cfg.noise)
         data = cast(TensorDict, TensorDict.cat((data, more)))
+        stays = best.keep_or_restore(returns)
+        print(
+            f"earned along it {float(returns.mean()):.1f}, stays: {stays}", flush=True
+        )
         clock.note("data")
         found = train_model(task, data, cfg, number, model)
         clock.note("model")

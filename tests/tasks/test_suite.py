@@ -22,7 +22,6 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_nerd import NeRDEnv, load_scene, make_env
 from torchrl_nerd.checkpoint import make_card, save_checkpoint
 from torchrl_nerd.robots import make_task
-from torchrl_nerd.tasks.suite import SuiteTask
 
 SUITE = [
     *("acrobot-swingup", "cartpole-balance", "cartpole-swingup", "cheetah-run"),
@@ -165,7 +164,7 @@ def test_mujoco_and_dm_control_feel_the_same(seed, generator):
 
 def test_a_held_action_is_the_same_action_again_and_again(seed, generator):
     name = task_id("walker-walk")
-    held = make_env(SuiteTask(name, 3), dynamics=GROUND_TRUTH, num_envs=2, seed=seed)
+    held = make_env(f"{name}/3", dynamics=GROUND_TRUTH, num_envs=2, seed=seed)
     plain = make_env(name, dynamics=GROUND_TRUTH, num_envs=2, seed=seed)
     assert held.task.horizon == 334 and plain.task.horizon == 1000
     for env in (held, plain):
@@ -193,6 +192,11 @@ def test_a_model_of_one_task_serves_another_of_the_same_robot(generator, tmp_pat
     [
         ("dm_control/cheetah-fly", "unknown task in 'dm_control/cheetah-fly'"),
         ("dm_control/cheetah", "unknown task in 'dm_control/cheetah'"),
+        (
+            "dm_control/cheetah-run/0",
+            "a HOLD from 1 on, got 'dm_control/cheetah-run/0'",
+        ),
+        ("dm_control/cheetah-run/", "expected dm_control/DOMAIN-TASK/HOLD"),
         ("dm_control/lqr-lqr_2_1", "has no time limit: not supported"),
         ("dm_control/point_mass-hard", "changes its robot at every reset"),
     ],

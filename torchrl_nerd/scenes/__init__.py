@@ -2,6 +2,7 @@
 
 from functools import cache
 
+from torchrl_nerd.scenes.importer import suite_name
 from torchrl_nerd.scenes.scene import Scene
 
 
@@ -15,7 +16,8 @@ def is_import(name: str) -> bool:
 def import_scene(name: str) -> Scene:
     """The third-party robot of that name; the same object at every call.
 
-    Such as ``dm_control/DOMAIN-TASK``, ``gymnasium/ID`` or the path of an MJCF file.
+    Such as ``dm_control/DOMAIN-TASK``, ``gymnasium/ID`` or the path of an MJCF file. With
+    ``dm_control/DOMAIN-TASK/4`` a control step is four of the suite's.
 
     Raises:
         ValueError: no such robot, or one with something not supported (named).
@@ -25,8 +27,7 @@ def import_scene(name: str) -> Scene:
     origin, _, rest = name.partition("/")
     if origin == "gymnasium":
         return Scene.from_gymnasium(rest)
-    domain, _, task = rest.partition("-")
-    return Scene.from_dm_control(domain, task)
+    return Scene.from_dm_control(*suite_name(name))
 
 
 __all__ = ["Scene", "import_scene", "is_import"]

@@ -86,6 +86,21 @@ def _not_finite(model: mujoco.MjModel) -> list[str]:
     ]
 
 
+def suite_name(name: str) -> tuple[str, str, int]:
+    """Domain and task of ``dm_control/DOMAIN-TASK``, and 1 or what ``/HOLD`` adds.
+
+    Raises:
+        ValueError: a HOLD that is no whole number from 1 on.
+    """
+    robot, slash, hold = name.removeprefix("dm_control/").partition("/")
+    domain, _, task = robot.partition("-")
+    if slash and not (hold.isdecimal() and int(hold) > 0):
+        raise ValueError(
+            f"expected dm_control/DOMAIN-TASK/HOLD with a HOLD from 1 on, got '{name}'"
+        )
+    return domain, task, int(hold or 1)
+
+
 def load_suite(domain: str, task: str) -> "Environment":
     """The dm_control suite's own environment of a task.
 

@@ -88,16 +88,19 @@ class Scene:
         return replace(scene, max_contact_points=max_contact_points)
 
     @classmethod
-    def from_dm_control(cls, domain: str, task: str, **ranges: Any) -> "Scene":
-        """The robot of a dm_control suite task, at the task's control step.
+    def from_dm_control(
+        cls, domain: str, task: str, hold: int = 1, **ranges: Any
+    ) -> "Scene":
+        """The robot of a dm_control suite task, such as ``"cheetah", "run"``.
 
-        Such as ``"cheetah", "run"``; ``ranges`` as for `from_mjcf`. Raises ValueError: no
-        such task, or a robot with something not supported (named).
+        Its control step is ``hold`` of the suite's; ``ranges`` as for `from_mjcf`. Raises
+        ValueError: no such task, or a robot with something not supported (named).
         """
         env = importer.load_suite(domain, task)
         model = env.physics.model.ptr
-        substeps = round(env.control_timestep() / model.opt.timestep)
-        return cls._from(f"dm_control/{domain}-{task}", model, substeps, ranges)
+        substeps = hold * round(env.control_timestep() / model.opt.timestep)
+        name = f"dm_control/{domain}-{task}" + (f"/{hold}" if hold > 1 else "")
+        return cls._from(name, model, substeps, ranges)
 
     @classmethod
     def from_gymnasium(cls, env_id: str, **ranges: Any) -> "Scene":

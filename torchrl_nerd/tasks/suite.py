@@ -14,7 +14,7 @@ from torchrl_nerd.compiled import uncompiled
 from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes import Scene, import_scene
-from torchrl_nerd.scenes.importer import load_suite
+from torchrl_nerd.scenes.importer import load_suite, suite_name
 from torchrl_nerd.tasks.suite_formulas import FORMULAS
 from torchrl_nerd.tasks.task import State, Task, own_actuators
 
@@ -38,8 +38,11 @@ class SuiteTask(Task):
     in its order; an action of -1 to 1 spans the control range. A task that reads contact
     forces (hopper's feet) is shown those of the ground truth's last substep, as in the
     suite. Learned dynamics know none: there MuJoCo computes them at the state and the
-    action that led to it. Of the ``frame_skip`` control steps over which an action is held
-    only the last is judged.
+    action that led to it.
+
+    With ``dm_control/DOMAIN-TASK/4`` an action is held over four of the suite's control
+    steps. They are one control step here, which a model predicts at once, and only the
+    state after the last is judged.
 
     Raises:
         ValueError: in one sentence, no such task or something not supported.
@@ -47,11 +50,11 @@ class SuiteTask(Task):
 
     num_uniforms = 1
 
-    def __init__(self, name: str, frame_skip: int = 1) -> None:
-        self.name, self.frame_skip = name, frame_skip
+    def __init__(self, name: str) -> None:
+        self.name = name
         model = self.scene.model  # refuses what is not supported
         suite = SuiteReward(name)
-        self.horizon = ceil(suite.horizon / frame_skip)
+        self.horizon = suite.horizon
         self.observation_size = suite.observation_size
         width = 3 * len(suite.targets)
         self.parameters = {TARGET: width} if width else {}
@@ -132,12 +135,12 @@ class SuiteReward:
     """
 
     def __init__(self, name: str) -> None:
-        self.domain, _, self.task = name.removeprefix("dm_control/").partition("-")
+        self.domain, self.task, hold = suite_name(name)
         env = load_suite(self.domain, self.task)
         self._task, self._physics = env.task, env.physics
         if not np.isfinite(env._step_limit):
             raise ValueError(f"task '{name}' has no time limit: not supported")
-        self.horizon = ceil(env._step_limit)
+        self.horizon = ceil(env._step_limit / hold)
         # geoms that it places at each reset and that touch nothing
         self.targets = np.zeros(0, int)
         self.targets = self._moved_geoms(name)
