@@ -19,8 +19,8 @@ from dynamics_helpers import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_nerd import NeRDEnv, load_scene, make_env
-from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd import NeRDEnv, Scene, load_scene, make_env
+from torchrl_nerd.checkpoint import load_checkpoint, make_card, save_checkpoint
 from torchrl_nerd.robots import make_task
 
 SUITE = [
@@ -172,6 +172,19 @@ def test_a_held_action_is_the_same_action_again_and_again(seed, generator):
     for action in random_actions(held, 4, generator):
         state, steps = act(held, action), [act(plain, action) for _ in range(3)]
         assert_same_motion(state, steps[-1], 0.0)
+
+
+def test_a_model_of_held_actions_is_found_by_its_name(generator, tmp_path):
+    scene, held = (load_scene(f"dm_control/cartpole-swingup{x}") for x in ("", "/4"))
+    assert held.control_step == pytest.approx(4 * scene.control_step)
+    assert Scene.from_dm_control("cartpole", "swingup", hold=4).hash == held.hash
+    model = random_model(held, generator)
+    save_checkpoint(model, tmp_path, make_card(model))
+    assert load_checkpoint(tmp_path).scene.control_step == held.control_step
+    env = make_env("dm_control/cartpole-swingup/4", dynamics=tmp_path, num_envs=2)
+    assert env.rollout(3).shape == (2, 3) and env.task.horizon == 250
+    with pytest.raises(ValueError, match="expected"):
+        make_env("dm_control/cartpole-swingup", dynamics=tmp_path)
 
 
 def test_a_model_of_one_task_serves_another_of_the_same_robot(generator, tmp_path):
