@@ -190,14 +190,11 @@ def pieces_along(
         before = cast(TensorDict, piece[:, ::held])
         ended = cast(TensorDict, piece[:, held - 1 :: held])
         after = {QPOS: ended[NEXT_QPOS], QVEL: ended[NEXT_QVEL]}
-        sound, fell = (
-            is_sound(piece),
-            task.terminated(after),
-        )  # (rows,), (rows, actions)
+        sound, fell = is_sound(piece), task.terminated(after)
         seen = {OBSERVATION: task.observation(before).float()}
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             action = actor(TensorDict(seen, before.batch_size))[ACTION]
-        runs = goes_on[:, None] & (fell.cumsum(1) - fell.long() == 0)
+        runs = goes_on[:, None] & (fell.cumsum(1) - fell.long() == 0)  # (rows, actions)
         returns += torch.where(runs, task.reward(before, action, after), 0.0).sum(1)
         stays = sound & ~fell.any(1)
         goes_on &= stays
