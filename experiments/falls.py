@@ -18,7 +18,7 @@ import torch
 from learner import run, use_one_thread
 from noisy_dynamics import NoisyDynamics, step_errors
 from policies_in_the_model import Config as Learning
-from policies_in_the_model import pieces_along, task_of
+from policies_in_the_model import pieces_along
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -34,6 +34,7 @@ from torchrl_nerd.evaluation.rollout_error import interval_of_mean
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import make_task
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.settings import expect_at_least, expect_count
 from torchrl_nerd.tasks.floating import uprightness
@@ -93,7 +94,7 @@ def main(cfg: Config) -> None:
     use_one_thread()
     torch.manual_seed(cfg.seed)
     learning = Learning(cfg.name)
-    task = task_of(learning)
+    task = make_task(learning.name)
     if not task.scene.base.is_floating:
         raise ValueError(f"expected a robot whose base moves freely, got '{cfg.name}'")
     counts = {f"ahead[{i}]": steps for i, steps in enumerate(cfg.ahead)}
@@ -107,7 +108,7 @@ def main(cfg: Config) -> None:
     model = cast(NeRD, load_checkpoint(last / "last"))
     actor = make_actor(load_policy(cfg.folder / "policy", task))
     draw, length = fold_in(cfg.seed, 0), learning.length
-    data, _ = pieces_along(task, actor, learning.along, length, draw, learning.noise)
+    data = pieces_along(task, actor, learning.along, length, draw, learning.noise)
     errors, how = step_errors(model, data), (cfg.actions, cfg.every)
     exact = make_env(task, "mujoco", cfg.robots, cfg.seed)
     rows = {"MuJoCo": falls(exact, actor, *how)}

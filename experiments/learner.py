@@ -76,9 +76,9 @@ class Learner:
 
     def __init__(self, cfg: ppo.Run, env: EnvBase) -> None:
         self.cfg = cfg
-        self.policy, self.critic = ppo.make_policy_and_critic(env, cfg)
+        self.policy, critic = ppo.make_policy_and_critic(env, cfg)
         self.actor = make_actor(self.policy)
-        self.parts = ppo.make_learning(self.actor, self.critic, cfg)
+        self.parts = ppo.make_learning(self.actor, critic, cfg)
         self.batch = cfg.num_envs * cfg.horizon
         self.updates, self.done = max(1, cfg.total_frames // self.batch), 0
 
@@ -87,17 +87,6 @@ class Learner:
         if self.policy.standardize.mean.device.type == "cpu":
             return self.actor
         return make_actor(copy.deepcopy(self.policy).cpu())
-
-    def state(self) -> list[dict]:
-        """All that it has learned, for `load_state`; not a copy."""
-        return [x.state_dict() for x in (self.policy, self.critic, self.parts[2])]
-
-    def load_state(self, state: list[dict]) -> None:
-        """Go back to what `state` gave; the frames since then count all the same."""
-        for part, old in zip(
-            (self.policy, self.critic, self.parts[2]), state, strict=True
-        ):
-            part.load_state_dict(old)
 
     def learn(self, env: EnvBase, share: float) -> dict[str, float]:
         """A share of all frames in an env; of the last batch: reward, share of failures."""

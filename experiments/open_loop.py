@@ -105,7 +105,7 @@ def along_policy(
             f"{cfg.policy} acts in {task.scene.name}, expected {scene.name}"
         )
     actor = make_actor(load_policy(cfg.policy, task))
-    return pieces_along(task, actor, rows, LENGTH, fold_in(seed, 1), noise, STEPS)[0]
+    return pieces_along(task, actor, rows, LENGTH, fold_in(seed, 1), noise, STEPS)
 
 
 def train(scene: Scene, cfg: Config) -> Path:

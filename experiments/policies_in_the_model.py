@@ -5,7 +5,7 @@
 1. Random trajectories of the robot in MuJoCo, and a network that learns from them.
 2. In rounds: trajectories along the policy in MuJoCo, from which the model goes on
    learning; PPO in the model alone, where an episode fails as soon as a step is unlike the
-   data. A policy that earned less in MuJoCo than an earlier one makes way for that one.
+   data.
    After the last round the model learns once more, and says what the policy earns.
 3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
    policy had in the model, one for as many as the model's data cost the robot, and one
@@ -15,11 +15,10 @@
 The two ways take a processor each at the same time, and each counts what it took of it.
 """
 
-import copy
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import cast
@@ -28,7 +27,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
@@ -45,15 +43,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.keys import (
-    ACTION,
-    NEXT_QPOS,
-    NEXT_QVEL,
-    OBSERVATION,
-    QPOS,
-    QVEL,
-    TRUST,
-)
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TRUST
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.seeds import fold_in
@@ -137,27 +127,17 @@ class Trusted(Transform):
         return next_tensordict
 
 
-def task_of(cfg: Config) -> Task:
-    """The task, whose actions end where pieces do."""
-    task = make_task(cfg.name)
-    if PIECE % task.frame_skip:
-        raise ValueError(
-            f"expected a frame skip that divides {PIECE}, got {task.frame_skip}"
-        )
-    return task
-
-
 def begin(cfg: Config, device: str = "cpu") -> tuple[Task, Clock]:
     """One processor for this process, and the task; with a GPU wall time counts."""
     use_one_thread()
     torch.manual_seed(cfg.seed)
     read = processor_time if device == "cpu" else time.monotonic
-    return task_of(cfg), Clock(read)
+    return make_task(cfg.name), Clock(read)
 
 
 def returns_of(cfg: Config, actor: Actor, count: int, seed: int) -> Tensor:
     """Of whole episodes in MuJoCo, ``(count,)``."""
-    return policy_returns(make_env(task_of(cfg), "mujoco", count, seed), actor)
+    return policy_returns(make_env(make_task(cfg.name), "mujoco", count, seed), actor)
 
 
 def watched(cfg: Config, actor: Actor) -> float:
@@ -173,57 +153,24 @@ def pieces_along(
     draw: Generator,
     noise: float,
     steps: int = PIECE,
-) -> tuple[TensorDict, Tensor]:
-    """Trajectories along the policy in MuJoCo, in pieces.
+) -> TensorDict:
+    """Pieces ``[n, steps]`` of trajectories in MuJoCo, without those that diverge.
 
     A robot that fell starts anew at the end of its piece.
-
-    Returns:
-        Pieces ``[n, steps]``, without those that diverge, and the return of each robot's
-        first episode ``(rows,)``, whose actions count without their noise.
     """
-    start, pieces, goes_on = None, [], torch.ones(rows, dtype=torch.bool)
-    returns = torch.zeros(rows, dtype=torch.float64)
+    start, pieces = None, []
     for _ in range(length // steps):
         piece = policy_data(task, actor, rows, steps, draw, noise, start)
-        held = task.frame_skip  # an action is judged by where it ended
-        before = cast(TensorDict, piece[:, ::held])
-        ended = cast(TensorDict, piece[:, held - 1 :: held])
-        after = {QPOS: ended[NEXT_QPOS], QVEL: ended[NEXT_QVEL]}
-        sound, fell = is_sound(piece), task.terminated(after)
-        seen = {OBSERVATION: task.observation(before).float()}
-        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-            action = actor(TensorDict(seen, before.batch_size))[ACTION]
-        runs = goes_on[:, None] & (fell.cumsum(1) - fell.long() == 0)  # (rows, actions)
-        returns += torch.where(runs, task.reward(before, action, after), 0.0).sum(1)
-        stays = sound & ~fell.any(1)
-        goes_on &= stays
+        after = {QPOS: piece[NEXT_QPOS], QVEL: piece[NEXT_QVEL]}
+        sound = is_sound(piece)  # (rows,)
+        stays = sound & ~task.terminated(after).any(1)
         u = torch.rand(rows, task.num_uniforms, dtype=torch.float64, generator=draw)
         fresh = TensorDict(task.initial_state(u), [rows])
         last = cast(TensorDict, piece[:, -1])
         last = last.update({key: value[:, -1] for key, value in after.items()})
         start = last.select(*fresh.keys()).where(stays, fresh)
         pieces.append(piece[sound])
-    return cast(TensorDict, TensorDict.cat(pieces)), returns
-
-
-@dataclass
-class Best:
-    """The policy that is not known to be worse than another, and what it earned."""
-
-    learner: Learner
-    returns: Tensor | None = None
-    state: list[dict] = field(default_factory=list)
-
-    def keep_or_restore(self, returns: Tensor) -> bool:
-        """Whether the learner's policy stays: it is worse by two standard errors else."""
-        if self.returns is not None:
-            error = (returns.var() + self.returns.var()) / len(returns)
-            if self.returns.mean() - returns.mean() > 2.0 * error.sqrt():
-                self.learner.load_state(copy.deepcopy(self.state))
-                return False
-        self.returns, self.state = returns, copy.deepcopy(self.learner.state())
-        return True
+    return cast(TensorDict, TensorDict.cat(pieces))
 
 
 def train_model(
@@ -266,19 +213,14 @@ def in_the_model(cfg: Config) -> dict:
     curve = []
     learner = Learner(cfg.ppo, make_env(task, "mujoco", 8, cfg.seed, device=cfg.device))
     model: NeRD | None = None
-    best = Best(learner)
 
     def learned(number: int) -> NeRD:
-        """The model, once it learned along the policy, which stays or makes way."""
+        """The model, once it learned along the policy as well."""
         nonlocal data
         draw = fold_in(cfg.seed, 1 + number)
         along = task, learner.on_the_processor(), cfg.along, cfg.length
-        more, returns = pieces_along(*along, draw, cfg.noise)
+        more = pieces_along(*along, draw, cfg.noise)
         data = cast(TensorDict, TensorDict.cat((data, more)))
-        stays = best.keep_or_restore(returns)
-        print(
-            f"earned along it {float(returns.mean()):.1f}, stays: {stays}", flush=True
-        )
         clock.note("data")
         found = train_model(task, data, cfg, number, model)
         clock.note("model")
@@ -336,7 +278,7 @@ def in_mujoco(cfg: Config, is_judged: bool = False) -> dict:
 
 def few_frames(cfg: Config, robot_frames: int) -> Tensor:
     """Returns of a policy that learned from as many robot frames as the model had."""
-    actions = robot_frames // task_of(cfg).frame_skip
+    actions = robot_frames // make_task(cfg.name).frame_skip
     return in_mujoco(replace(cfg, frames=actions, rounds=1))["reached"]
 
 
@@ -346,7 +288,7 @@ def main(cfg: Config) -> None:
     Raises:
         ValueError: an unknown task, or a folder that holds models already.
     """
-    task_of(cfg)
+    make_task(cfg.name)
     if any(cfg.folder.glob("model_*")):
         raise ValueError(
             f"expected no models in {cfg.folder}, got some: choose another --out"
