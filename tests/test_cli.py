@@ -408,7 +408,8 @@ def test_a_third_party_robot_from_data_to_results(tmp_path, seed, monkeypatch, c
     ("name", "words"),
     [
         ("../../etc/passwd", "unknown scene '../../etc/passwd'"),
-        ("dm_control/../../etc-passwd", "unknown domain"),
+        ("dm_control/../../etc-passwd", "expected dm_control/DOMAIN-TASK/HOLD"),
+        ("dm_control/..-passwd", "unknown domain"),
         ("gymnasium/../Ant-v5", "unknown environment '../Ant-v5'"),
         ("dm_control/cheetah-fly", "unknown task in 'dm_control/cheetah-fly'"),
         ("../nowhere.xml", "found none at ../nowhere.xml"),
