@@ -1,4 +1,4 @@
-"""Muon of PyTorch against the package's, which computes the same update in float32.
+"""Muon of PyTorch against the package's, on a processor without bfloat16 in float32.
 
     python experiments/muon.py --json results/muon.json
 

@@ -13,7 +13,9 @@ def matrices(generator):
     return [matrix.requires_grad_() for matrix in found]
 
 
-def test_it_is_pytorchs_but_for_bfloat16(generator):
+@pytest.mark.parametrize(("feature", "most"), [("avx512_bf16", 0.01), ("avx2", 0.03)])
+def test_it_is_pytorchs_but_for_bfloat16(feature, most, generator, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {feature: True})
     mine = matrices(generator)
     theirs = [weight.detach().clone().requires_grad_() for weight in mine]
     before = [weight.detach().clone() for weight in mine]
@@ -27,13 +29,16 @@ def test_it_is_pytorchs_but_for_bfloat16(generator):
             optimizer.step()
     for one, other, start in zip(mine, theirs, before, strict=True):
         apart, moved = (one - other).detach().norm(), (one - start).detach().norm()
-        assert apart < 0.03 * moved
+        assert apart < most * moved
 
 
 @pytest.mark.parametrize("shape", [(6, 6), (20, 6), (6, 20)])
-def test_singular_values_are_about_one_and_turning_commutes(shape, generator):
+def test_singular_values_are_about_one_and_turning_commutes(
+    shape, generator, monkeypatch
+):
     x = torch.randn(4, *shape, generator=generator)
     x *= torch.logspace(-3, 3, 4)[:, None, None]  # whatever their size
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True})
     found = orthogonalize(x)
     assert torch.linalg.svdvals(found).sub(0.9).abs().max() < 0.5
     turn = torch.linalg.qr(torch.randn(shape[0], shape[0], generator=generator))[0]

@@ -44,14 +44,19 @@ class InnerLinear(nn.Linear):
         return super().forward(input.bfloat16()).to(input.dtype)
 
 
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether it multiplies in bfloat16.
+
+    Other processors emulate it: a product takes 25 to 45 times as long as in float32.
+    """
+    has = torch.cpu.get_capabilities() if device.type == "cpu" else {"amx_bf16": True}
+    return has.get("avx512_bf16", False) or has.get("amx_bf16", False)
+
+
 def in_bfloat16(
     function: Callable[..., Tensor], device: torch.device
 ) -> Callable[..., Tensor]:
-    """A function under autocast, or as it is on a processor without bfloat16.
-
-    Such processors emulate it: a product takes 25 to 45 times as long as in float32.
-    """
-    has = torch.cpu.get_capabilities() if device.type == "cpu" else {"amx_bf16": True}
-    if not (has.get("avx512_bf16", False) or has.get("amx_bf16", False)):
+    """A function under autocast, or as it is on a device without bfloat16."""
+    if not has_bfloat16(device):
         return function
     return torch.autocast(device.type, torch.bfloat16)(function)
