@@ -185,6 +185,9 @@ def test_a_model_of_held_actions_is_found_by_its_name(generator, tmp_path):
     assert env.rollout(3).shape == (2, 3) and env.task.horizon == 250
     with pytest.raises(ValueError, match="expected"):
         make_env("dm_control/cartpole-swingup", dynamics=tmp_path)
+    for hold in (0, -1):
+        with pytest.raises(ValueError, match="with a HOLD from 1 on"):
+            Scene.from_dm_control("cartpole", "swingup", hold=hold)
 
 
 def test_a_model_of_one_task_serves_another_of_the_same_robot(generator, tmp_path):

@@ -148,12 +148,12 @@ class OODScore(nn.Module):
         """Take mean, covariance and quantile of ``(samples, F)``."""
         some = features[:: max(1, len(features) // MAX_SAMPLES)].double()
         self.center.copy_(some.mean(0))
-        some = some - self.center
+        around = some - self.center
         ridge = RIDGE * torch.eye(some.shape[1], dtype=some.dtype, device=some.device)
-        values, axes = torch.linalg.eigh(some.T @ some / len(some) + ridge)
+        values, axes = torch.linalg.eigh(around.T @ around / len(some) + ridge)
         # the ridge bounds eigenvalues from below, but for rounding beside a huge one
         self.whitening.copy_((axes / values.clamp_min(RIDGE).sqrt()).T)
-        length = torch.linalg.vector_norm(some @ self.whitening.T, dim=-1)
+        length = self.mahalanobis(some)
         self.reach.copy_(torch.quantile(length, QUANTILE))
 
     def mahalanobis(self, features: Tensor) -> Tensor:

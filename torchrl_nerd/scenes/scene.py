@@ -94,12 +94,13 @@ class Scene:
         """The robot of a dm_control suite task, such as ``"cheetah", "run"``.
 
         Its control step is ``hold`` of the suite's; ``ranges`` as for `from_mjcf`. Raises
-        ValueError: no such task, or a robot with something not supported (named).
+        ValueError: no such task or hold, or a robot with something not supported.
         """
         env = importer.load_suite(domain, task)
         model = env.physics.model.ptr
         substeps = hold * round(env.control_timestep() / model.opt.timestep)
-        name = f"dm_control/{domain}-{task}" + (f"/{hold}" if hold > 1 else "")
+        name = f"dm_control/{domain}-{task}" + (f"/{hold}" if hold != 1 else "")
+        importer.suite_name(name)  # refuses a hold that cannot be
         return cls._from(name, model, substeps, ranges)
 
     @classmethod
