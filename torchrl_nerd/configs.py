@@ -7,7 +7,7 @@ from torchrl_nerd.settings import SettingError, expect_at_least
 
 COUNTS = (
     *("batch_size", "sequence_length", "rollout_batch_size", "rollout_length"),
-    *("save_every", "validate_every", "rollout_restarts"),
+    *("save_every", "validate_every", "rollout_restarts", "copies"),
 )
 
 Update = Literal["physics", "all", "head"]
@@ -86,8 +86,8 @@ class TrainConfig:
     """Settings of a training: one-step targets first, then rollouts of the model.
 
     Raises:
-        SettingError: a number that is too small, or symmetry augmentation of a hybrid,
-            whose analytic change has no symmetric copies.
+        SettingError: a number that is too small, or symmetries of a hybrid, whose
+            analytic change has no symmetric copies.
     """
 
     network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width
@@ -104,6 +104,8 @@ class TrainConfig:
     # share of updates on as many single states in place of sequences
     single_step_fraction: float = 0.75
     use_symmetry: bool = False  # augment data by the robot's symmetries
+    # symmetric copies of its input that the network's output is averaged over
+    copies: int = 1
     rollout_batch_size: int = 128  # rollouts per update
     rollout_length: int = 8  # control steps of a rollout
     rollout_history: int = 0  # recorded steps that the model sees before it
@@ -129,6 +131,8 @@ class TrainConfig:
             raise SettingError(
                 "expected training without use_symmetry for a hybrid, got it with one"
             )
+        if self.copies > 1 and self.step is not None:
+            raise SettingError(f"expected one copy for a hybrid, got {self.copies}")
 
     @property
     def features(self) -> FeatureConfig:

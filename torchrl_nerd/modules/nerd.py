@@ -19,6 +19,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import FeatureConfig
+from torchrl_nerd.modules.equivariant import EquivariantNetwork
 from torchrl_nerd.modules.history import History
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
@@ -86,12 +87,15 @@ class NeRD(nn.Module):
         self.scene_features = scene_features or SceneFeatures(scene, features)
         self.state_delta = state_delta or StateDelta(scene)
         num_features, num_outputs = self.scene_features.size, self.state_delta.size
-        sizes: dict[NestedKey, int] = {TOKEN: num_features, TARGET: num_outputs}
-        unit = {key: Stats.unit(size) for key, size in sizes.items()}
+        widths: dict[NestedKey, int] = {TOKEN: num_features, TARGET: num_outputs}
+        unit = {key: Stats.unit(width) for key, width in widths.items()}
         self.normalize = Normalize(stats or unit)
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
-        self.network = network.build(self.token_size, num_outputs)
+        sizes = self.token_size, num_outputs
+        self.network = network.build(*sizes)
+        if network.copies > 1:
+            self.network = EquivariantNetwork(self.network, network.copies, *sizes)
 
     @property
     def token_size(self) -> int:

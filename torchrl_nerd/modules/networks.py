@@ -24,6 +24,7 @@ class MLPConfig:
 
     depth: int = 4
     width: int = 64
+    copies: int = 1  # symmetric ones that the output is averaged over
 
     def build(self, num_inputs: int, num_outputs: int) -> "MLP":
         """A freshly initialised network."""
@@ -69,6 +70,7 @@ class GRUConfig:
 
     layers: int = 1
     width: int = 128
+    copies: int = 1  # symmetric ones that the output is averaged over
 
     def build(self, num_inputs: int, num_outputs: int) -> "GRU":
         """A freshly initialised network."""

@@ -37,6 +37,7 @@ class TransformerConfig:
     heads: int = 4  # divides width
     band: int = 10  # tokens each layer sees, the current one included (paper: h = 10)
     pairs: bool = False  # embed a token together with the one before it
+    copies: int = 1  # symmetric ones that the output is averaged over
 
     def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
         """A freshly initialised network."""

@@ -2,14 +2,17 @@
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import nn
 
 from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.dynamics.base import as_numpy
 from torchrl_nerd.keys import NEXT_QVEL, QPOS
+from torchrl_nerd.modules.equivariant import EquivariantNetwork
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, network_config
@@ -20,16 +23,26 @@ from torchrl_nerd.transforms import Stats
 
 
 def make_model(
-    scene: Scene, config: TrainConfig, stats: Mapping[NestedKey, Stats] | None = None
+    scene: Scene,
+    config: TrainConfig,
+    stats: Mapping[NestedKey, Stats] | None = None,
+    symmetry: Symmetry | None = None,
 ) -> NeRD:
     """The model that a configuration describes, with random weights.
 
+    ``symmetry``: that of the robot, whose copies the network is to know.
+
     Raises:
-        ValueError: no such network or step, or a scene that the step cannot move.
+        ValueError: no such network or step, a scene that the step cannot move, or a robot
+            without so many symmetric copies.
     """
     network, features = network_config(config.network), config.features
+    network = replace(network, copies=config.copies)
     if config.step is None:
-        return NeRD(scene, features, network, stats)
+        model = NeRD(scene, features, network, stats)
+        if symmetry is not None and isinstance(model.network, EquivariantNetwork):
+            model.network.set_copies(*symmetry.group(config.copies))
+        return model
     step = make_step(scene, look_up("analytic step", config.step, STEPS))
     return HybridNeRD(scene, step, features, network, stats)
 
@@ -39,21 +52,23 @@ def begin_from(
 ) -> NeRD:
     """A model with weights and statistics of another one, which is left as it is.
 
-    What the network's inputs mean, their statistics, is part of what it learned, and so is
-    a hybrid's gate. The training range is left to be fitted.
+    It may average over more or fewer symmetric copies. What the network's inputs mean,
+    their statistics, is part of what it learned, and so is a hybrid's gate. The training
+    range is left to be fitted.
 
     Raises:
         ValueError: in one sentence, a configuration of another network, kind or step,
             inputs of another width, or statistics that symmetric copies do not share.
     """
-    if start.config != network_config(config.network):
-        names = [name for name, known in NETWORKS.items() if known == start.config]
-        name = " or ".join(names) or start.config
+    known = replace(start.config, copies=1)
+    if known != network_config(config.network):
+        names = [name for name, network in NETWORKS.items() if network == known]
+        name = " or ".join(names) or known
         raise ValueError(
             f"expected the network of the model to start from, {name}, "
             f"got {config.network}"
         )
-    model = make_model(scene, config)
+    model = make_model(scene, config, symmetry=symmetry)
     if type(model) is not type(start):
         raise ValueError(
             f"expected a {model.kind} model to start from, got a {start.kind} one"
@@ -66,14 +81,27 @@ def begin_from(
         )
     if isinstance(model, HybridNeRD) and isinstance(start, HybridNeRD):
         model.is_gated = start.is_gated
-    model.network.load_state_dict(start.network.state_dict())
+    single, learned = (_single(x.network) for x in (model, start))
+    single.load_state_dict(learned.state_dict())
     model.normalize.load_state_dict(start.normalize.state_dict())
     if symmetry is not None and not symmetry.keeps(model.normalize):
         raise ValueError(
-            "expected a model to start from that was trained with use_symmetry, got "
-            "one whose statistics they change: train without use_symmetry"
+            "expected a model to start from that was trained with use_symmetry, got one "
+            "whose statistics they change: train without use_symmetry and copies"
         )
     return model
+
+
+def find_symmetry(scene: Scene, config: TrainConfig) -> Symmetry | None:
+    """The robot's symmetries, where data or network are to have them; see `Symmetry`."""
+    if not config.use_symmetry and config.copies == 1:
+        return None
+    return Symmetry(scene, config.features)
+
+
+def _single(network: nn.Module) -> nn.Module:
+    """The network that sees one symmetric copy at a time."""
+    return network.network if isinstance(network, EquivariantNetwork) else network
 
 
 def fingerprint(model: NeRD) -> str:

@@ -6,7 +6,7 @@ to joints and commutes with MuJoCo's step. A symmetric copy of a token or target
 signed permutation of its entries.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import permutations, product
 from typing import cast
 
@@ -26,7 +26,9 @@ from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_commands
+from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.samples import raw_tokens
+from torchrl_nerd.training.signed_permutations import SignedPermutations
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
 
 PLACE_TOL = 1e-6  # m, and of a unit vector
@@ -34,8 +36,6 @@ STEP_RTOL = 1e-6  # the solver's own tolerance is 1e-8
 TRIALS = 32
 MAX_DEPTH = 0.01  # m that the trials reach into the ground
 MIRROR = np.diag((1.0, -1.0, 1.0))  # of the world, where the base is mirrored
-RTOL = 1e-7  # of equal entries, relative to the largest of a column
-STATS_TOL = 1e-3  # standard deviations: more than rounding, less than a network notices
 STATES = 512  # whose features tell which entry of a copy is which of the original
 OVERSHOOT = 0.2  # of a joint's range, beyond its limits
 MAX_DEPTHS = 0.01, 1.0  # m: with some of the contact points in the ground, and with all
@@ -116,8 +116,8 @@ def find_isometries(scene: Scene) -> list[Isometry]:
     is_varied = ground is not None and ground.is_per_env
     if not is_legged or is_varied or scene.servos is not None:
         raise ValueError(
-            f"expected a floating base, hinges or slides, motors and one ground to train "
-            f"with use_symmetry, got '{scene.name}': train without it"
+            "expected a floating base, hinges or slides, motors and one ground for "
+            f"use_symmetry and copies, got '{scene.name}': train without them"
         )
     identity, *others = _candidates(scene)
     return [identity, *(other for other in others if _solver_agrees(scene, other))]
@@ -183,60 +183,6 @@ def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
     return TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
 
 
-class SignedPermutations(nn.Module):
-    """Symmetric copies of a kind of vector: ``copy[j] = sign[j] x[source[j]]``.
-
-    Found from samples ``(N, F)`` and their copies by each isometry. Every entry that is
-    ever not zero must be so in a sample.
-
-    Raises:
-        ValueError: an entry of a copy that is none of the original's.
-    """
-
-    sources: Tensor
-    signs: Tensor
-
-    def __init__(self, original: Tensor, copies: Sequence[Tensor]) -> None:
-        super().__init__()
-        sources, signs = zip(*(_match(original, x) for x in copies), strict=True)
-        keep_indices(self, sources=sources)  # (isometries, F)
-        keep_constants(self, signs=signs)
-
-    def forward(self, x: Tensor, choice: Tensor) -> Tensor:
-        """Copies of ``x (batch, length, F)``, each by isometry ``choice (batch,)``."""
-        sources = self.sources[choice][:, None].expand(x.shape)  # (batch, length, F)
-        return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
-
-    def complete(self, stats: Stats) -> Stats:
-        """Statistics of all copies: with these, normalised vectors map as raw ones."""
-        return Stats.merge_all(
-            Stats(stats.count, sign * stats.mean[source], stats.m2[source])
-            for source, sign in zip(self.sources, self.signs, strict=True)
-        )
-
-    def keep(self, mean: Tensor, std: Tensor) -> bool:
-        """Whether copies of samples of these statistics ``(F,)`` have the same ones."""
-        means, stds = self.signs * mean[self.sources], std[self.sources]
-        apart = torch.maximum((means - mean).abs(), (stds - std).abs())
-        return bool((apart < STATS_TOL * std).all())
-
-
-def _match(original: Tensor, copy: Tensor) -> tuple[list[int], list[float]]:
-    scale = RTOL * (original.abs().amax(0) + 1e-3)
-    sources, signs = [], []
-    for j, column in enumerate(copy.T):
-        for sign in (1.0, -1.0):
-            apart = (column[:, None] - sign * original).abs().amax(0)
-            fits = (apart <= scale).nonzero()[:, 0].tolist()
-            if fits:  # of several alike, such as constants, its own
-                sources.append(j if j in fits else fits[0])
-                signs.append(sign)
-                break
-        else:
-            raise ValueError(f"entry {j} of a copy is no entry of the original")
-    return sources, signs
-
-
 class Symmetry(nn.Module):
     """Isometries of a robot, the identity first, and their effect on tokens and targets.
 
@@ -248,7 +194,7 @@ class Symmetry(nn.Module):
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
         super().__init__()
         if scene.variation is not None:
-            raise ValueError("expected a varied scene without use_symmetry, got both")
+            raise ValueError("expected a varied scene without use_symmetry and copies, got them")
         self.isometries = nn.ModuleList(find_isometries(scene))
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]
@@ -266,7 +212,7 @@ class Symmetry(nn.Module):
         if still and len(copies) > 1:
             raise ValueError(
                 f"expected random states of '{scene.name}' to fill every feature, got "
-                f"none for {still}: train without use_symmetry"
+                f"none for {still}: train without use_symmetry and copies"
             )
         tokens, targets = zip(*copies, strict=True)
         self.tokens = SignedPermutations(tokens[0], tokens)
@@ -276,6 +222,23 @@ class Symmetry(nn.Module):
         """Statistics of tokens and targets with all their symmetric copies."""
         both = (TOKEN, self.tokens), (TARGET, self.targets)
         return {key: copies.complete(stats[key]) for key, copies in both}
+
+    def group(self, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Sources and signs of tokens and targets for a subgroup of so many copies.
+
+        Raises:
+            SettingError: the robot has none of that size.
+        """
+        subgroups = self.targets.subgroups()
+        if count not in subgroups:
+            raise SettingError(
+                f"expected copies of {', '.join(map(str, sorted(subgroups)))}, the sizes "
+                f"of groups of this robot's symmetries, got {count}"
+            )
+        some = subgroups[count]
+        tokens, targets = self.tokens, self.targets
+        both = ((x.sources[some], x.signs[some]) for x in (tokens, targets))
+        return next(both), next(both)
 
     def keeps(self, normalize: Normalize) -> bool:
         """Whether copies of normalised tokens and targets are those of raw ones."""

@@ -43,6 +43,7 @@ from torchrl_nerd.training.sequences import Inputs, Sequences
 from torchrl_nerd.training.start import (
     begin_from,
     data_fingerprint,
+    find_symmetry,
     fingerprint,
     make_model,
 )
@@ -138,16 +139,15 @@ class Trainer:
     def _build(self, data: TensorDict, init_from: NeRD | None) -> None:
         """The model, its statistics and its batches."""
         data = data.to(self.device)  # which makes all of what follows of them
-        symmetry, self.init_from = None, None
-        if self.config.use_symmetry:
-            symmetry = Symmetry(self.scene, self.config.features)
+        symmetry, self.init_from = find_symmetry(self.scene, self.config), None
         if init_from is None:
             model = self.make_model(data, symmetry)
         else:
             model = begin_from(init_from, self.scene, self.config, symmetry)
             self.init_from = fingerprint(init_from)
         self.model = model.to(self.device)
-        self.sequences = Sequences(model, data, symmetry)
+        shown = symmetry if self.config.use_symmetry else None
+        self.sequences = Sequences(model, data, shown)
         self.resting = resting(data)
         cover(model, data, (self.sequences.features, self.sequences.targets))
         if init_from is not None:
@@ -158,7 +158,7 @@ class Trainer:
         stats = data_stats(self.scene, data, self.config.features)
         if symmetry is not None:
             stats = symmetry.complete(stats)
-        return make_model(self.scene, self.config, stats)
+        return make_model(self.scene, self.config, stats, symmetry)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Muon for the weights of linear layers, AdamW for all others."""
@@ -238,7 +238,7 @@ class Trainer:
     def averaged_model(self) -> NeRD:
         """A copy of the model with the averaged weights and its sleep threshold."""
         model = copy.deepcopy(self.model)
-        model.network.load_state_dict(self.average)
+        model.network.load_state_dict(self.average, strict=False)  # copies stay
         find_rest(model.eval(), self.resting)
         return model
 

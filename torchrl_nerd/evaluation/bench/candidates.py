@@ -15,7 +15,7 @@ from torchrl_nerd.checkpoint import from_pretrained, shipped_models
 from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.transformer import CausalTransformer
+from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import look_up
 
@@ -128,7 +128,7 @@ def _ways(name: str, model: Model, variants: Sequence[str]) -> Iterator[Candidat
             yield _candidate(label, rounded)
             if "compiled" in variants:
                 yield _candidate(f"{name}, compiled bf16", rounded, compile=True)
-        elif isinstance(model, NeRD) and isinstance(model.network, CausalTransformer):
+        elif isinstance(model, NeRD) and isinstance(model.config, TransformerConfig):
             yield _candidate(label, model, inference="window")
 
 

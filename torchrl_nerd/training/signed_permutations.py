@@ -1,0 +1,92 @@
+"""Signed permutations: what a symmetry of a robot makes of a vector's entries."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_nerd.geometry.base import keep_constants, keep_indices
+from torchrl_nerd.transforms import Stats
+
+RTOL = 1e-7  # of equal entries, relative to the largest of a column
+STATS_TOL = 1e-3  # standard deviations: more than rounding, less than a network notices
+
+
+class SignedPermutations(nn.Module):
+    """Symmetric copies of a kind of vector: ``copy[j] = sign[j] x[source[j]]``.
+
+    Found from samples ``(N, F)`` and their copies by each isometry. Every entry that is
+    ever not zero must be so in a sample.
+
+    Raises:
+        ValueError: an entry of a copy that is none of the original's.
+    """
+
+    sources: Tensor
+    signs: Tensor
+
+    def __init__(self, original: Tensor, copies: Sequence[Tensor]) -> None:
+        super().__init__()
+        sources, signs = zip(*(_match(original, x) for x in copies), strict=True)
+        keep_indices(self, sources=sources)  # (isometries, F)
+        keep_constants(self, signs=signs)
+
+    def forward(self, x: Tensor, choice: Tensor) -> Tensor:
+        """Copies of ``x (batch, length, F)``, each by isometry ``choice (batch,)``."""
+        sources = self.sources[choice][:, None].expand(x.shape)  # (batch, length, F)
+        return x.gather(-1, sources) * self.signs[choice][:, None].to(x.dtype)
+
+    def complete(self, stats: Stats) -> Stats:
+        """Statistics of all copies: with these, normalised vectors map as raw ones."""
+        return Stats.merge_all(
+            Stats(stats.count, sign * stats.mean[source], stats.m2[source])
+            for source, sign in zip(self.sources, self.signs, strict=True)
+        )
+
+    def keep(self, mean: Tensor, std: Tensor) -> bool:
+        """Whether copies of samples of these statistics ``(F,)`` have the same ones."""
+        means, stds = self.signs * mean[self.sources], std[self.sources]
+        apart = torch.maximum((means - mean).abs(), (stds - std).abs())
+        return bool((apart < STATS_TOL * std).all())
+
+    def subgroups(self) -> dict[int, list[int]]:
+        """Subgroups of at most two generators, by size: the first one of each.
+
+        The isometries are a group, the identity first, and no entries are alike, so that
+        each of them is another permutation.
+        """
+        rows = zip(self.sources.tolist(), self.signs.tolist(), strict=True)
+        known = [tuple(zip(*row, strict=True)) for row in rows]
+        place = {copy: number for number, copy in enumerate(known)}
+
+        def after(second: int, first: int) -> int:
+            """The copy of a copy: by ``first``, then by ``second``."""
+            entries = known[first]
+            twice = ((entries[j][0], sign * entries[j][1]) for j, sign in known[second])
+            return place[tuple(twice)]
+
+        found: dict[int, list[int]] = {}
+        for generators in product(range(len(known)), repeat=2):
+            members, new = {0}, {0}
+            while new:
+                new = {after(g, x) for g in generators for x in new} - members
+                members |= new
+            found.setdefault(len(members), sorted(members))
+        return found
+
+
+def _match(original: Tensor, copy: Tensor) -> tuple[list[int], list[float]]:
+    scale = RTOL * (original.abs().amax(0) + 1e-3)
+    sources, signs = [], []
+    for j, column in enumerate(copy.T):
+        for sign in (1.0, -1.0):
+            apart = (column[:, None] - sign * original).abs().amax(0)
+            fits = (apart <= scale).nonzero()[:, 0].tolist()
+            if fits:  # of several alike, such as constants, its own
+                sources.append(j if j in fits else fits[0])
+                signs.append(sign)
+                break
+        else:
+            raise ValueError(f"entry {j} of a copy is no entry of the original")
+    return sources, signs
