@@ -3,11 +3,15 @@
 from pathlib import Path
 
 import pytest
+import torch
 from dynamics_helpers import random_model
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, from_pretrained, load_scene, make_env
 from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.robots import TASKS, make_task
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.controllers import PDController, TorqueController
+from torchrl_nerd.tasks import SceneTask
 
 TASK = "ant/run"
 HANGING = """<mujoco><worldbody><body><joint axis="0 1 0" range="-90 90" limited="true"/>
@@ -209,3 +213,69 @@ def test_a_robot_is_named_by_a_path_as_by_its_text(tmp_path):
     path.write_text(HANGING)
     for name in (path, str(path)):
         assert load_scene(name).model.nq == make_env(name, "mujoco").scene.model.nq == 1
+
+
+SWINGUP = type(make_task("cartpole/swingup"))
+
+
+class Wide(SWINGUP):
+    observation_size = 5
+
+
+class Flat(SWINGUP):
+    def observation(self, state):
+        return state["qpos"][..., 0]
+
+
+class Narrow(SWINGUP):
+    def initial_state(self, u):
+        return {"qpos": u[..., :1], "qvel": torch.zeros_like(u[..., :2])}
+
+
+class Still(SWINGUP):
+    def initial_state(self, u):
+        return {"qpos": u[..., :2]}
+
+
+@pytest.mark.parametrize(
+    ("task", "said"),
+    {
+        Wide: "expected observation of shape (3, 5) from Wide, got (3, 4)",
+        Flat: "expected observation of shape (3, 4) from Flat, got (3,)",
+        Narrow: "expected initial qpos of shape (3, 2) from Narrow, got (3, 1)",
+        Still: "expected qvel from initial_state of Still, got ['qpos']",
+    }.items(),
+)
+def test_what_a_task_gives_has_the_shape_of_its_specs(task, said):
+    with pytest.raises(ValueError) as refused:
+        make_env(task(), "mujoco", num_envs=3, seed=0).reset()
+    assert str(refused.value) == said
+
+
+class Springs(SceneTask):
+    @property
+    def controller(self):
+        joints = (
+            tuple(range(7, 15)),
+            tuple(range(6, 14)),
+        )  # the motors' order is another
+        return PDController(*joints, kp=(50.0,) * 8, kd=(0.0,) * 8, scale=(0.5,) * 8)
+
+
+def test_a_controller_drives_the_motors_in_their_order():
+    task = Springs(Scene.from_gymnasium("Ant-v5"))
+    with pytest.raises(
+        ValueError, match=r"dofs \(12, 13, 6, .* got one of dofs \(6, 7"
+    ):
+        make_env(task, "mujoco")
+
+
+class Torques(type(make_task("dm_control/walker-run"))):
+    @property
+    def controller(self):
+        return TorqueController((100.0,) * 6)
+
+
+def test_a_reward_of_controls_needs_the_robots_own_actuators():
+    with pytest.raises(ValueError, match="own actuators.*got a TorqueController"):
+        make_env(Torques("dm_control/walker-run"), "mujoco", num_envs=2).rollout(2)

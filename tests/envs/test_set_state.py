@@ -289,3 +289,16 @@ def test_an_env_inside_a_module_is_restored_too(generator):
     one.reset()
     other.load_state_dict(one.state_dict())
     assert torch.equal(one.reset()["qpos"], other.reset()["qpos"])
+
+
+def test_a_whole_state_draws_no_start():
+    """A suite task draws one env by env, in Python."""
+    env = make_env("dm_control/cheetah-run", "mujoco", num_envs=ROWS, seed=0)
+    state = env.reset().select("qpos", "qvel")
+
+    def fail(u):
+        raise AssertionError("a start was drawn")
+
+    env.task.initial_state = fail
+    after = env.reset(state.clone(), set_state=True)
+    assert all(torch.equal(after[key], state[key]) for key in ("qpos", "qvel"))

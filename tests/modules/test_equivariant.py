@@ -8,10 +8,12 @@ import torch
 from dynamics_helpers import enliven
 from torch import Tensor
 
+from torchrl_nerd import from_pretrained
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
-from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.equivariant import EquivariantNetwork
@@ -20,7 +22,7 @@ from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.samples import data_stats
-from torchrl_nerd.training.start import begin_from, make_model
+from torchrl_nerd.training.start import begin_from, make_model, with_copies
 from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import Trainer
 
@@ -194,3 +196,22 @@ def test_a_file_with_other_entries_is_refused(network):
     weights["token_sources"] = weights["token_sources"] + 3
     with pytest.raises(ValueError, match="entries 0 to 5, got entries 3 to 8"):
         network.load_state_dict(weights)
+
+
+def test_a_shipped_model_with_copies_is_more_exact():
+    """The same weights: from starts of the validation's seed, which no test uses."""
+    model, task = from_pretrained("ant-mlp"), make_task("ant/run")
+    both = [NeRDDynamics(x) for x in (model, with_copies(model, 4))]
+    about = MujocoDynamics(model.scene), [100], 64, 1_000_003
+    single, averaged = (passive_errors(task, x, *about)[100] for x in both)
+    for name in ("base_position", "base_orientation", "joints"):
+        assert averaged[name].mean < 0.95 * single[name].mean
+
+
+def test_copies_of_a_model_without_symmetric_statistics_are_refused():
+    with pytest.raises(ValueError, match="that was trained with use_symmetry"):
+        with_copies(from_pretrained("cube-mlp"), 4)
+    with pytest.raises(ValueError, match="floating base.* got 'cartpole'"):
+        with_copies(from_pretrained("cartpole"), 2)
+    with pytest.raises(ValueError, match="a learned model for copies, got a hybrid"):
+        with_copies(from_pretrained("double_pendulum-hybrid"), 2)

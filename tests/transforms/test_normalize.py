@@ -5,7 +5,10 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
+from torchrl_nerd import make_env
 from torchrl_nerd.transforms import Normalize, Stats
 
 ROWS, WIDTH = 1000, 4
@@ -166,3 +169,29 @@ def test_inv_acts_on_the_keys_it_was_told_and_no_others(generator):
     back = Normalize(stats, in_keys_inv=["y"]).inv(normal.clone())
     torch.testing.assert_close(back["y"], y)
     assert torch.equal(back["x"], normal["x"])
+
+
+def test_empty_samples_change_no_statistics():
+    some, none = Stats.of(torch.randn(9, 3)), Stats.of(torch.empty(0, 3))
+    for merged in (some.merge(none), none.merge(some), Stats.merge_all([none, some])):
+        assert merged.count == 9 and torch.equal(merged.mean, some.mean)
+
+
+def test_the_inverse_acts_on_what_an_env_is_given():
+    """As TorchRL's ObservationNorm does, with bounds that fit."""
+    action = Stats.of(torch.tensor([[0.1], [0.3]]))  # mean 0.2, deviation 0.1
+    plain = make_env("cartpole/swingup", "mujoco", num_envs=2, seed=0)
+    gain = plain.task.controller.gain[0]
+    env = TransformedEnv(plain, Normalize({"action": action}, in_keys_inv=["action"]))
+    check_env_specs(env)
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    torch.testing.assert_close(low, torch.full((2, 1), -12.0))
+    torch.testing.assert_close(high, torch.full((2, 1), 8.0))
+    given = env.reset().set("action", torch.full((2, 1), 0.5))
+    torque = env.step(given)["next", "joint_torque"]
+    torch.testing.assert_close(torque, torch.full((2, 1), 0.25 * gain).double())
+
+
+def test_an_inverse_without_statistics_is_refused():
+    with pytest.raises(ValueError, match=r"with statistics \(\['x'\]\), got \['y'\]"):
+        Normalize({"x": Stats.unit(2)}, in_keys_inv=["y"])

@@ -155,3 +155,19 @@ def test_the_empty_batch_passes(scene):
     rows = TensorDict({QPOS: torch.zeros(0, nq), QVEL: torch.zeros(0, nv)}, [0])
     transform = RobotCentric(scene)
     assert transform(rows)[ROBOT_STATE].shape == (0, transform.sizes[ROBOT_STATE])
+
+
+def test_the_next_state_has_features_too_where_it_is_recorded(generator):
+    """As an off-policy loss needs them of a buffer's samples."""
+    scene = load_scene("cartpole")
+    rows, transform = random_transitions(scene, ROWS, generator), RobotCentric(scene)
+    after = transform(rows.clone())["next"]
+    expected = transform(rows["next"].select(QPOS, QVEL))
+    torch.testing.assert_close(after[ROBOT_STATE], expected[ROBOT_STATE])
+
+
+def test_states_of_another_robot_are_refused():
+    """Whose joints would be read as if they were its own."""
+    state = {QPOS: torch.zeros(3, 15).double(), QVEL: torch.zeros(3, 14).double()}
+    with pytest.raises(ValueError, match="'cartpole' expects qpos of width 2, got 15"):
+        RobotCentric(load_scene("cartpole"))(TensorDict(state, [3]))

@@ -15,11 +15,12 @@ from torchrl_nerd.compiled import Compiled, unaffected
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.faults import FaultRecorder
+from torchrl_nerd.envs.given_state import given_state
 from torchrl_nerd.envs.pixels import RenderedEnv
 from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import env_keys, stream_offsets, uniforms
-from torchrl_nerd.envs.transition import FLAGS, Transition, drive_sizes, given_state
+from torchrl_nerd.envs.transition import FLAGS, Transition, drive_sizes
 from torchrl_nerd.keys import ACTION, FAULT, PARAMETERS, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_count, expect_device

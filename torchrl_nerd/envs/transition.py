@@ -4,7 +4,7 @@ Functions of tensors with one memory, the history that the dynamics keeps, so th
 of a control step can be compiled into one piece.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from functools import reduce
 from typing import Any
 
@@ -16,7 +16,6 @@ from torchrl_nerd.compiled import Compiled, uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.dynamics.base import warm_up
 from torchrl_nerd.envs.faults import find_faults
-from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import (
     ACTION,
     CTRL,
@@ -31,7 +30,6 @@ from torchrl_nerd.keys import (
 )
 from torchrl_nerd.scenes.commands import actuate, num_ctrl
 from torchrl_nerd.scenes.controllers import ActuatorController
-from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.variation import expect_told, ranges_of
 from torchrl_nerd.tasks import Task
 
@@ -50,7 +48,8 @@ def drive_sizes(task: Task) -> dict[str, int]:
 class Transition:
     """A task in a dynamics, from one state to the next.
 
-    Raises ValueError for a dynamics of another scene, or told of other parameters.
+    Raises ValueError for a dynamics of another scene, or told of other parameters, and for
+    a controller of other joints than the robot's motors.
     """
 
     # the dynamics has compiled code of its own, and `step` compiles to what is round it
@@ -71,6 +70,13 @@ class Transition:
                 f"{'one robot' if own is None else 'another variation'}"
             )
         expect_told(dynamics.told, varied)
+        motors = task.scene.actuated
+        driven = getattr(task.controller, "dof_addresses", motors)
+        if tuple(driven) != tuple(motors):
+            raise ValueError(
+                f"expected a controller of the motors of '{task.scene.name}' in their "
+                f"order, dofs {tuple(motors)}, got one of dofs {tuple(driven)}"
+            )
         self.task, self.dynamics = task, dynamics
         is_guarded = isinstance(dynamics, GuardedDynamics)
         self.is_truncating = is_guarded and dynamics.guard == "truncate"
@@ -184,7 +190,7 @@ class Transition:
         return after | {
             **{key: drive[key] for key in drive_sizes(self.task)},
             FAULT: fault,
-            OBSERVATION: self.task.observation(shown).to(torch.float32),
+            OBSERVATION: self._observation(shown),
             "reward": reward.to(torch.float32),
             "done": terminated | truncated,
             "terminated": terminated,
@@ -193,12 +199,22 @@ class Transition:
 
     def _per_env(self, name: str, value: Tensor, action: Tensor) -> Tensor:
         """What a task says of each env, ``(num_envs,)``, as ``(num_envs, 1)``."""
-        if value.shape != action.shape[:1]:
+        return self._of_shape(name, value, action.shape[:1])[:, None]
+
+    def _observation(self, state: Tensors) -> Tensor:
+        """What the policy sees, ``(num_envs, observation_size)``, float32."""
+        found = self.task.observation(state).to(torch.float32)
+        size = len(state[QPOS]), self.task.observation_size
+        return self._of_shape("observation", found, size)
+
+    def _of_shape(self, name: str, value: Tensor, expected: Iterable[int]) -> Tensor:
+        """What a task gave, if it has this shape."""
+        if tuple(value.shape) != tuple(expected):
             raise ValueError(
-                f"expected {name} of shape {tuple(action.shape[:1])} from "
+                f"expected {name} of shape {tuple(expected)} from "
                 f"{type(self.task).__name__}, got {tuple(value.shape)}"
             )
-        return value[:, None]
+        return value
 
     def _control_step(
         self, state: Tensors, action: Tensor, terrain: Tensor | None
@@ -233,7 +249,7 @@ class Transition:
             As `step`, without reward: zero torque and control, no fault, full trust, not
             done.
         """
-        fresh = self.task.initial_state(drawn[:, : self.task.num_uniforms])
+        fresh = self._start(state, drawn) if state.keys() - given.keys() else {}
         if (variation := self.task.scene.variation) is not None:
             fresh[PARAMETERS] = variation.values(drawn[:, self.task.num_uniforms :])
         fresh = fresh | given
@@ -247,48 +263,18 @@ class Transition:
             **{key: zero(len(is_reset), size) for key, size in sizes.items()},
             FAULT: torch.zeros_like(column, dtype=torch.long),
             TRUST: torch.ones_like(column, dtype=torch.float32),
-            OBSERVATION: self.task.observation(start).to(torch.float32),
+            OBSERVATION: self._observation(start),
             **{flag: torch.zeros_like(column) for flag in FLAGS},  # (num_envs, 1) each
         }
 
-
-def given_state(
-    scene: Scene,
-    tensordict: TensorDictBase | None,
-    is_reset: Tensor,
-    sizes: Mapping[str, int],
-    dtype: torch.dtype = torch.float64,
-) -> dict[str, Tensor]:
-    """The state that ``reset(td, set_state=True)`` asks for, copies.
-
-    Quaternions and normals of the ground become unit ones.
-
-    Of the keys in ``sizes``, which have these widths, ``qpos`` and ``qvel`` must be there.
-    Only the state of envs where ``is_reset (num_envs,)`` must be finite.
-
-    Raises:
-        ValueError: a key that is missing, of another shape or not finite; parameters of
-            no robot.
-    """
-    given = {} if tensordict is None else tensordict
-    missing = [key for key in (QPOS, QVEL) if key not in given.keys()]
-    if missing:
-        raise ValueError(f"set_state needs {missing} in the tensordict")
-    values = {}
-    for key, size in sizes.items():
-        value, expected = given.get(key, None), (len(is_reset), size)
-        if value is None:
-            continue
-        if (got := tuple(value.shape)) != expected:
-            raise ValueError(f"expected {key} of shape {expected}, got {got}")
-        if not value[is_reset].isfinite().all():
-            raise ValueError(f"expected finite {key} to set the state to")
-        values[key] = value.to(is_reset.device, dtype, copy=True)
-    values[QPOS] = normalize_pos(scene.layout, values[QPOS])
-    if TERRAIN in values and scene.terrain is not None:
-        values[TERRAIN] = scene.terrain.normalize(values[TERRAIN])
-        if not values[TERRAIN][is_reset].isfinite().all():
-            raise ValueError("expected normals of the ground with a length, got zero")
-    if PARAMETERS in values and scene.variation is not None:
-        scene.variation.check(values[PARAMETERS][is_reset])
-    return values
+    def _start(self, state: Tensors, drawn: Tensor) -> Tensors:
+        """What the task begins with, where a ``state`` has such widths."""
+        fresh = dict(self.task.initial_state(drawn[:, : self.task.num_uniforms]))
+        for key in (x for x in state if x != PARAMETERS):
+            if key not in fresh:
+                raise ValueError(
+                    f"expected {key} from initial_state of {type(self.task).__name__}, "
+                    f"got {sorted(fresh)}"
+                )
+            self._of_shape(f"initial {key}", fresh[key], state[key].shape)
+        return fresh

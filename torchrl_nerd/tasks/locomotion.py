@@ -87,7 +87,7 @@ class LocomotionTask(Task):
         return import_scene(self.name)
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
-        """The file's pose, moved a little; a base's quaternion is not yet normalised."""
+        """The file's pose, moved a little; a base's quaternion is normalised."""
         noise, nq = self.numbers.noise, len(self._start)
         around = noise * (2.0 * u - 1.0)
         qpos, qvel = around.split((nq, u.shape[-1] - nq), -1)

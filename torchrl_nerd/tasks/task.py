@@ -25,7 +25,7 @@ TensorDict is one."""
 class Task(ABC):
     """Pure functions of the state; the same ones for all dynamics."""
 
-    horizon: int  # control steps after which an episode is truncated
+    horizon: int  # actions after which an episode is truncated
     num_uniforms: int  # random numbers that one reset takes
     observation_size: int  # width of the observation
     frame_skip: int = 1  # control steps over which an action is held
@@ -139,6 +139,15 @@ class SceneTask(Task):
 
 
 def own_actuators(task: Task) -> ActuatorController:
-    """The controller of a task that leaves the robot to MuJoCo's own actuators."""
-    assert isinstance(task.controller, ActuatorController)
-    return task.controller
+    """The controller of a task that leaves the robot to MuJoCo's own actuators.
+
+    Raises:
+        ValueError: it has another one.
+    """
+    controller = task.controller
+    if not isinstance(controller, ActuatorController):
+        raise ValueError(
+            f"expected the robot's own actuators, whose controls {type(task).__name__} of "
+            f"scene '{task.scene.name}' counts, got a {type(controller).__name__}"
+        )
+    return controller

@@ -84,12 +84,43 @@ def begin_from(
     single, learned = (_single(x.network) for x in (model, start))
     single.load_state_dict(learned.state_dict())
     model.normalize.load_state_dict(start.normalize.state_dict())
-    if symmetry is not None and not symmetry.keeps(model.normalize):
+    if symmetry is not None:
+        _expect_shared(symmetry, model)
+    return model
+
+
+def with_copies(model: NeRD, count: int) -> NeRD:
+    """The same weights, averaged over so many symmetric copies of the robot.
+
+    A group of symmetries has such a size: 2, 4 or 8 of the Ant. The network then takes
+    ``count`` times as long; see `EquivariantNetwork`.
+
+    Raises:
+        ValueError: a robot without such symmetries, a hybrid, or a model that was trained
+            without ``use_symmetry``.
+    """
+    if model.kind != "learned":
+        raise ValueError(f"expected a learned model for copies, got a {model.kind} one")
+    features = model.scene_features.config
+    symmetry = Symmetry(model.scene, features)
+    _expect_shared(symmetry, model)
+    twin = NeRD(model.scene, features, replace(model.config, copies=count))
+    _single(twin.network).load_state_dict(_single(model.network).state_dict())
+    for name in ("normalize", "training_range", "ood", "sleep"):
+        getattr(twin, name).load_state_dict(getattr(model, name).state_dict())
+    if isinstance(twin.network, EquivariantNetwork):
+        twin.network.set_copies(*symmetry.group(count))
+    twin.reference_ratio = model.reference_ratio
+    return twin.to(model.device).train(model.training)
+
+
+def _expect_shared(symmetry: Symmetry, model: NeRD) -> None:
+    """Refuse a model whose statistics symmetric copies of its samples do not share."""
+    if not symmetry.keeps(model.normalize):
         raise ValueError(
             "expected a model to start from that was trained with use_symmetry, got one "
             "whose statistics they change: train without use_symmetry and copies"
         )
-    return model
 
 
 def find_symmetry(scene: Scene, config: TrainConfig) -> Symmetry | None:

@@ -194,7 +194,9 @@ class Symmetry(nn.Module):
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
         super().__init__()
         if scene.variation is not None:
-            raise ValueError("expected a varied scene without use_symmetry and copies, got them")
+            raise ValueError(
+                "expected a varied scene without use_symmetry and copies, got them"
+            )
         self.isometries = nn.ModuleList(find_isometries(scene))
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]

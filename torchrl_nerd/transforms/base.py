@@ -10,7 +10,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_nerd.keys import CTRL, JOINT_TORQUE
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL
+from torchrl_nerd.scenes.scene import Scene
 
 
 class StateTransform(Transform):
@@ -37,13 +38,22 @@ class FeatureTransform(StateTransform):
 
     def __init__(
         self,
+        scene: Scene,
         in_keys: Sequence[NestedKey],
         sizes: dict[NestedKey, int],
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         keys = list(sizes) if out_keys is None else list(out_keys)
         super().__init__(in_keys=list(in_keys), out_keys=keys)
-        self.sizes = sizes
+        self.sizes, self.name = sizes, scene.name
+        self.widths = {QPOS: scene.model.nq, QVEL: scene.model.nv}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
+        """Write the features, and under ``next`` those of the state there."""
+        after = tensordict.get("next", None)
+        if after is not None and all(key in after.keys(True) for key in self.in_keys):
+            self._call(after)
+        return self._call(tensordict)
 
     def _features(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         raise NotImplementedError
@@ -53,6 +63,12 @@ class FeatureTransform(StateTransform):
             return next_tensordict
         expect_keys(type(self).__name__, self.in_keys, next_tensordict)
         given = next_tensordict
+        for key, width in self.widths.items():
+            if given[key].shape[-1] != width:
+                raise ValueError(
+                    f"{type(self).__name__} of scene '{self.name}' expects {key} of width "
+                    f"{width}, got {given[key].shape[-1]}: is it another robot's?"
+                )
         own = next((x.dtype for x in self.buffers() if x.is_floating_point()), None)
         if own not in (None, given[self.in_keys[0]].dtype):  # computed in its precision
             given = given.select(*self.in_keys, JOINT_TORQUE, CTRL, strict=False).to(

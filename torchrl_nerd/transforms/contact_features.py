@@ -81,7 +81,7 @@ class ContactFeatures(FeatureTransform):
             is_level = plane is not None and abs(float(plane[:3] @ down)) > 1.0 - 1e-12
             if plane is None or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count
-        super().__init__(in_keys, sizes)
+        super().__init__(scene, in_keys, sizes)
         self.terrain, self.base = terrain, scene.base
         self.step_size, self.num_torques = scene.control_step, len(scene.actuated)
         if terrain is None:

@@ -7,11 +7,13 @@ for computing the sample variance", 1983), so that huge offsets cost no digits.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec
 
 from torchrl_nerd.transforms.base import StateTransform
 
@@ -41,7 +43,9 @@ class Stats:
         return cls(1, torch.zeros(size).double(), torch.ones(size).double())
 
     def merge(self, other: "Stats") -> "Stats":
-        """Statistics of both sets of samples together."""
+        """Statistics of both sets of samples together; either may be empty."""
+        if not (self.count and other.count):
+            return self if self.count else other
         count = self.count + other.count
         shift = other.mean - self.mean
         share = other.count / count
@@ -65,7 +69,10 @@ class Normalize(StateTransform):
 
     Statistics are frozen buffers. Keys that a tensordict lacks are left alone. The inverse
     acts on ``in_keys_inv`` alone, none by default: a replay buffer calls it on whatever is
-    stored. `denormalize` is the inverse of one quantity.
+    stored, an env on what it is given. `denormalize` is the inverse of one quantity.
+
+    Raises:
+        ValueError: a key of ``in_keys_inv`` without statistics.
 
     Examples:
         >>> x = torch.randn(100, 3).double() * 5.0 + 1000.0
@@ -79,6 +86,10 @@ class Normalize(StateTransform):
         self, stats: Mapping[NestedKey, Stats], in_keys_inv: Sequence[NestedKey] = ()
     ) -> None:
         keys, back = list(stats), list(in_keys_inv)
+        if unknown := [key for key in back if key not in keys]:
+            raise ValueError(
+                f"expected in_keys_inv with statistics ({keys}), got {unknown}"
+            )
         super().__init__(keys, keys, in_keys_inv=back, out_keys_inv=back)
         self.names = {}
         for key, of_key in stats.items():
@@ -115,8 +126,19 @@ class Normalize(StateTransform):
                 next_tensordict.set(key, self.normalize(key, x))
         return next_tensordict
 
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Bounds of what an env is given, normalised."""
+        found = cast(Composite, input_spec.clone())
+        for part in found.values():  # actions and states
+            for key in (x for x in self.in_keys_inv if x in part.keys(True)):
+                if isinstance(part[key], Bounded):
+                    low, high = part[key].space.low, part[key].space.high
+                    part[key].space.low = self.normalize(key, low)
+                    part[key].space.high = self.normalize(key, high)
+        return found
+
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        for key in self.in_keys_inv if self.parent is None else ():
+        for key in self.in_keys_inv:
             x = tensordict.get(key, None)
             if x is not None:
                 tensordict.set(key, self.denormalize(key, x))

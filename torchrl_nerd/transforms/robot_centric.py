@@ -75,7 +75,7 @@ class RobotCentric(FeatureTransform):
             sizes[ROBOT_TORQUE] = len(scene.actuated)
         if num_ctrl(scene):
             sizes[ROBOT_CTRL] = num_ctrl(scene)
-        super().__init__([QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
+        super().__init__(scene, [QPOS, QVEL], sizes, out_keys=[ROBOT_STATE])
         self.base, self.trees = scene.base, trees
         self.seen, self.free = seen, [i for i, moves in enumerate(free) if moves]
         self.joints = joints

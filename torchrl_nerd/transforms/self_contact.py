@@ -47,7 +47,7 @@ class SelfContactFeatures(FeatureTransform):
         times, sizes = times_of(scene), {}
         if pairs:
             sizes[SELF_CONTACT] = (8 + len(times)) * len(pairs)
-        super().__init__([QPOS, QVEL] if pairs else [], sizes)
+        super().__init__(scene, [QPOS, QVEL] if pairs else [], sizes)
         if not pairs:
             return
         self.layout, self.period = scene.layout, scene.control_step

@@ -38,7 +38,9 @@ class StateDelta(Transform):
     | free, linear | R_t^T (v' - v) | R_t^T (p' - p - h/2 (v + v')) |
     | free and ball, angular | Q^T Q' w' - w | log(Q^T Q') - h/2 (w + Q^T Q' w') |
 
-    In an env it is written under ``next`` and is zero at a reset. The inverse integrates:
+    In an env it is written under ``next`` and is zero at a reset. Where an action lasts
+    several control steps it is the change over all of them, with the same h, and nothing
+    that a model of one step can learn from. The inverse integrates:
     from ``qpos``, ``qvel`` and ``state_delta`` it writes the next ``qpos`` and ``qvel``.
 
     Examples:
