@@ -43,7 +43,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TRUST
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN, TRUST
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.seeds import fold_in
@@ -120,7 +120,9 @@ class Trusted(Transform):
                 tensordict.select(QPOS, QVEL),
                 next_tensordict.get("ctrl", None),
             )
-            found = self.judge.step(state, next_tensordict["joint_torque"], None, ctrl)
+            ground = tensordict.get(TERRAIN, None)
+            torque = next_tensordict["joint_torque"]
+            found = self.judge.step(state, torque, ground, ctrl)
         lost = found[TRUST] < self.least  # (num_envs, 1)
         for key in ("done", "terminated"):
             next_tensordict[key] = next_tensordict[key] | lost
@@ -286,9 +288,12 @@ def main(cfg: Config) -> None:
     """Both ways side by side, then the report.
 
     Raises:
-        ValueError: an unknown task, or a folder that holds models already.
+        ValueError: an unknown task, trajectories that are too short, or a folder that
+            holds models already.
     """
     make_task(cfg.name)
+    if cfg.length < PIECE:
+        raise ValueError(f"expected --length of at least {PIECE}, got {cfg.length}")
     if any(cfg.folder.glob("model_*")):
         raise ValueError(
             f"expected no models in {cfg.folder}, got some: choose another --out"

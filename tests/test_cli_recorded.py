@@ -14,6 +14,7 @@ from torchrl_nerd.cli import main
 from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
+from torchrl_nerd.robots import cartpole
 
 TINY = [
     "--update",
@@ -159,3 +160,38 @@ def test_training_on_recorded_trajectories_is_told_of_finetune(
             "nerd: expected simulated trajectories in set, got recorded ones, which "
             "`nerd finetune --from log.npz` learns from\n"
         )
+
+
+def test_a_fine_tuned_model_is_not_written_over(generator, tmp_path, capsys):
+    write_cartpole_log(log := tmp_path / "log.npz", generator, trajectories=12)
+    out = tmp_path / "run"
+    argv = ["finetune", "cartpole", "--from", str(log), "--states", "10", *TINY]
+    argv += ["--out", str(out), "--model", "cartpole-mlp"]
+    assert main(argv) == 0
+    before = (out / "model.safetensors").read_bytes()
+    capsys.readouterr()  # its progress bar
+    assert "already holds a model: choose another --out" in refusal(capsys, *argv)
+    assert (out / "model.safetensors").read_bytes() == before
+
+
+def test_settings_that_cannot_be_are_refused(generator, tmp_path, capsys):
+    write_cartpole_log(log := tmp_path / "log.npz", generator, trajectories=12)
+    argv = ["eval", "cartpole", "--data", str(log), "--states", "1"]
+    assert "expected states of at least 2, got 1" in refusal(capsys, *argv)
+    argv = ["finetune", "cartpole", "--from", str(log), "--epochs", "inf"]
+    assert "expected a finite number of epochs" in refusal(capsys, *argv)
+
+
+def test_a_robot_of_a_file_stays_in_the_folder_of_data_sets(
+    generator, tmp_path, monkeypatch
+):
+    source = Path(cartpole.__file__).with_name("cartpole.xml").read_text()
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    Path("../robots/cart.xml").write_text(source)
+    scene = load_scene("../robots/cart.xml")
+    log = simulated(scene, generator, 12, states=12)
+    np.savez("log.npz", qpos=log.qpos, qvel=log.qvel, trajectory_offsets=log.offsets)
+    assert main("data ../robots/cart.xml --from log.npz".split()) == 0
+    assert [p.name for p in Path("datasets").iterdir()] == ["robots-cart_recorded"]

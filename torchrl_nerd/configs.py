@@ -1,6 +1,7 @@
 """Configurations of data, training, fine-tuning and policy learning: pure data."""
 
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Literal, get_args
 
 from torchrl_nerd.settings import SettingError, expect_at_least
@@ -186,6 +187,8 @@ class FinetuneConfig:
             known = ", ".join(get_args(Update))
             raise SettingError(f"expected update of {known}, got '{self.update}'")
         expect_at_least(2, states=self.states)
+        if self.epochs == inf:
+            raise SettingError(f"expected a finite number of epochs, got {self.epochs}")
         counts = ("evaluations", "batch_size", "sequence_length")
         counts = (*counts, "validate_every", "patience")
         numbers = ("epochs", "lr", "clip", "short_history_fraction")

@@ -165,3 +165,29 @@ def test_velocities_of_other_robots_are_checked(name, generator):
         with pytest.raises(ValueError, match="qvel against differences"):
             check_log(replace(log, qvel=factor * log.qvel), scene)
     check_log(replace(log, qvel=torch.full_like(log.qvel, NONE)), scene)
+
+
+def test_a_robot_that_stands_most_of_the_time_passes(generator):
+    """Encoders at rest read a constant, and velocities a little noise."""
+    log = simulated(load_scene("cartpole"), generator, states=60)
+    stands = torch.arange(len(log.qpos)) % 60 >= 20
+    held = log.qpos[20::60].repeat_interleave(60, 0)
+    noise = 1e-4 * torch.randn(log.qvel.shape, generator=generator).double()
+    qpos = torch.where(stands[:, None], held, log.qpos)
+    qvel = torch.where(stands[:, None], 0.0, log.qvel) + noise
+    check_log(replace(log, qpos=qpos, qvel=qvel), load_scene("cartpole"))
+
+
+@pytest.mark.parametrize(
+    "name", ["gymnasium/HalfCheetah-v5", "dm_control/reacher-easy", "cube_real"]
+)
+def test_exact_motion_passes(name, generator):
+    """Dampers and impacts change a velocity within a frame."""
+    scene = load_scene(name)
+    log = simulated(scene, generator, states=80)
+    check_log(log, scene)
+    if name != "cube_real":  # and half of the frames, called all of them, do not
+        with pytest.raises(ValueError, match="frames are of another length"):
+            half = {key: getattr(log, key)[::2] for key in ("qpos", "qvel")}
+            torque, offsets = log.joint_torque[::2], log.offsets // 2
+            check_log(replace(log, **half, joint_torque=torque, offsets=offsets), scene)

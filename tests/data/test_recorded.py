@@ -11,6 +11,7 @@ from torchrl_nerd import load_scene
 from torchrl_nerd.data.log_files import load_recording, read_log, write_recording
 from torchrl_nerd.data.recorded import (
     FEWEST,
+    Recording,
     complete,
     estimate_velocities,
     free_fall,
@@ -211,3 +212,72 @@ def test_a_log_of_another_robot_is_refused(generator, tmp_path):
         read_log(tmp_path / "log.npz", load_scene("ant"))
     with pytest.raises(ValueError, match="expected 'qpos'"):
         read_log(EXCERPT, load_scene("ant"))
+
+
+CARTPOLE = ("qpos_0", "qpos_1", "qvel_0", "qvel_1", "joint_torque_0")
+
+
+def cartpole_csv(path, generator, *names, **more):
+    """A log of cartpoles under these names of its columns, and ``more`` columns."""
+    log = simulated(load_scene("cartpole"), generator)
+    columns = [numbers(log), log.qpos, log.qvel, log.joint_torque]
+    columns += [np.full((len(log.qpos), 1), value) for value in more.values()]
+    header = ",".join((*(names or ("trajectory", *CARTPOLE)), *more))
+    write_csv(path, header, *columns)
+    return log
+
+
+def test_other_columns_of_a_csv_are_ignored(generator, tmp_path):
+    path, scene = tmp_path / "log.csv", load_scene("cartpole")
+    log = cartpole_csv(path, generator, joint_torque_measured=1.0, qvel_raw_0=2.0)
+    assert same(read_log(path, scene), log)
+    path.write_text("\ufeff" + path.read_text())  # as Excel writes it
+    assert same(read_log(path, scene), log)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (("trajectory", *CARTPOLE[:4], "joint_torque_1"), "none named joint_torque_0"),
+        (("Trajectory", *CARTPOLE), "a column 'trajectory' .* got 'Trajectory'"),
+    ],
+)
+def test_columns_that_are_nearly_right_are_refused(names, said, generator, tmp_path):
+    cartpole_csv(tmp_path / "log.csv", generator, *names)
+    with pytest.raises(ValueError, match=said):
+        read_log(tmp_path / "log.csv", load_scene("cartpole"))
+
+
+def test_a_pose_without_one_of_its_columns_is_refused(log, real_cube, tmp_path):
+    header = "toss,x,y,z,qw,qx,qy,qz,vx,vy"
+    write_csv(tmp_path / "log.csv", header, numbers(log), log.qpos, log.qvel[:, :2])
+    with pytest.raises(ValueError, match="expected columns vx, vy, vz .* named vz"):
+        read_log(tmp_path / "log.csv", real_cube)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "said"),
+    [
+        (np.arange(120) % 2, "got one of one frame in row 0"),
+        (np.arange(120) // 30 % 2, "got several pieces"),
+        (np.arange(120) // 60, "by 'trajectory' and 'trajectory_offsets'"),
+    ],
+)
+def test_trajectories_are_whole(trajectory, said, generator, tmp_path):
+    scene, path = load_scene("cartpole"), tmp_path / "log.npz"
+    log = simulated(scene, generator)
+    how = {"trajectory_offsets": log.offsets} if "offsets" in said else {}
+    np.savez(path, qpos=log.qpos, qvel=log.qvel, trajectory=trajectory, **how)
+    with pytest.raises(ValueError, match=said):
+        read_log(path, scene)
+
+
+def test_estimated_velocities_of_a_fall_are_exact_from_the_first_frame_on(real_cube):
+    frame, gravity = real_cube.control_step, real_cube.model.opt.gravity[2]
+    t = frame * torch.arange(12, dtype=torch.float64)
+    qpos = torch.zeros(12, 7, dtype=torch.float64)
+    qpos[:, 2], qpos[:, 3] = 1.0 + 0.5 * t + 0.5 * gravity * t**2, 1.0
+    none = torch.full((12, 6), torch.nan, dtype=torch.float64)
+    no_torque, offsets = torch.zeros(12, 0).double(), torch.tensor([0, 12])
+    found = complete(Recording(qpos, none, no_torque, offsets, frame), real_cube)
+    torch.testing.assert_close(found.qvel[:, 2], 0.5 + gravity * t)

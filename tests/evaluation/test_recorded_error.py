@@ -96,3 +96,8 @@ def test_models_are_compared_in_pairs(real_cube, recording):
     assert table["a"]["against"] == {"b": {"m": (0.0, 0.0), "rad": (0.0, 0.0)}}
     apart = table["no motion"]["against"]["a"]["m"]
     assert 0.0 < apart[0] <= table["no motion"]["position_error_m"]["mean"] <= apart[1]
+
+
+def test_one_trajectory_has_no_interval():
+    a, b, group = torch.ones(4, 9), torch.zeros(4, 9), torch.zeros(4, dtype=torch.long)
+    assert all(math.isnan(end) for end in paired_interval(a, b, group))

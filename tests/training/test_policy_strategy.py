@@ -111,3 +111,11 @@ def test_what_cannot_be_followed_is_refused(
 def test_a_folder_without_a_policy_is_refused(tmp_path, capsys):
     assert main(["data", "cartpole", "--policy", str(tmp_path / "none")]) == 2
     assert "found no policy" in capsys.readouterr().err
+
+
+def test_varied_robots_follow_it_each_with_its_own_parameters(folder, tmp_path):
+    scene = SCENE.vary({"mass:pole": (0.3, 3.0)})
+    strategy = along_policy(scene, folder)
+    data = load_data(scene, generate(scene, CONFIG, tmp_path / "d", True, strategy))
+    masses = data["parameters"][:, 0, 0]
+    assert masses.min() >= 0.3 and masses.max() <= 3.0 and masses.std() > 0.1

@@ -4,7 +4,7 @@ import shlex
 from abc import ABC, abstractmethod
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchrl_nerd import __version__
 from torchrl_nerd.evaluation.results import make_record
@@ -19,6 +19,7 @@ SHOWN = ("json", "quiet", "dry_run")
 class Command(ABC):
     """A command whose fields are its options."""
 
+    interrupted: ClassVar[str] = "the same command resumes data and training"
     json: Path | None = None
     """Write results and all settings to this file."""
     dry_run: bool = False

@@ -21,7 +21,7 @@ from torchrl_nerd.data.generate import (
 from torchrl_nerd.data.log_files import load_recording, write_recording
 from torchrl_nerd.data.simulate import SEGMENT, simulate
 from torchrl_nerd.data.strategies import preset_strategy, strategy
-from torchrl_nerd.files import read_json
+from torchrl_nerd.files import folder_name, read_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.training.policy_data import along_policy
@@ -108,7 +108,8 @@ class Data(SceneOptions, Command):
                     "expected --policy, --vary and --changes without --from: they draw data"
                 )
             scene = recorded_scene(self.scene)
-            out = self.out or Path("datasets") / f"{scene.name}_recorded"
+            name = f"{folder_name(scene.name)}_recorded"
+            out = self.out or Path("datasets") / name
             card = write_recording(self.recorded, scene, out)
             print(*card["checks"], sep="\n")
             count = card["trajectories"]

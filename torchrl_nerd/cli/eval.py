@@ -155,6 +155,7 @@ class Eval(MeasuringCommand):
 
     def run_recorded(self, path: Path) -> dict[str, Any]:
         """The same for recorded trajectories; a split that is none raises ValueError."""
+        expect_at_least(2, states=self.states)
         protocol, scene = recorded_protocol(self.scene), recorded_scene(self.scene)
         model = from_pretrained(self.model or protocol.model, scene).to(self.device)
         recording, split = load_recording(path, scene)

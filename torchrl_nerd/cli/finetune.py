@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 import tyro
@@ -14,7 +14,7 @@ from torchrl_nerd.cli.options import Flat, Positional, SceneName, recorded_scene
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import Model
-from torchrl_nerd.files import check_writable, read_json, write_json
+from torchrl_nerd.files import check_writable, folder_name, read_json, write_json
 from torchrl_nerd.training.finetune import ANALYTIC, FineTuner, start_model
 
 
@@ -24,9 +24,10 @@ class Finetune(DeviceCommand):
 
     Example: nerd finetune cube --from cube_tosses.npz --out runs/cube_tosses
 
-    Example: nerd finetune cube --from cube_tosses.npz --model runs/cube/best
+    Example: nerd finetune cube --from cube_tosses.npz --model cube_real-mlp
     """
 
+    interrupted: ClassVar[str] = "the best model so far is in the folder of the run"
     scene: Positional[SceneName]
     recorded: Annotated[Path, tyro.conf.arg(name="from")]
     """Recorded trajectories, npz or CSV."""
@@ -51,7 +52,9 @@ class Finetune(DeviceCommand):
         The folder gets its checkpoint and the validation errors, ``curve.json``.
         """
         scene = recorded_scene(self.scene)
-        out = self.out or Path("runs") / f"{scene.name}_finetuned"
+        out = self.out or Path("runs") / f"{folder_name(scene.name)}_finetuned"
+        if (out / CARD).exists():
+            raise ValueError(f"{out} already holds a model: choose another --out")
         check_writable(out / CARD)
         recording, split = load_recording(self.recorded, scene)
         model = start_model(scene, self.model).to(self.device)

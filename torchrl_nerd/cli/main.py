@@ -65,8 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         return _fail((str(error) or repr(error)).splitlines()[0])
     except KeyboardInterrupt:  # Ctrl-C
-        said = "interrupted; the same command resumes data and training"
-        return _fail(said, INTERRUPTED)
+        return _fail(f"interrupted; {kind.interrupted}", INTERRUPTED)
     return 0
 
 

@@ -83,9 +83,11 @@ def read_log(path: Path, scene: Scene) -> Recording:
                 f"got {arrays[name].shape}"
             )
         tensors[name] = torch.as_tensor(arrays[name], dtype=torch.float64)
-        if not tensors[name].isfinite().all():
+        bad = (~tensors[name].reshape(count, -1).isfinite()).any(1).nonzero()
+        if len(bad):
             raise ValueError(
-                f"expected finite numbers in '{name}' of {path}, got others"
+                f"expected finite numbers in '{name}' of {path}, got others in row "
+                f"{int(bad[0])}"
             )
     none = torch.full((count, nv), torch.nan, dtype=torch.float64)
     if is_pose:
@@ -104,8 +106,22 @@ def read_log(path: Path, scene: Scene) -> Recording:
 def _offsets(arrays: dict[str, np.ndarray], count: int, path: Path) -> Tensor:
     offsets = np.array([0, count])
     if "trajectory" in arrays:
-        edges = np.flatnonzero(np.diff(arrays["trajectory"])) + 1
-        offsets = np.array([0, *edges, count])
+        numbers = arrays["trajectory"]
+        offsets = np.array([0, *(np.flatnonzero(np.diff(numbers)) + 1), count])
+        lengths, starts = np.diff(offsets), numbers[offsets[:-1]]
+        short, (_, parts) = lengths < 2, np.unique(starts, return_counts=True)
+        if short.any() or parts.max() > 1:
+            row = int(offsets[:-1][short][0]) if short.any() else 0
+            what = f"one of one frame in row {row}" if short.any() else "several pieces"
+            raise ValueError(
+                f"expected every trajectory in {path} in one piece of at least 2 frames, "
+                f"got {what}"
+            )
+        if not np.array_equal(arrays.get("trajectory_offsets", offsets), offsets):
+            raise ValueError(
+                f"expected equal trajectories by 'trajectory' and 'trajectory_offsets' "
+                f"in {path}, got others"
+            )
     offsets = arrays.get("trajectory_offsets", offsets)
     is_order = offsets.ndim == 1 and len(offsets) > 1 and offsets.dtype.kind in "iu"
     whole = offsets.astype(np.int64) if is_order else np.zeros(2, np.int64)
@@ -134,25 +150,44 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     try:
-        table: Any = np.genfromtxt(
-            path, delimiter=",", names=True, dtype=np.float64, ndmin=1
-        )
+        how: dict[str, Any] = {"dtype": np.float64, "encoding": "utf-8-sig"}
+        table: Any = np.genfromtxt(path, delimiter=",", names=True, ndmin=1, **how)
     except (ValueError, IndexError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"expected a CSV table in {path}: {said}") from None
     names = set(table.dtype.names or ())
     columns = dict(FREE_BODY)
     for array in (QPOS, QVEL, TORQUE, CONTROL, TERRAIN):
-        count = sum(name.startswith(f"{array}_") for name in names)
-        if count:
+        start = f"{array}_"
+        ends = (name.removeprefix(start) for name in names if name.startswith(start))
+        if count := sum(end.isdecimal() for end in ends):
             columns[array] = tuple(f"{array}_{number}" for number in range(count))
+            _expect_columns(path, columns[array], names)
+    if QPOS not in columns:
+        for its in FREE_BODY.values():
+            if not names.isdisjoint(its):
+                _expect_columns(path, its, names)
     arrays = {
         array: np.stack([table[column] for column in its], -1)
         for array, its in columns.items()
         if names.issuperset(its)
     }
     others = {"time": "time", "toss": "trajectory", "trajectory": "trajectory"}
+    for name in sorted(names - others.keys()):
+        if name.lower() in others:
+            raise ValueError(
+                f"expected a column '{name.lower()}' in {path}, got '{name}'"
+            )
     return arrays | {others[name]: table[name] for name in others if name in names}
+
+
+def _expect_columns(path: Path, expected: tuple[str, ...], names: set[str]) -> None:
+    """Refuse an array of which some columns are missing."""
+    if missing := [name for name in expected if name not in names]:
+        raise ValueError(
+            f"expected columns {', '.join(expected)} in {path}, got none named "
+            f"{', '.join(missing)}"
+        )
 
 
 def load_recording(path: Path, scene: Scene) -> tuple[Recording, dict[str, Tensor]]:

@@ -27,6 +27,7 @@ DEEPEST = 0.2  # of the robot's size that points may lie under the ground
 VELOCITY_ERROR = 0.25  # of the median speed, measured against differences of poses
 LARGEST_JUMP = 0.5  # of a frame's displacement that its velocity does not explain
 LARGEST_EXCESS = 0.2  # of a frame's speed, above that of both its neighbours
+STILL = 1e-2  # m/s and rad/s: slower frames tell no units
 SLOW = 0.3  # m/s added to speeds: noise counts for more in slow frames
 WXYZ = [6, 3, 4, 5]  # columns of a free body's qpos, if its quaternion is xyzw
 
@@ -87,10 +88,10 @@ def _checks(log: Recording, scene: Scene) -> Iterator[Check]:
     if is_free_body(scene):
         yield from _free_body_checks(log, scene)
     elif not log.qvel.isnan().any():
-        ends = 0.5 * (log.qvel + log.qvel.roll(1, 0))  # of a frame
         mean = backward_differences(log, scene)
         advice = "velocities are in other units, or frames are of another length"
-        yield _velocity("qvel against differences of qpos", ends, mean, log, advice)
+        nearest = _between(log.qvel, mean)
+        yield _velocity("qvel against differences of qpos", nearest, mean, log, advice)
 
 
 def _free_body_checks(log: Recording, scene: Scene) -> Iterator[Check]:
@@ -122,7 +123,7 @@ def _free_body_checks(log: Recording, scene: Scene) -> Iterator[Check]:
         }
         yield _velocity(name, angular, turned, log, advice, readings)
     if has_linear:
-        jump = _length(moved - linear) / (_length(linear) + SLOW)
+        jump = _length(moved - _between(linear, moved)) / (_length(linear) + SLOW)
         name = "displacement within a frame that no velocity explains"
         yield _gap(name, torch.where(log.inside, jump, 0.0), LARGEST_JUMP)
     # The velocity over a frame with an impact is a mean of those around it, so no impact
@@ -174,14 +175,17 @@ def _velocity(
     advice: str,
     readings: Mapping[str, tuple[Tensor, Tensor]] | None = None,
 ) -> Check:
-    """Median difference over the median speed, of frames within a trajectory.
+    """Median difference over the median speed, of frames that move within a trajectory.
 
     ``readings``: other pairs of velocities, which are advised if they agree.
     """
 
     def error(stored: Tensor, measured: Tensor) -> float:
-        apart, speed = (_length(x)[log.inside] for x in (stored - measured, measured))
-        return float(apart.median() / speed.median().clamp_min(1e-9))
+        apart, speed = _length(stored - measured), _length(measured)
+        moves = log.inside & (torch.maximum(apart, speed) > STILL)
+        if not moves.any():
+            return 0.0
+        return float(apart[moves].median() / speed[moves].median().clamp_min(STILL))
 
     for reading, pair in (readings or {}).items():
         if error(*pair) < VELOCITY_ERROR:
@@ -196,6 +200,15 @@ def _gap(name: str, values: Tensor, limit: float) -> Check:
     frame = int(values.argmax())
     advice = f"there is a gap in time, or frames are lost, before frame {frame}"
     return Check(name, float(values[frame]), 0.0, limit, "of it", advice)
+
+
+def _between(ends: Tensor, mean: Tensor) -> Tensor:
+    """What is nearest to the ``mean`` velocity of a frame, between those at its ends.
+
+    Dampers and impacts change a velocity within a frame, so it need not be half way.
+    """
+    before = ends.roll(1, 0)
+    return mean.clamp(torch.minimum(before, ends), torch.maximum(before, ends))
 
 
 def _length(x: Tensor) -> Tensor:

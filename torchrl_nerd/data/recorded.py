@@ -134,8 +134,9 @@ def complete(log: Recording, scene: Scene) -> Recording:
 
     Velocities are estimated from positions as `estimate_velocities` does. A velocity that
     is a mean over the frame before lags its state: of a free body in flight the median lag
-    is measured, and what gravity adds in that time is added. The torque of servos follows
-    from their controls.
+    is measured, and what gravity adds in that time is added. A trajectory's first estimate
+    is the mean over the frame after it, and leads. The torque of servos follows from their
+    controls.
     """
     layout = scene.layout
     qpos = integrate_pos(layout, log.qpos, torch.zeros_like(log.qvel))
@@ -146,8 +147,14 @@ def complete(log: Recording, scene: Scene) -> Recording:
         steady = is_airborne & log.inside
         if steady.any():
             mean = backward_differences(log, scene)[:, 2]
-            now = mean + 0.5 * log.frame * float(free_fall(log)[2])
-            qvel[is_airborne, 2] += (now - qvel[:, 2])[steady].median()
+            half = 0.5 * log.frame * float(free_fall(log)[2])
+            qvel[is_airborne, 2] += (mean + half - qvel[:, 2])[steady].median()
+            first = log.offsets[
+                :-1
+            ]  # whose estimate is the mean over the frame after it
+            is_estimated = log.qvel[first, 2].isnan() & is_airborne[first]
+            leads = first[is_estimated & is_airborne[first + 1]]
+            qvel[leads, 2] = mean[leads] - half
     log = replace(log, qvel=qvel)
     if scene.servos is None or log.ctrl is None:
         return log

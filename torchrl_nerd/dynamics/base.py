@@ -11,7 +11,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.compiled import uncompiled
-from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
+from torchrl_nerd.keys import (
+    ACTION,
+    CTRL,
+    JOINT_TORQUE,
+    PARAMETERS,
+    QPOS,
+    QVEL,
+    TERRAIN,
+)
 from torchrl_nerd.scenes.controllers import ActuatorController
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.variation import Ranges
@@ -98,9 +106,9 @@ def warm_up(
         )
     is_varied = dynamics.scene.variation is not None and isinstance(dynamics, Engine)
     optional = (CTRL,) if is_varied else (CTRL, PARAMETERS)
-    for key in (QPOS, QVEL, JOINT_TORQUE, CTRL, PARAMETERS):
+    for key in (QPOS, QVEL, JOINT_TORQUE, CTRL, PARAMETERS, ACTION):
         value = history.get(key, None)
-        if value is None and key not in optional:
+        if value is None and key not in (*optional, ACTION):
             raise ValueError(f"expected {key!r} in a history to warm up with, got none")
         if value is not None and not value.isfinite().all():
             raise ValueError(

@@ -5,6 +5,7 @@ from the first of them the model rolls out the other 79; mean error along the pa
 of one trajectory overlap, so intervals are found by drawing trajectories again.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -73,8 +74,11 @@ def resampled_means(values: Tensor, group: Tensor, draws: int = DRAWS) -> Tensor
 def paired_interval(a: Tensor, b: Tensor, group: Tensor) -> tuple[float, float]:
     """95% interval over trajectories of mean(a) - mean(b), errors ``(windows, steps)``.
 
-    ``group``: number of each window's trajectory, ``(windows,)``.
+    ``group``: number of each window's trajectory, ``(windows,)``. NaN where there is one:
+    it tells nothing of others.
     """
+    if len(group.unique()) < 2:
+        return math.nan, math.nan
     means = resampled_means((a - b).mean(1), group)  # (draws,)
     low, high = means.quantile(means.new_tensor((0.025, 0.975))).tolist()
     return low, high

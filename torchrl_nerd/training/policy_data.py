@@ -97,6 +97,8 @@ def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, D
             f"the policy in {folder} acts in scene '{task.scene.name}' "
             f"({task.scene.hash}), expected '{scene.name}' ({scene.hash})"
         )
+    if scene.variation is not None:  # which a scene's hash leaves out
+        task = task.with_scene(scene)
     policy = load_policy(folder, task)
     digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:16]
     draw = partial(policy_data, task, make_actor(policy), noise=noise)
