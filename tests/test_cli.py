@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -14,7 +15,8 @@ from helpers import EXCERPT, slow_but
 from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli import COMMANDS, main
-from torchrl_nerd.configs import FinetuneConfig
+from torchrl_nerd.configs import DataConfig, FinetuneConfig
+from torchrl_nerd.data import generate as generate_module
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import mujoco_name, simulators
 from torchrl_nerd.evaluation.bench.errors import PAPER, cases_of
@@ -516,3 +518,39 @@ def test_the_preset_is_that_of_the_scene_and_not_of_a_folder(scene, order, capsy
     count = preset_of(scene).data.trajectories
     assert count != PRESETS["ant"].data.trajectories
     assert f"draw {count} trajectories" in capsys.readouterr().out
+
+
+def test_settings_that_do_not_fit_are_refused_before_data_are_drawn(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    for options, said in {
+        "--network nope": "nope",
+        "--sequence-length 400": "at least 400 steps, got 100: draw them",
+        "--use-symmetry": "floating base",
+    }.items():
+        assert said in refusal(capsys, "train", "cartpole", *options.split())
+    assert not (tmp_path / "datasets").exists()
+
+
+def test_training_finishes_the_data_that_it_began(tmp_path, monkeypatch):
+    """Data that were cut short, by the command that drew them."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(generate_module, "CHUNK", 8)
+    preset = preset_of("cartpole")
+    small = replace(preset, data=DataConfig(trajectories=24, steps=20))
+    monkeypatch.setitem(PRESETS, "cartpole", small)
+    once, calls = generate_module.simulate, iter(range(9))
+
+    def dying(*given):
+        if next(calls) == 2:
+            raise KeyboardInterrupt
+        return once(*given)
+
+    monkeypatch.setattr(generate_module, "simulate", dying)
+    argv = "train cartpole --network mlp-1x16 --steps 2 --rollout-steps 0 --quiet"
+    argv = [*argv.split(), "--logger", "csv", "--sequence-length", "2"]
+    assert main(argv) == 130
+    card = json.loads((tmp_path / "datasets" / "cartpole" / "data.json").read_text())
+    assert 0 < card["trajectories"] < 24
+    assert main(argv) == 0

@@ -121,3 +121,23 @@ def test_forces_that_it_does_not_model_are_refused(what, field):
     getattr(scene.model, field)[:] = 1
     with pytest.raises(ValueError, match=what):
         UnconstrainedStep(scene)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "<option",
+            '<option><flag gravity="disable"/></option><option',
+            "switched off",
+        ),
+        ("<option", '<option><flag spring="disable"/></option><option', "switched off"),
+        ("<option", '<option><flag limit="disable"/></option><option', "switched off"),
+        ('stiffness="3"', 'stiffness="3 1"', "that grows"),
+        ('damping="0.2"', 'damping="0.2 0.1"', "that grows"),
+    ],
+)
+def test_forces_that_it_does_not_have_are_refused(old, new, said):
+    text = CHAIN.format(integrator="Euler").replace(old, new, 1)
+    with pytest.raises(ValueError, match=said):
+        UnconstrainedStep(make_scene(text))

@@ -1,10 +1,11 @@
 """What MuJoCo computes of a state."""
 
+import pytest
 import torch
 from helpers import make_scene
 from tensordict import TensorDict
 
-from torchrl_nerd.evaluation.stability.states import mechanics
+from torchrl_nerd.evaluation.stability.states import mechanics, robot_mass
 
 PENDULUM = """
 <mujoco><worldbody><body pos="0 0 2"><joint name="hinge" axis="0 1 0"/>
@@ -27,3 +28,23 @@ def test_energy_of_a_state_that_is_not_finite_is_nan():
     angle = torch.tensor([[0.0], [torch.nan]], dtype=torch.float64)
     states = TensorDict({"qpos": angle, "qvel": torch.zeros_like(angle)}, [2])
     assert mechanics(scene, states)["energy"].isnan().tolist() == [False, True]
+
+
+FREE = """<mujoco><option timestep="0.005"/><worldbody>{}
+<geom type="plane" size="9 9 .1"/><body pos="0 0 1"><freejoint/>
+<geom type="box" size=".1 .05 .05" mass="1"/><body pos=".15 0 0">
+<joint name="k" axis="0 1 0" damping=".1"/>
+<geom type="capsule" size=".03" fromto="0 0 0 .2 0 0" mass=".3"/></body></body>
+</worldbody><actuator><motor joint="k"/></actuator></mujoco>"""
+TABLE = '<body pos="4 4 .2"><geom type="box" size=".3 .3 .2"/></body>'
+
+
+def test_what_does_not_fall_with_the_robot_is_no_part_of_it():
+    alone, beside = (make_scene(FREE.format(x)) for x in ("", TABLE))
+    assert robot_mass(alone) == robot_mass(beside) == pytest.approx(1.3)
+    qpos = torch.tensor([[0.0, 0, 2, 1, 0, 0, 0, 0.3]]).double()
+    qvel = torch.arange(7).double()[None]
+    states = TensorDict({"qpos": qpos, "qvel": qvel}, [1])
+    both = [mechanics(scene, states) for scene in (alone, beside)]
+    for name in ("com", "momentum", "angular_momentum"):
+        torch.testing.assert_close(both[0][name], both[1][name])

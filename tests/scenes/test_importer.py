@@ -499,3 +499,21 @@ def test_a_plane_for_a_file_without_ground(tmp_path):
         Scene.from_mjcf(floored, terrain="plane")
     with pytest.raises(ValueError, match="terrain 'plane' or None, got 'hills'"):
         Scene.from_mjcf(bare, terrain="hills")  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    "default", ["", 'contype="0" conaffinity="0"', 'pos="0 0 0.5"', 'friction="0"']
+)
+def test_an_added_plane_is_level_ground_whatever_geoms_are_by_default(
+    default, tmp_path
+):
+    (tmp_path / "ball.xml").write_text(f"""<mujoco><default><geom {default}/>
+      <default class="hull"><geom contype="1" conaffinity="1" pos="0 0 0"/></default>
+      </default><worldbody><body pos="0 0 1"><freejoint/>
+      <geom class="hull" size="0.1"/></body></worldbody></mujoco>""")
+    scene = Scene.from_mjcf(tmp_path / "ball.xml", terrain="plane")
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_step(scene.model, data, 1000)
+    assert len(scene.contacts) == 1 and abs(data.qpos[2] - 0.1) < 0.01
+    [plane] = np.flatnonzero(scene.model.geom_bodyid == 0)
+    assert scene.model.geom_friction[plane].tolist() == [1.0, 0.005, 0.0001]

@@ -12,6 +12,7 @@ from helpers import HANDMADE, random_states, random_transitions
 
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import SCENES, load_scene
+from torchrl_nerd.scenes.fingerprint import fingerprint
 
 FACTS = {
     "cartpole": {
@@ -177,3 +178,33 @@ def test_an_unknown_scene_is_named_with_those_that_exist():
     with pytest.raises(ValueError, match="unknown scene 'hovercraft'") as error:
         load_scene("hovercraft")
     assert all(name in str(error.value) for name in SCENES)
+
+
+TENDON = """<mujoco><worldbody><site name="w" pos="0 0 1"/><body pos="0 0 0.3">
+<joint name="j" axis="0 1 0"/><geom size="0.05" pos="0.3 0 0"/><site name="p" pos="{}"/>
+</body></worldbody><tendon>{}</tendon>{}</mujoco>"""
+CORD = '<spatial name="t"><site site="w"/><site site="p"/></spatial>'
+FIXED = '<fixed name="t" {}><joint joint="j" coef="{}"/></fixed>'
+PULL = '<actuator><motor tendon="t"/></actuator>'
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (("0 0 0.2", CORD, PULL), ("0.3 0 -0.2", CORD, PULL)),
+        (("0 0 0", FIXED.format("", 1), PULL), ("0 0 0", FIXED.format("", -1), PULL)),
+        (
+            ("0 0 0", FIXED.format('actuatorfrcrange="-1 1"', 1), PULL),
+            ("0 0 0", FIXED.format('actuatorfrcrange="-2 2"', 1), PULL),
+        ),
+        (
+            ("0.1 0 0", "", '<equality><connect site1="w" site2="p"/></equality>'),
+            ("0.2 0 0", "", '<equality><connect site1="w" site2="p"/></equality>'),
+        ),
+    ],
+    ids=["a motor's site", "a coefficient", "a force range", "a bound site"],
+)
+def test_the_fingerprint_knows_what_tendons_and_sites_do(one, other):
+    models = (mujoco.MjModel.from_xml_string(TENDON.format(*x)) for x in (one, other))
+    hashes = {fingerprint(model, 4) for model in models}
+    assert len(hashes) == 2

@@ -148,3 +148,20 @@ def test_looking_for_symmetries_leaves_the_model_alone(scene, generator):
     assert not flags & mujoco.mjtDisableBit.mjDSBL_LIMIT
     after = mujoco_step(scene, before, before["next", "joint_torque"])
     assert torch.equal(after["next", QVEL], before["next", QVEL])
+
+
+GRIPPER = """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1"/>
+<geom size="0.05" contype="0" conaffinity="0"/>
+<body pos="0 0.04 0"><joint name="l" type="slide" axis="0 1 0"/><geom size="0.01"/></body>
+<body pos="0 -0.04 0"><joint name="r" type="slide" axis="0 1 0"/><geom size="0.01"/></body>
+</body></worldbody></mujoco>"""
+BUNGEE = """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+<geom size="0.05"/></body></worldbody><tendon><fixed stiffness="20" springlength="0 4">
+<joint joint="x" coef="1"/></fixed></tendon></mujoco>"""
+
+
+def test_what_touches_or_pulls_seldom_is_kept():
+    """Fingers that may meet, a cord that is slack: few states show what they do."""
+    ignored = make_scene(GRIPPER).symmetries.positions
+    assert ignored == {0}  # how high the hand is, but not where its fingers are
+    assert make_scene(BUNGEE).symmetries.positions == set()

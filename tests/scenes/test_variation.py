@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from helpers import varied_model
+from helpers import make_scene, varied_model
 
 from torchrl_nerd.robots import PRESETS, load_scene
 from torchrl_nerd.scenes.variation import Variation
@@ -198,3 +198,21 @@ def test_what_cannot_be_is_refused(ranges, words):
     with pytest.raises(ValueError, match=words) as raised:
         load_scene("cartpole").vary(ranges)
     assert "\n" not in str(raised.value)
+
+
+ONE_HINGE = """<mujoco><worldbody><body><joint name="h" {joint}/><geom size="0.1"/></body>
+</worldbody><tendon><fixed name="t"><joint joint="h" coef="1"/></fixed></tendon>
+<actuator><motor {actuator}/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("joint", "actuator", "said"),
+    [
+        ("", 'tendon="t"', "a motor on the joint, got a tendon's in 'motor:h'"),
+        ('actuatorfrcrange="-1 1"', 'joint="h"', "without an actuatorfrcrange"),
+    ],
+)
+def test_motors_that_would_not_vary_alike_everywhere_are_refused(joint, actuator, said):
+    scene = make_scene(ONE_HINGE.format(joint=joint, actuator=actuator))
+    with pytest.raises(ValueError, match=said):
+        scene.vary({"motor:h": (0.5, 1.0)})

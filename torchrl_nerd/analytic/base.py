@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import asdict
 from typing import Any, ClassVar, NamedTuple, cast
 
+import mujoco
 import torch
 from torch import Tensor, nn
 
@@ -19,6 +20,13 @@ class StepResult(NamedTuple):
     qpos: Tensor  # (*batch, nq)
     qvel: Tensor  # (*batch, nv)
     velocity_defect: Tensor  # (*batch, K): embedded error estimate, rad/s and m/s
+
+
+FORCES = sum(
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+    for name in ("GRAVITY", "SPRING", "DAMPER", "LIMIT", "CONSTRAINT", "ACTUATION")
+)
+"""Flags of MuJoCo that switch off forces which an analytic step has."""
 
 
 class AnalyticStep(nn.Module, ABC):
@@ -83,6 +91,7 @@ def check_supported(scene: Scene) -> None:
     model = scene.model
     kinds = {geom_kind(model, geom) for geom in touching_geoms(model)}
     names = ("armature", "damping", "dampingpoly")
+    polynomials = model.jnt_stiffnesspoly, model.dof_dampingpoly
     of_actuators = (getattr(model, f"actuator_{name}") for name in names)
     forces = {
         "dry friction": model.dof_frictionloss.any(),
@@ -95,6 +104,8 @@ def check_supported(scene: Scene) -> None:
         "cylinders, ellipsoids or meshes on the ground": not kinds <= {*EXACT},
         "servos of MuJoCo": scene.servos is not None,
         "actuators with damping or mass": any(x.any() for x in of_actuators),
+        "stiffness or damping that grows": any(x.any() for x in polynomials),
+        "forces switched off": model.opt.disableflags & FORCES,
     }
     found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:

@@ -1,6 +1,6 @@
 """``nerd train``: the model that ships for a scene, or one of your own."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,7 +9,7 @@ import torch
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_checkpoint
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, SceneOptions
-from torchrl_nerd.configs import TrainConfig
+from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.data.generate import (
     CARD,
     expect_few_dropped,
@@ -24,7 +24,7 @@ from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.log import LoggerName
-from torchrl_nerd.training.start import begin_from, make_model
+from torchrl_nerd.training.start import begin_from, find_symmetry, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
 
 Kind = Literal["learned", "hybrid"]
@@ -91,17 +91,14 @@ class Train(SceneOptions, DeviceCommand):
     def plan(self) -> list[str]:
         """Which model would be trained on which data, and what exists already."""
         scene, (out, folders) = self.load(), self.folders
-        if _is_missing(folders):
+        if _is_missing(folders, preset_of(self.scene).data):
             count = preset_of(self.scene).data.trajectories
             data = f"draw {count} trajectories, to {folders[0]}"
         else:
             for folder in folders:
                 read_card(scene, folder)
             data = f"use the data in {', '.join(map(str, folders))}"
-        if (initial := self.initial(scene)) is None:
-            model = make_model(scene, self.config)
-        else:
-            model = begin_from(initial, scene, self.config)
+        model = self.untrained(scene, self.initial(scene))
         weights = sum(weight.numel() for weight in model.network.parameters())
         return [
             data,
@@ -110,13 +107,32 @@ class Train(SceneOptions, DeviceCommand):
             f"{self.config.total_steps} updates",
         ]
 
+    def untrained(self, scene: Scene, initial: NeRD | None) -> NeRD:
+        """The model whose training begins; settings that do not fit are refused."""
+        symmetry = find_symmetry(scene, self.config)
+        if initial is not None:
+            return begin_from(initial, scene, self.config, symmetry)
+        return make_model(scene, self.config, symmetry=symmetry)
+
+    def expect_trainable(
+        self, scene: Scene, initial: NeRD | None, data: DataConfig
+    ) -> None:
+        """Refuse settings before data are drawn, not after it."""
+        self.untrained(scene, initial)
+        if data.steps < self.config.longest:
+            raise ValueError(
+                f"expected trajectories of at least {self.config.longest} steps, got "
+                f"{data.steps}: draw them with `nerd data {self.scene} --steps`"
+            )
+
     def run(self) -> dict[str, Any]:
         """Train and return the card of the checkpoint that the preset chooses."""
         scene, preset = self.load(), preset_of(self.scene)
         (out, folders), initial = self.folders, self.initial(scene)
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
-        if _is_missing(folders):
+        if _is_missing(folders, preset.data):
+            self.expect_trainable(scene, initial, preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
             expect_few_dropped(read_json(folders[0] / CARD))
         if self.threads:
@@ -145,9 +161,13 @@ class Train(SceneOptions, DeviceCommand):
         return card
 
 
-def _is_missing(folders: tuple[Path, ...]) -> bool:
-    """Whether the data must be generated: a single data set that does not exist."""
-    return len(folders) == 1 and not (folders[0] / CARD).exists()
+def _is_missing(folders: tuple[Path, ...], config: DataConfig) -> bool:
+    """Whether a single data set is yet to be generated, or to be finished."""
+    if len(folders) != 1 or not (path := folders[0] / CARD).exists():
+        return len(folders) == 1
+    card = read_json(path)
+    drawn = card.get("trajectories", 0) + card.get("dropped", 0)
+    return card.get("config") == asdict(config) and drawn < config.trajectories
 
 
 def _errors(card: dict[str, Any]) -> str:

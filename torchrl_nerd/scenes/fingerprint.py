@@ -51,6 +51,9 @@ TENDONS = (
     *("wrap_type", "wrap_objid", "wrap_prm", "site_pos", "site_quat"),
 )
 """Of tendons, where one acts by itself or is bound."""
+ON_SITES = tuple(
+    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("SITE", "SLIDERCRANK")
+)
 SOLVER = ("solver", "iterations", "noslip_iterations", "enableflags")  # no tolerances
 GROUND = (
     *("geom_bodyid", "body_mocapid", "geom_dataid"),
@@ -110,9 +113,17 @@ def _unusual(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     unusual = {k: v for k, v in values.items() if np.any(v != RARELY[k])}
     if np.any(model.qpos_spring != model.qpos0):
         unusual["qpos_spring"] = model.qpos_spring
-    if model.ntendon and (model.neq or any(k.startswith("tendon") for k in unusual)):
+    pulls = np.any(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
+    is_bound = model.neq or any(k.startswith("tendon") for k in unusual)
+    if model.ntendon and (pulls or is_bound):
         unusual |= {name: np.asarray(getattr(model, name)) for name in TENDONS}
-    if np.any(model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE):
+    if np.any(model.tendon_actfrclimited):
+        names = "tendon_actfrclimited", "tendon_actfrcrange"
+        unusual |= {name: np.asarray(getattr(model, name)) for name in names}
+    has_sites = np.any(np.isin(model.actuator_trntype, ON_SITES))
+    has_sites |= np.any(model.wrap_type == mujoco.mjtWrap.mjWRAP_SITE)
+    has_sites |= np.any(model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE)
+    if has_sites:
         names = "site_bodyid", "site_pos", "site_quat"
         unusual |= {name: np.asarray(getattr(model, name)) for name in names}
     bodies = model.jnt_bodyid - model.jnt_bodyid[:1]  # by default a joint each

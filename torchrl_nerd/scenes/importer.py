@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from dm_control.rl.control import Environment
 
 CONTROL_STEP = 0.02  # s, where nobody says
+CONTACT_FIELDS = (
+    *("conaffinity", "condim", "contype", "friction", "gap", "margin", "pos"),
+    *("priority", "quat", "solimp", "solmix", "solref"),
+)
+"""Of a plane that is added: where it lies and how it touches."""
 
 
 def read_mjcf(
@@ -59,7 +64,9 @@ def read_mjcf(
             raise ValueError(f"expected no ground beside a plane in {path}, got some")
         spec = mujoco.MjSpec.from_file(str(path))
         plane = mujoco.mjtGeom.mjGEOM_PLANE
-        spec.worldbody.add_geom(type=plane, size=(0.0, 0.0, 1.0))
+        usual = mujoco.MjSpec().worldbody.add_geom()  # whatever the file's default is
+        about = {name: getattr(usual, name) for name in CONTACT_FIELDS}
+        spec.worldbody.add_geom(type=plane, size=(0.0, 0.0, 1.0), **about)
         model = spec.compile()
     timestep = model.opt.timestep
     if control_step is None:

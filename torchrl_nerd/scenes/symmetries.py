@@ -18,7 +18,11 @@ from torchrl_nerd.geometry.base import Base
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE, joint_label
 from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
-from torchrl_nerd.scenes.contact_points import ground_geoms, terrain_geoms
+from torchrl_nerd.scenes.contact_points import (
+    ground_geoms,
+    own_contacts,
+    terrain_geoms,
+)
 from torchrl_nerd.scenes.support import DISABLE, silence_mujoco, unit_gravity
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
@@ -67,17 +71,20 @@ def find_symmetries(
 
     One coordinate is moved and nothing else, so that only invariances of the
     dynamics pass; the ground stays where it is. Nothing is dropped where a few states do
-    not show what matters: limited tendons, static shapes without features, props. Servos
+    not show what matters: limited tendons, static shapes without features, props. A joint
+    of `seldom_felt` is kept. Servos
     act in every substep; without them a torque is a torque.
     """
     if why_all_kept(model):
         return Symmetries(())
     free, rng = _without(model, LIMIT, has_servos), np.random.default_rng(0)
+    seldom = seldom_felt(model)
     effects: list[Effect] = []
     for joint in np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE))).tolist():
         q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         for key, address in ((QPOS, q), (QVEL, v)):
             change = _largest_change(free, substeps, rng, _shift(key, address))
+            change = max(change, float(joint in seldom))
             effects.append(Effect(joint_label(model, joint), key, address, change))
     return Symmetries(tuple(effects))
 
@@ -91,6 +98,32 @@ def why_all_kept(model: mujoco.MjModel) -> str | None:
     if set(ground_geoms(model)) - set(terrain_geoms(model)):
         return "the robot can touch shapes that no feature shows"
     return None
+
+
+def seldom_felt(model: mujoco.MjModel) -> set[int]:
+    """Joints that act where few states lead: touching shapes, tendons that are slack.
+
+    Of two shapes of the robot which may touch, those that move one against the other.
+    """
+    above: list[set[int]] = [set()]  # joints between each body and the world
+    for body in range(1, model.nbody):
+        first, count = model.body_jntadr[body], model.body_jntnum[body]
+        own = range(first, first + count)
+        above.append(above[model.body_parentid[body]] | {*own})
+    found: set[int] = set()
+    for pair in own_contacts(model):
+        one, other = (above[model.geom_bodyid[geom]] for geom in pair)
+        found |= one ^ other
+    low, high = model.tendon_lengthspring.T
+    for tendon in np.flatnonzero((model.tendon_stiffness != 0.0) & (high > low)):
+        first, count = model.tendon_adr[tendon], model.tendon_num[tendon]
+        for wrap in range(first, first + count):
+            kind, target = model.wrap_type[wrap], int(model.wrap_objid[wrap])
+            if kind == mujoco.mjtWrap.mjWRAP_JOINT:
+                found.add(target)
+            elif kind == mujoco.mjtWrap.mjWRAP_SITE:
+                found |= above[model.site_bodyid[target]]
+    return found
 
 
 def base_effects(

@@ -85,9 +85,23 @@ class Variation:
             load = "payload" + parameter.suffix
             if kind.startswith("payload_") and load not in ranges:
                 raise ValueError(f"expected '{load}' beside '{name}', got none")
-            has_motors = set(parameter.indices) <= set(actuated)
-            if kind == "motor" and parameter.suffix and not has_motors:
-                raise ValueError(f"expected a joint with a motor, got '{name}'")
+            if kind == "motor":
+                self._expect_motors(parameter)
+
+    def _expect_motors(self, parameter: Parameter) -> None:
+        """Refuse joints without a motor of their own, or whose torque is clipped."""
+        model, name, dofs = self.model, parameter.name, {*parameter.indices}
+        if parameter.suffix and not dofs <= {*self.actuated}:
+            raise ValueError(f"expected a joint with a motor, got '{name}'")
+        if parameter.suffix and not dofs <= {*self._motor_dofs.tolist()}:
+            raise ValueError(
+                f"expected a motor on the joint, got a tendon's in '{name}'"
+            )
+        chosen = dofs if parameter.suffix else {*self.actuated}
+        if model.jnt_actfrclimited[model.dof_jntid[[*chosen]]].any():
+            raise ValueError(
+                f"expected motors of joints without an actuatorfrcrange, got '{name}'"
+            )
 
     @property
     def size(self) -> int:

@@ -86,16 +86,27 @@ def rotated(scene: Scene, states: TensorDict, quat: Tensor) -> TensorDict:
     return states
 
 
+def robot_root(scene: Scene) -> int:
+    """The body that carries the robot: a floating base, else the world."""
+    return scene.base.body if scene.base.is_floating else 0
+
+
+def robot_mass(scene: Scene) -> float:
+    """Mass of the robot without props and what stands in the world, kg."""
+    return float(scene.model.body_subtreemass[robot_root(scene)])
+
+
 def mechanics(scene: Scene, states: TensorDictBase) -> dict[str, Tensor]:
     """What MuJoCo computes of each state ``[n]``; NaN where a state is not finite.
 
     Returns:
-        ``energy (n,)``, kinetic plus that of gravity and joint springs, J; ``com (n, 3)``,
-        m; ``momentum (n, 3)``, kg m/s; ``angular_momentum (n, 3)`` about the centre of
-        mass, kg m^2/s; ``penetration (n,)``, the deepest contact, m. In world axes.
+        Of the robot, without props, but for the energy, which is of all: ``energy (n,)``,
+        kinetic plus that of gravity and joint springs, J; ``com (n, 3)``, m; ``momentum
+        (n, 3)``, kg m/s; ``angular_momentum (n, 3)`` about the centre of mass, kg m^2/s;
+        ``penetration (n,)``, the deepest contact, m. In world axes.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
-    mass = float(model.body_mass.sum())
+    root, mass = robot_root(scene), robot_mass(scene)
     none = torch.full((len(states), 3), torch.nan, dtype=torch.float64)
     found = {k: none.clone() for k in ("com", "momentum", "angular_momentum")}
     found |= {k: none[:, 0].clone() for k in ("energy", "penetration")}
@@ -107,8 +118,8 @@ def mechanics(scene: Scene, states: TensorDictBase) -> dict[str, Tensor]:
         mujoco.mj_energyVel(model, data)
         mujoco.mj_subtreeVel(model, data)
         found["energy"][i] = float(data.energy.sum())
-        found["com"][i] = torch.from_numpy(data.subtree_com[0])
-        found["momentum"][i] = mass * torch.from_numpy(data.subtree_linvel[0])
-        found["angular_momentum"][i] = torch.from_numpy(data.subtree_angmom[0])
+        found["com"][i] = torch.from_numpy(data.subtree_com[root])
+        found["momentum"][i] = mass * torch.from_numpy(data.subtree_linvel[root])
+        found["angular_momentum"][i] = torch.from_numpy(data.subtree_angmom[root])
         found["penetration"][i] = max((-c.dist for c in data.contact), default=0.0)
     return found

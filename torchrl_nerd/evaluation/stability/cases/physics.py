@@ -22,6 +22,7 @@ from torchrl_nerd.evaluation.stability.case import (
 from torchrl_nerd.evaluation.stability.states import (
     clear_of_ground,
     mechanics,
+    robot_mass,
     sample_states,
 )
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
@@ -90,7 +91,7 @@ def free_fall(trial: Trial) -> Iterator[Metric]:
     """The centre of mass of a robot in the air follows a parabola."""
     found, time, gravity = _slow_flight(trial)
     model = trial.scene.model
-    velocity = found["momentum"][:, :1] / float(model.body_mass.sum())
+    velocity = found["momentum"][:, :1] / robot_mass(trial.scene)
     # semi-implicit Euler falls as if half a substep had passed more
     fall = 0.5 * gravity * time * (time + model.opt.timestep)
     miss = norm(found["com"] - found["com"][:, :1] - velocity * time - fall)
@@ -103,7 +104,7 @@ def free_fall(trial: Trial) -> Iterator[Metric]:
 def momentum(trial: Trial) -> Iterator[Metric]:
     """In the air momentum changes by gravity alone, however the joints move."""
     found, time, gravity = _slow_flight(trial)
-    mass = float(trial.scene.model.body_mass.sum())
+    mass = robot_mass(trial.scene)
     linear = found["momentum"] / mass - time * gravity
     angular = found["angular_momentum"] / (mass * trial.scene.model.stat.extent)
     for name, value in {
