@@ -572,6 +572,28 @@ def self_contact_table(folder: Path = RESULTS) -> str:
     return with_sources(table, [record])
 
 
+def symmetric_copies_tables(folder: Path = RESULTS) -> str:
+    """Errors and rate of networks averaged over symmetric copies, each robot's table."""
+    parts = []
+    for record in read("symmetric_copies", folder).values():
+        results = record["results"]
+        found = {(x["case"], x["name"], x["quantity"]): x for x in results["errors"]}
+        cases = dict.fromkeys(x["case"] for x in results["errors"])
+        quantities = dict.fromkeys(x["quantity"] for x in results["errors"])
+        columns = [(case, quantity) for case in cases for quantity in quantities]
+        units = {x["quantity"]: x["unit"] for x in results["errors"]}
+        shown = [f"{case}: {q.replace('_', ' ')}, {units[q]}" for case, q in columns]
+        table = [["model", *shown, "rate / MuJoCo's"]]
+        exact, *rates = results["rates"]
+        shares = {x["name"]: x["steps_per_s"] / exact["steps_per_s"] for x in rates}
+        for name in dict.fromkeys(x["name"] for x in results["errors"]):
+            means = (found.get((case, name, q), {}).get("mean") for case, q in columns)
+            share = f"{shares[name]:.2f}" if name in shares else "-"
+            table.append([name, *map(number, means), share])
+        parts.append(with_sources(table, [record]))
+    return "\n\n".join(parts)
+
+
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
     """Mean errors of the joints (rad) over 20 and 100 steps, the least of some rows."""
     places = [f"{case}, {steps} steps, rad" for steps in (20, 100)]
@@ -615,6 +637,7 @@ TABLES = {
     "returns": returns_table,
     "network_off": network_off_table,
     "self_contact": self_contact_table,
+    "symmetric_copies": symmetric_copies_tables,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -634,6 +657,8 @@ COMMANDS |= {
     "gallery": "make results",
 }
 COMMANDS |= {"self_contact": "python experiments/self_contact.py --json FILE"}
+COPIES = "python experiments/symmetric_copies.py ROBOT --json FILE"
+COMMANDS |= {"symmetric_copies": COPIES}
 COMMANDS |= {"returns": "nerd transfer TASK --json results/transfer_TASK.json"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 

@@ -104,9 +104,10 @@ def main(options: Options) -> None:
         how = case, source, is_driven, lambda scene: MujocoDynamics(scene, 1)
         each = evaluation_set(*how, options.num_trajectories, steps, options.seed)
         errors = measure([each], shown[1:])
-        rows += error_rows(scene, case, steps, errors, protocol.published)
-        for row in rows[-len(errors) * 3 - 3 :]:
-            print(f"{case} {row.name} {row.quantity}: {row.mean:.4f} {row.unit}")
+        found = error_rows(scene, case, steps, errors, protocol.published)
+        for row in found:
+            print(f"{case}, {row.name}, {row.quantity}: {row.mean:.4f} {row.unit}")
+        rows += found
     source = next(iter(protocol.cases.values()))
     rates = rate_rows(shown, source, options.batch, options.rounds, options.seed)
     for rate in rates:

@@ -517,3 +517,30 @@ def test_an_added_plane_is_level_ground_whatever_geoms_are_by_default(
     assert len(scene.contacts) == 1 and abs(data.qpos[2] - 0.1) < 0.01
     [plane] = np.flatnonzero(scene.model.geom_bodyid == 0)
     assert scene.model.geom_friction[plane].tolist() == [1.0, 0.005, 0.0001]
+
+
+BOX = '<body pos="{} 0 {}"><freejoint/><geom type="box" size=".05 .05 .05"/></body>'
+GROUNDS = {
+    "a thick floor": ('<geom type="box" size="9 9 .5" pos="0 0 -.5"/>', 0.0, 0.3),
+    "a platform elsewhere": ('<geom type="box" size="2 2 1" pos="20 0 0"/>', 20.0, 1.5),
+    "a table over a floor": (
+        '<geom type="plane" size="9 9 1"/>'
+        '<geom type="box" size="3 3 .1" pos="0 0 .9"/>',
+        *(0.0, 1.2),
+    ),
+}
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_a_free_robot_falls_on_the_ground_below_its_place(ground, generator, tmp_path):
+    text, x, z = GROUNDS[ground]
+    body = BOX.format(x, z)
+    (tmp_path / "box.xml").write_text(
+        f"<mujoco><worldbody>{text}{body}</worldbody></mujoco>"
+    )
+    scene = Scene.from_mjcf(tmp_path / "box.xml")
+    data = simulate(scene, 16, 100, generator)
+    end = data["next", "qpos"][is_sound(data)][:, -1]
+    top = {"a thick floor": 0.0}.get(ground, 1.0)
+    assert ((end[:, 2] > top) & (end[:, 2] < top + 0.1)).double().mean() > 0.9
+    assert ((end[:, 0] - x).abs() < 2.0).all()

@@ -155,7 +155,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
     except (ValueError, IndexError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"expected a CSV table in {path}: {said}") from None
-    names = set(table.dtype.names or ())
+    names: set[str] = set(table.dtype.names or ())
     columns = dict(FREE_BODY)
     for array in (QPOS, QVEL, TORQUE, CONTROL, TERRAIN):
         start = f"{array}_"

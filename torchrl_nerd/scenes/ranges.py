@@ -7,8 +7,9 @@ than a sixteenth, and all speeds are halved. A hinge's speed is what gravity and
 torque together reach over half its range, against its inertia and armature, less where its
 damper allows less. A slide's is that of a fall over twice its reach, or what its own force
 reaches. None crosses its range in less than `CROSSING`. All are halved until MuJoCo does
-not give up on them, see `_stable`. A floating base starts anywhere above the ground up to
-twice the robot's reach, turned any way; a prop starts near its place in the file.
+not give up on them, see `_stable`. A floating base starts at its place in the file,
+anywhere above the ground there up to twice the robot's reach, turned any way; a prop starts
+near its place in the file.
 """
 
 import copy
@@ -32,6 +33,7 @@ CROSSING = 0.1  # s
 MAX_GAIN = 4.0  # changes of speed in a control step over a joint's speed range
 PROP_ROOM = 0.1  # m: how far from its place a prop starts at least
 LEAST_REACH = 0.01  # m
+HIGHEST = 1e3  # m: ground above a robot is looked for from here
 START_PENETRATION = 1e-3  # m: about what a resting robot's soft contacts give
 LEAST_SPEED = 1.0  # m/s or rad/s: where nothing falls and nothing pushes
 MAX_HALVINGS, TRIALS, TRIAL_STEPS, MAX_LOST = 8, 64, 50, 0.02
@@ -193,16 +195,33 @@ def _reaches(model: mujoco.MjModel) -> np.ndarray:
     return reaches
 
 
-def _base_sampling(model: mujoco.MjModel, speed: list[float]) -> BaseSampling:
-    """Start of a floating base, whose joint is the model's first."""
-    data = mujoco.MjData(model)
+def _ground_below(model: mujoco.MjModel, place: tuple[float, float, float]) -> float:
+    """Height of the ground under a place, m; else of what is over it; else 0."""
+    data, down = mujoco.MjData(model), np.array((0.0, 0.0, -1.0))
     mujoco.mj_kinematics(model, data)
-    heights = [float(data.geom_xpos[geom, 2]) for geom in terrain_geoms(model)]
-    ground = min(heights, default=0.0)
+    for height in (place[2], HIGHEST):
+        start, found = np.array((*place[:2], height)), [np.inf]
+        for geom in terrain_geoms(model):
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_HFIELD:
+                away = mujoco.mj_rayHfield(model, data, geom, start, down)
+            else:
+                pose = data.geom_xpos[geom], data.geom_xmat[geom]
+                about = *pose, model.geom_size[geom], start, down, model.geom_type[geom]
+                away = mujoco.mju_rayGeom(*about)
+            found.append(away if away >= 0.0 else np.inf)
+        if np.isfinite(nearest := min(found)):
+            return height - float(nearest)
+    return 0.0
+
+
+def _base_sampling(model: mujoco.MjModel, speed: list[float]) -> BaseSampling:
+    """Start of a floating base, whose joint is the model's first, at its file's place."""
+    x, y, z = model.qpos0[:3].tolist()
+    ground = _ground_below(model, (x, y, z))
     linear, angular = (tuple(speed[a : a + 3]) for a in (0, 3))
     return BaseSampling(
-        low=(0.0, 0.0, ground),
-        high=(0.0, 0.0, ground + 2.0 * float(_reaches(model)[0])),
+        low=(x, y, ground),
+        high=(x, y, ground + 2.0 * float(_reaches(model)[0])),
         tilt=pi,
         linear_low=tuple(-v for v in linear),
         linear_high=linear,

@@ -7,7 +7,7 @@ for computing the sample variance", 1983), so that huge offsets cost no digits.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -132,9 +132,9 @@ class Normalize(StateTransform):
         for part in found.values():  # actions and states
             for key in (x for x in self.in_keys_inv if x in part.keys(True)):
                 if isinstance(part[key], Bounded):
-                    low, high = part[key].space.low, part[key].space.high
-                    part[key].space.low = self.normalize(key, low)
-                    part[key].space.high = self.normalize(key, high)
+                    space = cast(Any, part[key].space)
+                    space.low = self.normalize(key, space.low)
+                    space.high = self.normalize(key, space.high)
         return found
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
