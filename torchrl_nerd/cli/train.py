@@ -166,8 +166,9 @@ def _is_missing(folders: tuple[Path, ...], config: DataConfig) -> bool:
     if len(folders) != 1 or not (path := folders[0] / CARD).exists():
         return len(folders) == 1
     card = read_json(path)
-    drawn = card.get("trajectories", 0) + card.get("dropped", 0)
-    return card.get("config") == asdict(config) and drawn < config.trajectories
+    drawn = [card.get(key) for key in ("trajectories", "dropped")]
+    is_own = card.get("config") == asdict(config) and all(type(x) is int for x in drawn)
+    return is_own and sum(drawn) < config.trajectories
 
 
 def _errors(card: dict[str, Any]) -> str:

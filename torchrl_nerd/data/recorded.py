@@ -149,9 +149,7 @@ def complete(log: Recording, scene: Scene) -> Recording:
             mean = backward_differences(log, scene)[:, 2]
             half = 0.5 * log.frame * float(free_fall(log)[2])
             qvel[is_airborne, 2] += (mean + half - qvel[:, 2])[steady].median()
-            first = log.offsets[
-                :-1
-            ]  # whose estimate is the mean over the frame after it
+            first = log.offsets[:-1]  # estimated from the frame after it
             is_estimated = log.qvel[first, 2].isnan() & is_airborne[first]
             leads = first[is_estimated & is_airborne[first + 1]]
             qvel[leads, 2] = mean[leads] - half
