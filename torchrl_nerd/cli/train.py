@@ -166,9 +166,12 @@ def _is_missing(folders: tuple[Path, ...], config: DataConfig) -> bool:
     if len(folders) != 1 or not (path := folders[0] / CARD).exists():
         return len(folders) == 1
     card = read_json(path)
-    drawn = [card.get(key) for key in ("trajectories", "dropped")]
-    is_own = card.get("config") == asdict(config) and all(type(x) is int for x in drawn)
-    return is_own and sum(drawn) < config.trajectories
+    counts = (card.get(key) for key in ("trajectories", "dropped"))
+    drawn = [
+        count for count in counts if type(count) is int
+    ]  # else it is refused later
+    is_whole = len(drawn) < 2 or sum(drawn) >= config.trajectories
+    return card.get("config") == asdict(config) and not is_whole
 
 
 def _errors(card: dict[str, Any]) -> str:
