@@ -51,7 +51,7 @@ def made_by(record: dict[str, Any]) -> str:
     where = machine["processor"] if device == "cpu" else device
     return (
         f"`{record['command']}`, commit {record['commit'][:7]}, seed {record['seed']}, "
-        f"{where}, {machine['threads']} threads, MuJoCo {machine['mujoco']}."
+        f"{where}, {machine['threads']} thread{'s' * (machine['threads'] != 1)}, MuJoCo {machine['mujoco']}."
     )
 
 
