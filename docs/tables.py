@@ -49,9 +49,10 @@ def made_by(record: dict[str, Any]) -> str:
     machine = record["machine"]
     device = machine.get("device", "cpu")
     where = machine["processor"] if device == "cpu" else device
+    threads = f"{machine['threads']} thread{'s' * (machine['threads'] != 1)}"
     return (
         f"`{record['command']}`, commit {record['commit'][:7]}, seed {record['seed']}, "
-        f"{where}, {machine['threads']} thread{'s' * (machine['threads'] != 1)}, MuJoCo {machine['mujoco']}."
+        f"{where}, {threads}, MuJoCo {machine['mujoco']}."
     )
 
 
