@@ -18,6 +18,7 @@ class LSTMConfig:
     """Size of an LSTM of one layer."""
 
     width: int = 112
+    copies: int = 1  # of its input: itself
 
     def build(self, num_inputs: int, num_outputs: int) -> "LSTM":
         """A freshly initialised network."""
@@ -72,6 +73,7 @@ class MarkovConfig:
     layers: int = 2
     width: int = 64
     heads: int = 4
+    copies: int = 1  # of its input: itself
 
     def build(self, num_inputs: int, num_outputs: int) -> "Markov":
         """A freshly initialised network."""
