@@ -574,11 +574,23 @@ def self_contact_table(folder: Path = RESULTS) -> str:
 
 
 def symmetric_copies_tables(folder: Path = RESULTS) -> str:
-    """Errors and rate of networks averaged over symmetric copies, each robot's table."""
+    """Errors and rate of networks averaged over symmetric copies, each robot's table.
+
+    Beside them, where `nerd eval` had the same starts, its rivals.
+    """
     parts = []
-    for record in read("symmetric_copies", folder).values():
-        results = record["results"]
+    for robot, record in read("symmetric_copies", folder).items():
+        results, rivals = record["results"], read("eval", folder).get(robot)
+        records = [record]
+        names = list(dict.fromkeys(x["name"] for x in results["errors"]))
         found = {(x["case"], x["name"], x["quantity"]): x for x in results["errors"]}
+        if rivals is not None and same_starts(record, rivals):
+            records.append(rivals)
+            for x in rivals["results"]["errors"]:
+                is_rival = x["kind"] in ("baseline", "simulator", "analytic")
+                if is_rival and x["steps"] == results["steps"]:
+                    found[x["case"], x["name"], x["quantity"]] = x
+                    names += [] if x["name"] in names else [x["name"]]
         cases = dict.fromkeys(x["case"] for x in results["errors"])
         quantities = dict.fromkeys(x["quantity"] for x in results["errors"])
         columns = [(case, quantity) for case in cases for quantity in quantities]
@@ -587,12 +599,20 @@ def symmetric_copies_tables(folder: Path = RESULTS) -> str:
         table = [["model", *shown, "rate / MuJoCo's"]]
         exact, *rates = results["rates"]
         shares = {x["name"]: x["steps_per_s"] / exact["steps_per_s"] for x in rates}
-        for name in dict.fromkeys(x["name"] for x in results["errors"]):
-            means = (found.get((case, name, q), {}).get("mean") for case, q in columns)
+        for name in names:
+            known = [found.get((case, name, q)) for case, q in columns]
+            # None: the rollout diverges
+            means = [x and (inf if x["mean"] is None else x["mean"]) for x in known]
             share = f"{shares[name]:.2f}" if name in shares else "-"
             table.append([name, *map(number, means), share])
-        parts.append(with_sources(table, [record]))
+        parts.append(with_sources(table, records))
     return "\n\n".join(parts)
+
+
+def same_starts(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two records begin with the same initial states, as many of them."""
+    counts = (record["results"]["num_trajectories"] for record in (one, other))
+    return one["seed"] == other["seed"] and len(set(counts)) == 1
 
 
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:

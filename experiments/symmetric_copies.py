@@ -8,7 +8,6 @@ thread. `--export FOLDER --model ant-mlp --copies 4` writes one of the models to
 which `dynamics=` and every command take.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
@@ -24,7 +23,7 @@ from torchrl_nerd.checkpoint import (
     shipped_card,
     shipped_models,
 )
-from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.bench.candidates import Candidate, mujoco_name
 from torchrl_nerd.evaluation.bench.errors import (
     cases_of,
@@ -64,9 +63,9 @@ class Options:
     """Write the results to this file."""
 
 
-def dynamics_of(model: NeRD) -> Callable[[Scene], Dynamics]:
-    """The model's, for its scene."""
-    return lambda scene: NeRDDynamics(model)
+def candidate(name: str, model: NeRD) -> Candidate:
+    """A model in its own scene."""
+    return Candidate(name, "learned", lambda scene: NeRDDynamics(model))
 
 
 def candidates(options: Options, scene: Scene) -> list[Candidate]:
@@ -77,8 +76,7 @@ def candidates(options: Options, scene: Scene) -> list[Candidate]:
         model = cast(NeRD, from_pretrained(name, scene))
         for count in options.copies:
             label = f"{name}, {count} cop{'y' if count == 1 else 'ies'}"
-            averaged = with_copies(model, count).eval()
-            found.append(Candidate(label, "learned", dynamics_of(averaged)))
+            found.append(candidate(label, with_copies(model, count).eval()))
     return found
 
 

@@ -166,11 +166,9 @@ def _is_missing(folders: tuple[Path, ...], config: DataConfig) -> bool:
     if len(folders) != 1 or not (path := folders[0] / CARD).exists():
         return len(folders) == 1
     card = read_json(path)
-    counts = (card.get(key) for key in ("trajectories", "dropped"))
-    drawn = [
-        count for count in counts if type(count) is int
-    ]  # else it is refused later
-    is_whole = len(drawn) < 2 or sum(drawn) >= config.trajectories
+    drawn = [card.get(key) for key in ("trajectories", "dropped")]
+    counts = [count for count in drawn if type(count) is int]  # odd ones: refused later
+    is_whole = counts != drawn or sum(counts) >= config.trajectories
     return card.get("config") == asdict(config) and not is_whole
 
 

@@ -39,10 +39,7 @@ def make_model(
     network, features = network_config(config.network), config.features
     network = replace(network, copies=config.copies)
     if config.step is None:
-        model = NeRD(scene, features, network, stats)
-        if symmetry is not None and isinstance(model.network, EquivariantNetwork):
-            model.network.set_copies(*symmetry.group(config.copies))
-        return model
+        return _with_group(NeRD(scene, features, network, stats), symmetry)
     step = make_step(scene, look_up("analytic step", config.step, STEPS))
     return HybridNeRD(scene, step, features, network, stats)
 
@@ -108,10 +105,15 @@ def with_copies(model: NeRD, count: int) -> NeRD:
     _single(twin.network).load_state_dict(_single(model.network).state_dict())
     for name in ("normalize", "training_range", "ood", "sleep"):
         getattr(twin, name).load_state_dict(getattr(model, name).state_dict())
-    if isinstance(twin.network, EquivariantNetwork):
-        twin.network.set_copies(*symmetry.group(count))
     twin.reference_ratio = model.reference_ratio
-    return twin.to(model.device).train(model.training)
+    return _with_group(twin, symmetry).to(model.device).train(model.training)
+
+
+def _with_group(model: NeRD, symmetry: Symmetry | None) -> NeRD:
+    """The model, whose network knows its symmetric copies; see `Symmetry.group`."""
+    if symmetry is not None and isinstance(model.network, EquivariantNetwork):
+        model.network.set_copies(*symmetry.group(model.network.copies))
+    return model
 
 
 def _expect_shared(symmetry: Symmetry, model: NeRD) -> None:
