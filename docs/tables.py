@@ -573,46 +573,31 @@ def self_contact_table(folder: Path = RESULTS) -> str:
     return with_sources(table, [record])
 
 
-def symmetric_copies_tables(folder: Path = RESULTS) -> str:
-    """Errors and rate of networks averaged over symmetric copies, each robot's table.
-
-    Beside them, where `nerd eval` had the same starts, its rivals.
-    """
-    parts = []
-    for robot, record in read("symmetric_copies", folder).items():
-        results, rivals = record["results"], read("eval", folder).get(robot)
-        records = [record]
-        names = list(dict.fromkeys(x["name"] for x in results["errors"]))
-        found = {(x["case"], x["name"], x["quantity"]): x for x in results["errors"]}
-        if rivals is not None and same_starts(record, rivals):
-            records.append(rivals)
-            for x in rivals["results"]["errors"]:
-                is_rival = x["kind"] in ("baseline", "simulator", "analytic")
-                if is_rival and x["steps"] == results["steps"]:
-                    found[x["case"], x["name"], x["quantity"]] = x
-                    names += [] if x["name"] in names else [x["name"]]
-        cases = dict.fromkeys(x["case"] for x in results["errors"])
-        quantities = dict.fromkeys(x["quantity"] for x in results["errors"])
-        columns = [(case, quantity) for case in cases for quantity in quantities]
-        units = {x["quantity"]: x["unit"] for x in results["errors"]}
-        shown = [f"{case}: {q.replace('_', ' ')}, {units[q]}" for case, q in columns]
-        table = [["model", *shown, "rate / MuJoCo's"]]
-        exact, *rates = results["rates"]
-        shares = {x["name"]: x["steps_per_s"] / exact["steps_per_s"] for x in rates}
-        for name in names:
-            known = [found.get((case, name, q)) for case, q in columns]
-            # None: the rollout diverges
-            means = [x and (inf if x["mean"] is None else x["mean"]) for x in known]
-            share = f"{shares[name]:.2f}" if name in shares else "-"
-            table.append([name, *map(number, means), share])
-        parts.append(with_sources(table, records))
-    return "\n\n".join(parts)
+def symmetric_layers_table(folder: Path = RESULTS) -> str:
+    """Errors of networks with and without built-in mirrors, means over seeds."""
+    record = one("symmetric_layers", folder)
+    if record is None:
+        return ""
+    names: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for row in record["results"]["rows"]:
+        names.setdefault((row["network"], row["symmetries"]), []).append(row)
+    quantities = ("base_position", "base_orientation", "joints")
+    table = [["network", "symmetries", "weights", "time of an update", *HEADS_500]]
+    first = None
+    for (network, symmetries), alike in names.items():
+        means = {
+            key: sum(row[key] for row in alike) / len(alike)
+            for key in ("seconds_per_update", *(f"{q}_500" for q in quantities))
+        }
+        first = first or means["seconds_per_update"]
+        share = f"{means['seconds_per_update'] / first:.2f}"
+        errors = [number(means[f"{q}_500"]) for q in quantities]
+        count = f"{alike[0]['weights']:,}"
+        table.append([f"`{network}`", str(symmetries), count, share, *errors])
+    return with_sources(table, [record])
 
 
-def same_starts(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether two records begin with the same initial states, as many of them."""
-    counts = (record["results"]["num_trajectories"] for record in (one, other))
-    return one["seed"] == other["seed"] and len(set(counts)) == 1
+HEADS_500 = ("position, m", "orientation, rad", "joints, rad")
 
 
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
@@ -658,7 +643,7 @@ TABLES = {
     "returns": returns_table,
     "network_off": network_off_table,
     "self_contact": self_contact_table,
-    "symmetric_copies": symmetric_copies_tables,
+    "symmetric_layers": symmetric_layers_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
@@ -678,8 +663,8 @@ COMMANDS |= {
     "gallery": "make results",
 }
 COMMANDS |= {"self_contact": "python experiments/self_contact.py --json FILE"}
-COPIES = "python experiments/symmetric_copies.py ROBOT --json FILE"
-COMMANDS |= {"symmetric_copies": COPIES}
+LAYERS = "python experiments/symmetric_layers.py --json FILE"
+COMMANDS |= {"symmetric_layers": LAYERS}
 COMMANDS |= {"returns": "nerd transfer TASK --json results/transfer_TASK.json"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 

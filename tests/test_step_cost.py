@@ -10,7 +10,7 @@ from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import GuardedDynamics, MujocoDynamics, NeRDDynamics
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS, GRUConfig, MLPConfig
-from torchrl_nerd.modules.transformer import HEAD_WIDTH
+from torchrl_nerd.modules.symmetric import HEAD_WIDTH
 from torchrl_nerd.robots import load_scene
 
 FREE = ("cartpole", "franka_gravity")  # no contact: the network's products alone

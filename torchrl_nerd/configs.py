@@ -8,7 +8,7 @@ from torchrl_nerd.settings import SettingError, expect_at_least
 
 COUNTS = (
     *("batch_size", "sequence_length", "rollout_batch_size", "rollout_length"),
-    *("save_every", "validate_every", "rollout_restarts", "copies"),
+    *("save_every", "validate_every", "rollout_restarts", "symmetries"),
 )
 
 Update = Literal["physics", "all", "head"]
@@ -105,8 +105,8 @@ class TrainConfig:
     # share of updates on as many single states in place of sequences
     single_step_fraction: float = 0.75
     use_symmetry: bool = False  # augment data by the robot's symmetries
-    # symmetric copies of its input that the network's output is averaged over
-    copies: int = 1
+    # mirrors of the robot and their products that the network itself has: 2, 4 or 8
+    symmetries: int = 1
     rollout_batch_size: int = 128  # rollouts per update
     rollout_length: int = 8  # control steps of a rollout
     rollout_history: int = 0  # recorded steps that the model sees before it
@@ -132,8 +132,10 @@ class TrainConfig:
             raise SettingError(
                 "expected training without use_symmetry for a hybrid, got it with one"
             )
-        if self.copies > 1 and self.step is not None:
-            raise SettingError(f"expected one copy for a hybrid, got {self.copies}")
+        if self.symmetries > 1 and self.step is not None:
+            raise SettingError(
+                f"expected 1 of symmetries for a hybrid, got {self.symmetries}"
+            )
 
     @property
     def features(self) -> FeatureConfig:

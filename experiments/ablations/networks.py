@@ -18,7 +18,6 @@ class LSTMConfig:
     """Size of an LSTM of one layer."""
 
     width: int = 112
-    copies: int = 1  # of its input: itself
 
     def build(self, num_inputs: int, num_outputs: int) -> "LSTM":
         """A freshly initialised network."""
@@ -73,7 +72,6 @@ class MarkovConfig:
     layers: int = 2
     width: int = 64
     heads: int = 4
-    copies: int = 1  # of its input: itself
 
     def build(self, num_inputs: int, num_outputs: int) -> "Markov":
         """A freshly initialised network."""

@@ -5,12 +5,9 @@ import torch
 from dynamics_helpers import enliven
 from torch import Generator, Tensor, nn
 
+from torchrl_nerd.modules.linear import FullLinear
 from torchrl_nerd.modules.networks import TRANSFORMERS, network_config
-from torchrl_nerd.modules.transformer import (
-    CausalTransformer,
-    FullLinear,
-    TransformerConfig,
-)
+from torchrl_nerd.modules.transformer import CausalTransformer, TransformerConfig
 
 INPUTS, OUTPUTS = 5, 3
 CONFIGS = {
@@ -19,6 +16,7 @@ CONFIGS = {
     "narrow band": TransformerConfig(layers=1, width=8, heads=1, band=2),
     "pairs": TransformerConfig(layers=2, width=16, heads=2, band=4, pairs=True),
     "deep": TransformerConfig(layers=3, width=24, heads=3, band=4),
+    "symmetric": TransformerConfig(2, 16, 2, band=4, pairs=True, symmetries=4),
 }
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 each_precision = pytest.mark.parametrize(

@@ -18,9 +18,13 @@ class FullLinear(nn.Linear):
         """``(*batch, in) -> (*batch, out)``, in the precision of the weights."""
         input, device = input.to(self.weight.dtype), input.device.type
         if not torch.is_autocast_enabled(device):
-            return super().forward(input)
+            return self.multiply(input)
         with torch.autocast(device, enabled=False):
-            return super().forward(input)
+            return self.multiply(input)
+
+    def multiply(self, x: Tensor) -> Tensor:
+        """What the layer does, once precisions are settled."""
+        return super().forward(x)
 
     def _apply(
         self, fn: Callable[[Tensor], Tensor], recurse: bool = True
@@ -40,8 +44,12 @@ class InnerLinear(nn.Linear):
         """``(*batch, in) -> (*batch, out)``, in autocast's precision or the input's."""
         is_cast = torch.is_autocast_enabled(input.device.type)
         if is_cast or self.weight.dtype != torch.bfloat16:
-            return super().forward(input)
-        return super().forward(input.bfloat16()).to(input.dtype)
+            return self.multiply(input)
+        return self.multiply(input.bfloat16()).to(input.dtype)
+
+    def multiply(self, x: Tensor) -> Tensor:
+        """What the layer does, once precisions are settled."""
+        return super().forward(x)
 
 
 def has_bfloat16(device: torch.device) -> bool:

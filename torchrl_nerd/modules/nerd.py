@@ -19,7 +19,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import FeatureConfig
-from torchrl_nerd.modules.equivariant import EquivariantNetwork
 from torchrl_nerd.modules.history import History
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
@@ -92,10 +91,7 @@ class NeRD(nn.Module):
         self.normalize = Normalize(stats or unit)
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
-        sizes = self.token_size, num_outputs
-        self.network = network.build(*sizes)
-        if network.copies > 1:
-            self.network = EquivariantNetwork(self.network, network.copies, *sizes)
+        self.network = network.build(self.token_size, num_outputs)
 
     @property
     def token_size(self) -> int:

@@ -9,12 +9,8 @@ from torch import Tensor, nn
 
 from torchrl_nerd.modules.history import History, stored
 from torchrl_nerd.modules.linear import FullLinear
-from torchrl_nerd.modules.transformer import (
-    FeedForward,
-    TransformerConfig,
-    initialize,
-    make_head,
-)
+from torchrl_nerd.modules.symmetric import make_embedding, make_head
+from torchrl_nerd.modules.transformer import FeedForward, TransformerConfig, initialize
 from torchrl_nerd.settings import SettingError, look_up
 
 
@@ -24,7 +20,7 @@ class MLPConfig:
 
     depth: int = 4
     width: int = 64
-    copies: int = 1  # symmetric ones that the output is averaged over
+    symmetries: int = 1  # mirrors of the robot and their products; see `symmetric`
 
     def build(self, num_inputs: int, num_outputs: int) -> "MLP":
         """A freshly initialised network."""
@@ -41,16 +37,15 @@ class MLP(nn.Module):
     def __init__(self, config: MLPConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
         self.config = config
-        self.embed = FullLinear(num_inputs, config.width)
-        self.blocks = nn.ModuleList(
-            FeedForward(config.width) for _ in range(config.depth)
-        )
-        self.head = make_head(config.width, num_outputs)
+        sizes = config.width, config.symmetries
+        self.embed = make_embedding(num_inputs, *sizes)
+        self.blocks = nn.ModuleList(FeedForward(*sizes) for _ in range(config.depth))
+        self.head = make_head(config.width, num_outputs, config.symmetries)
         initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """``(*batch, F) -> (*batch, D)``."""
-        x = self.embed(tokens)  # (*batch, width)
+        x = self.embed(tokens)  # (*batch, *hidden)
         for block in self.blocks:
             x = block(x)
         return self.head(x)
@@ -70,7 +65,6 @@ class GRUConfig:
 
     layers: int = 1
     width: int = 128
-    copies: int = 1  # symmetric ones that the output is averaged over
 
     def build(self, num_inputs: int, num_outputs: int) -> "GRU":
         """A freshly initialised network."""

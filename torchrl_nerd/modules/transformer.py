@@ -16,13 +16,17 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from torchrl_nerd.modules.history import History, replaced, stored
-from torchrl_nerd.modules.linear import FullLinear, InnerLinear
+from torchrl_nerd.modules.symmetric import (
+    hidden_shape,
+    make_activation,
+    make_embedding,
+    make_head,
+    make_inner,
+)
 
 MASKED = float("-inf")
-HEAD_WIDTH = 64  # paper, appendix A
 # Widest band whose step is made of sums of products: a product of matrices of one row is
 # slower there, GPUs included. With a band of 64 it saves a third of an env's step.
 NARROW = 16
@@ -37,7 +41,7 @@ class TransformerConfig:
     heads: int = 4  # divides width
     band: int = 10  # tokens each layer sees, the current one included (paper: h = 10)
     pairs: bool = False  # embed a token together with the one before it
-    copies: int = 1  # symmetric ones that the output is averaged over
+    symmetries: int = 1  # mirrors of the robot and their products; see `symmetric`
 
     def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
         """A freshly initialised network."""
@@ -58,7 +62,7 @@ class KeyValueCache(History):
     # (1,): where the oldest token lies, which the next one overwrites; a tensor, so that
     # compiled code is the same for all of them
     slot: Tensor
-    last: Tensor  # (rows, width)
+    last: Tensor  # (rows, *hidden)
 
     def clear(self, rows: Tensor) -> None:
         """See `History.clear`."""
@@ -128,29 +132,31 @@ class Attention(nn.Module):
         super().__init__()
         self.heads, self.band = config.heads, config.band
         self.scale = (config.width // config.heads) ** -0.5
-        self.project = InnerLinear(config.width, 3 * config.width, bias=False)
-        self.output = InnerLinear(config.width, config.width, bias=False)
+        self.project = make_inner(config.width, 3 * config.width, config.symmetries)
+        self.output = make_inner(config.width, config.width, config.symmetries)
         self.offset_bias = nn.Parameter(torch.zeros(config.heads, config.band))
 
-    def _split(self, x: Tensor) -> tuple[Tensor, ...]:
-        # query, key and value, (*, heads, head width) each
-        return self.project(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
+    def _split(self, x: Tensor, *batch: int) -> tuple[Tensor, ...]:
+        # query, key and value, (*batch, heads, head width) each
+        parts = self.project(x).unflatten(-1, (3, -1)).unbind(-2)
+        return tuple(part.reshape(*batch, self.heads, -1) for part in parts)
 
     def forward(self, x: Tensor) -> Tensor:
-        """All tokens at once, ``(rows, T, width)``."""
+        """All tokens at once, ``(rows, T, *hidden)``."""
         # (rows, heads, T, head width) each
-        query, key, value = (part.transpose(1, 2) for part in self._split(x))
+        parts = self._split(x, *x.shape[:2])
+        query, key, value = (part.transpose(1, 2) for part in parts)
         steps = torch.arange(x.shape[1], device=x.device)
         offset = steps[:, None] - steps[None, :]  # (T, T): how long ago
         is_seen = (offset >= 0) & (offset < self.band)
         bias = self.offset_bias[:, offset.clamp(0, self.band - 1)]  # (heads, T, T)
         scores = query @ key.mT * self.scale + bias
         weights = scores.masked_fill(~is_seen, MASKED).softmax(-1)
-        return self.output((weights @ value).transpose(1, 2).flatten(2))
+        return self.output((weights @ value).transpose(1, 2).reshape(x.shape))
 
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
-        """One token per env, ``(rows, width)``, against itself and the cached ones."""
-        query, key, value = self._split(x)
+        """One token per env, ``(rows, *hidden)``, against itself and the cached ones."""
+        query, key, value = self._split(x, len(x))
         # written before it is read: compiled code then copies no ring
         offset = cache.write(layer, key, value)
         is_seen = offset <= cache.age[:, None]  # (rows, band)
@@ -167,7 +173,7 @@ class Attention(nn.Module):
             mixed = (weights[..., None] * values).sum(-2)
         else:
             mixed = (weights[:, :, None] @ values)[:, :, 0]
-        return self.output(mixed.flatten(1))  # (rows, heads * head width)
+        return self.output(mixed.reshape(x.shape))  # from (rows, heads, head width)
 
 
 class FeedForward(nn.Module):
@@ -177,45 +183,40 @@ class FeedForward(nn.Module):
     takes it away (a third to a half of the rollout error, see experiments/first_edition).
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, symmetries: int = 1) -> None:
         super().__init__()
-        self.expand = InnerLinear(width, 4 * width, bias=False)
-        self.contract = InnerLinear(4 * width, width, bias=False)
+        self.expand = make_inner(width, 4 * width, symmetries)
+        self.activation = make_activation(nn.GELU(), symmetries)
+        self.contract = make_inner(4 * width, width, symmetries)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(*batch, width)``."""
-        return x + self.contract(F.gelu(self.expand(x)))
+        """``(*batch, *hidden)``."""
+        return x + self.contract(self.activation(self.expand(x)))
 
 
 class Block(FeedForward):
     """Attention, added to its input, before the MLP."""
 
     def __init__(self, config: TransformerConfig) -> None:
-        super().__init__(config.width)
+        super().__init__(config.width, config.symmetries)
         self.attention = Attention(config)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(rows, T, width)``."""
+        """``(rows, T, *hidden)``."""
         return super().forward(x + self.attention(x))
 
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
-        """``(rows, width)``."""
+        """``(rows, *hidden)``."""
         return super().forward(x + self.attention.step(x, cache, layer))
-
-
-def make_head(width: int, num_outputs: int) -> nn.Sequential:
-    """From a block's width to predictions; SiLU for the paper's ReLU: half the error."""
-    first, last = FullLinear(width, HEAD_WIDTH), FullLinear(HEAD_WIDTH, num_outputs)
-    return nn.Sequential(first, nn.SiLU(), last)
 
 
 def initialize(blocks: nn.ModuleList) -> None:
     """Keep sizes through every layer; residual branches share the variance."""
     for name, weight in blocks.named_parameters():
-        if weight.ndim == 2 and "offset_bias" not in name:
+        if weight.ndim >= 2 and "offset_bias" not in name:
             is_residual = name.endswith(("output.weight", "contract.weight"))
             depth = (2 * len(blocks)) ** -0.5 if is_residual else 1.0
-            nn.init.normal_(weight, std=depth * weight.shape[1] ** -0.5)
+            nn.init.normal_(weight, std=depth * weight.shape[-1] ** -0.5)
 
 
 class CausalTransformer(nn.Module):
@@ -237,19 +238,21 @@ class CausalTransformer(nn.Module):
                 f"expected heads to divide width {config.width}, got {config.heads}"
             )
         self.config = config
-        self.embed = FullLinear(num_inputs, config.width)
+        sizes = config.width, config.symmetries
+        self.embed = make_embedding(num_inputs, *sizes)
         self.embed_last = None
         if config.pairs:
-            self.embed_last = FullLinear(num_inputs, config.width, bias=False)
+            self.embed_last = make_embedding(num_inputs, *sizes, bias=False)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
-        self.head = make_head(config.width, num_outputs)
+        self.head = make_head(config.width, num_outputs, config.symmetries)
         initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
         x = self.embed(tokens)
         if self.embed_last is not None:
-            x = x + F.pad(self.embed_last(tokens[:, :-1]), (0, 0, 1, 0))
+            earlier = self.embed_last(tokens[:, :-1])  # (rows, T - 1, *hidden)
+            x = torch.cat((x[:, :1], x[:, 1:] + earlier), 1)
         for block in self.blocks:
             x = block(x)
         return self.head(x)
@@ -261,7 +264,8 @@ class CausalTransformer(nn.Module):
         keys = [weight.new_zeros(shape) for _ in range(c.layers)]
         values = [torch.zeros_like(key) for key in keys]
         age = torch.zeros(rows, dtype=torch.long, device=weight.device)
-        last = weight.new_zeros(rows, c.width if c.pairs else 0)
+        hidden = hidden_shape(c.width, c.symmetries) if c.pairs else (0,)
+        last = weight.new_zeros(rows, *hidden)
         return KeyValueCache(keys, values, age, age.new_zeros(1), last)
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:

@@ -22,7 +22,7 @@ class Muon(Optimizer):
     """Steps of a matrix of size ``lr * sqrt(max(1, rows / columns))``, without decay.
 
     Args:
-        params: matrices ``(rows, columns)``.
+        params: matrices ``(*blocks, rows, columns)``, every block a matrix of its own.
         lr: step size.
         momentum: Nesterov's.
     """
@@ -45,13 +45,19 @@ class Muon(Optimizer):
                     state["momentum_buffer"] = torch.zeros_like(weight)
                 mean = state["momentum_buffer"].lerp_(weight.grad, 1.0 - momentum)
                 update = weight.grad.lerp(mean, momentum)
-                by_shape.setdefault(weight.shape, []).append((weight, update))
+                blocks = zip(_blocks(weight), _blocks(update), strict=True)
+                by_shape.setdefault(weight.shape[-2:], []).extend(blocks)
             for (rows, columns), pairs in by_shape.items():
                 weights, updates = zip(*pairs, strict=True)
                 size = group["lr"] * sqrt(max(1.0, rows / columns))
                 directions = orthogonalize(torch.stack(updates))
                 for weight, direction in zip(weights, directions, strict=True):
                     weight.add_(direction, alpha=-size)
+
+
+def _blocks(weight: Tensor) -> tuple[Tensor, ...]:
+    """Its matrices ``(rows, columns)``, views."""
+    return weight.reshape(-1, *weight.shape[-2:]).unbind(0)
 
 
 def orthogonalize(matrices: Tensor) -> Tensor:

@@ -15,10 +15,10 @@ STATE = "state.safetensors"
 
 
 def split_parameters(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
-    """Weights ``(out, in)`` of linear layers, for Muon, and all other weights."""
+    """Matrices ``(*blocks, out, in)`` of linear layers, for Muon, and other weights."""
     matrices, others = [], []
     for name, weight in network.named_parameters():
-        is_matrix = weight.ndim == 2 and "offset_bias" not in name
+        is_matrix = weight.ndim >= 2 and "offset_bias" not in name
         (matrices if is_matrix else others).append(weight)
     return matrices, others
 

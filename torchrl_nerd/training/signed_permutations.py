@@ -1,7 +1,7 @@
 """Signed permutations: what a symmetry of a robot makes of a vector's entries."""
 
 from collections.abc import Sequence
-from itertools import product
+from itertools import combinations
 
 import torch
 from torch import Tensor, nn
@@ -50,11 +50,12 @@ class SignedPermutations(nn.Module):
         apart = torch.maximum((means - mean).abs(), (stds - std).abs())
         return bool((apart < STATS_TOL * std).all())
 
-    def subgroups(self) -> dict[int, list[int]]:
-        """Subgroups of at most two generators, by size: the first one of each.
+    def mirrors(self, count: int) -> list[int] | None:
+        """Numbers of ``count = 2^n`` isometries, products of n that commute; None if fewer.
 
-        The isometries are a group, the identity first, and no entries are alike, so that
-        each of them is another permutation.
+        Each undoes itself: mirrors, and half turns. Number k is the product of the
+        generators whose bits are set in k. The isometries are a group, the identity first,
+        and no entries are alike, so that each of them is another permutation.
         """
         rows = zip(self.sources.tolist(), self.signs.tolist(), strict=True)
         known = [tuple(zip(*row, strict=True)) for row in rows]
@@ -66,14 +67,16 @@ class SignedPermutations(nn.Module):
             twice = ((entries[j][0], sign * entries[j][1]) for j, sign in known[second])
             return place[tuple(twice)]
 
-        found: dict[int, list[int]] = {}
-        for generators in product(range(len(known)), repeat=2):
-            members, new = {0}, {0}
-            while new:
-                new = {after(g, x) for g in generators for x in new} - members
-                members |= new
-            found.setdefault(len(members), sorted(members))
-        return found
+        own_inverse = [k for k in range(1, len(known)) if after(k, k) == 0]
+        for generators in combinations(own_inverse, count.bit_length() - 1):
+            pairs = combinations(generators, 2)
+            if all(after(a, b) == after(b, a) for a, b in pairs):
+                members = [0]
+                for generator in generators:
+                    members += [after(generator, member) for member in members]
+                if len(set(members)) == count:
+                    return members
+        return None
 
 
 def _match(original: Tensor, copy: Tensor) -> tuple[list[int], list[float]]:

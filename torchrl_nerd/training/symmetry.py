@@ -24,6 +24,7 @@ from torchrl_nerd.geometry.manifold import FREE, SLIDE
 from torchrl_nerd.geometry.rotations import quat_multiply
 from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, SceneFeatures
+from torchrl_nerd.modules.symmetric import SignedCopies
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_commands
 from torchrl_nerd.settings import SettingError
@@ -225,21 +226,20 @@ class Symmetry(nn.Module):
         both = (TOKEN, self.tokens), (TARGET, self.targets)
         return {key: copies.complete(stats[key]) for key, copies in both}
 
-    def group(self, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Sources and signs of tokens and targets for a subgroup of so many copies.
+    def mirrors(self, count: int) -> tuple[SignedCopies, SignedCopies]:
+        """What ``count`` products of commuting mirrors make of tokens and targets.
 
         Raises:
-            SettingError: the robot has none of that size.
+            SettingError: the robot has fewer.
         """
-        subgroups = self.targets.subgroups()
-        if count not in subgroups:
+        some = self.targets.mirrors(count)
+        if some is None:
+            sizes = (2**n for n in range(7) if self.targets.mirrors(2**n) is not None)
             raise SettingError(
-                f"expected copies of {', '.join(map(str, sorted(subgroups)))}, the sizes "
-                f"of groups of this robot's symmetries, got {count}"
+                f"expected symmetries of {', '.join(map(str, sizes))}, which this robot's "
+                f"commuting mirrors make, got {count}"
             )
-        some = subgroups[count]
-        tokens, targets = self.tokens, self.targets
-        both = ((x.sources[some], x.signs[some]) for x in (tokens, targets))
+        both = ((x.sources[some], x.signs[some]) for x in (self.tokens, self.targets))
         return next(both), next(both)
 
     def keeps(self, normalize: Normalize) -> bool:

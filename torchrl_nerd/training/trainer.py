@@ -238,7 +238,7 @@ class Trainer:
     def averaged_model(self) -> NeRD:
         """A copy of the model with the averaged weights and its sleep threshold."""
         model = copy.deepcopy(self.model)
-        model.network.load_state_dict(self.average, strict=False)  # copies stay
+        model.network.load_state_dict(self.average, strict=False)  # mirrors stay
         find_rest(model.eval(), self.resting)
         return model
 
