@@ -71,6 +71,7 @@ class Config:
     batch: int = 512  # transitions of an update
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     network: str = "mlp-4x64"
+    symmetries: int = 1  # of the robot, built into the network: 4 of Ant-v5
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
     num_envs: int = 512
@@ -182,6 +183,8 @@ def train_model(
     updates = cfg.last_updates if number == cfg.rounds else cfg.more_updates
     how = TrainConfig(
         network=cfg.network,
+        symmetries=cfg.symmetries,
+        use_symmetry=cfg.symmetries > 1,
         steps=cfg.updates if start is None else updates,
         rollout_steps=0,
         batch_size=cfg.batch,
