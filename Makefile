@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: data-ant help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -96,9 +96,6 @@ results: $(STAMP) ## errors and rates of every dynamics of every robot, to resul
 # Models that take more than `nerd train SCENE`.
 PRETRAINED := torchrl_nerd/pretrained
 
-ANT_TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85 --rollout-restarts 1 \
-	--save-every 500 --threads 1
-
 ADAPTIVE := --vary preset --network adaptive-4x64 --single-step-fraction 0 \
 	--rollout-history 20 --threads 1
 SHORT = --data datasets/$*_varied --sequence-length 64 --batch-size 32
@@ -151,16 +148,23 @@ model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequen
 	$(call LEARN_ROLLOUTS,cartpole,1000,250)
 	$(call SHIP_ADAPTIVE,cartpole)
 
-model-ant: $(STAMP) ## the Ant's transformer: two stages, the second with data along a policy
-	$(NERD) data ant --trajectories 30000 --out datasets/ant
-	$(NERD) train ant --data datasets/ant $(ANT_TRANSFORMER) --steps 24000 --rollout-steps 2000 \
-		--bf16-fraction 0.9 --validate-every 4000 --out runs/ant_transformer
-	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 8000 --seed 11 \
+ANT := --data datasets/ant datasets/ant_run --symmetries 4 --rollout-lr-ratio 0.25 \
+	--validate-every 4000 --save-every 500 --threads 1
+
+data-ant: $(STAMP)
+	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
+	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 3000 --seed 31 \
 		--out datasets/ant_run
-	$(NERD) train ant --init-from runs/ant_transformer/best --data datasets/ant datasets/ant_run \
-		$(ANT_TRANSFORMER) --steps 12000 --rollout-steps 4000 --rollout-lr-ratio 0.25 \
-		--bf16-fraction 0.8 --lr 0.005 --adamw-lr 0.0015 --validate-every 2000 --out runs/ant_on
-	cp runs/ant_on/best/* $(PRETRAINED)/ant/
+
+model-ant: data-ant ## the Ant's transformer, with the mirrors of the Ant built in
+	$(NERD) train ant $(ANT) --network transformer-4x128 --single-step-fraction 0.85 \
+		--steps 15000 --rollout-steps 3000 --out runs/ant_transformer
+	cp runs/ant_transformer/best/* $(PRETRAINED)/ant/
+
+model-ant-mlp: data-ant ## the Ant's MLP, with the same mirrors
+	$(NERD) train ant $(ANT) --network mlp-4x160 --single-step-fraction 1 \
+		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp
+	cp runs/ant_mlp/best/* $(PRETRAINED)/ant-mlp/
 
 # Transformers that learned single steps on a GPU, in minutes: make model-franka DEVICE=cuda.
 # On two cores the same takes a day. The second stage is short and runs anywhere.
@@ -209,20 +213,6 @@ model-double_pendulum: $(STAMP) ## the double pendulum's transformer: single ste
 		--data datasets/pendulum_on --lr 0.004 --adamw-lr 0.0012 --steps 0 \
 		--rollout-steps 2000 --rollout-lr-ratio 0.06 --validate-every 500 --out runs/pendulum_on
 	cp runs/pendulum_on/best/* $(PRETRAINED)/double_pendulum/
-
-model-ant-mlp: $(STAMP) ## the Ant's learned model: two stages, the second with data along a policy
-	$(NERD) data ant --trajectories 50000 --out datasets/ant_mlp
-	$(NERD) train ant --data datasets/ant_mlp --network mlp-4x160 --single-step-fraction 1 \
-		--steps 46000 --rollout-steps 6000 --rollout-restarts 2 --bf16-fraction 0.85 \
-		--validate-every 5000 --out runs/ant_mlp
-	$(PY) examples/ppo.py --task ant/run --dynamics runs/ant_mlp/best --out runs/ppo_ant \
-		--horizon 16 --minibatch 8192 --lr 1e-3 --total-frames 8000000 --episodes 512
-	$(NERD) data ant --policy runs/ppo_ant --trajectories 12000 --out datasets/ant_policy
-	$(NERD) train ant --init-from runs/ant_mlp/best --data datasets/ant_mlp datasets/ant_policy \
-		--network mlp-4x160 --single-step-fraction 1 --bf16-fraction 0.85 \
-		--steps 12000 --rollout-steps 4000 --rollout-restarts 1 --lr 0.004 --adamw-lr 0.0012 \
-		--rollout-lr-ratio 0.25 --validate-every 2000 --out runs/ant_policy
-	cp runs/ant_policy/best/* $(PRETRAINED)/ant-mlp/
 
 model-anymal-mlp: $(STAMP) ## ANYmal's learned model: two stages, the second with data along two policies
 	$(NERD) data anymal --trajectories 20000 --out datasets/anymal_mlp

@@ -62,7 +62,8 @@ def configured_network(config: TrainConfig) -> NetworkConfig:
         return network
     if not isinstance(network, TransformerConfig | MLPConfig):
         raise SettingError(
-            f"expected a transformer or an MLP with symmetries, got '{config.network}'"
+            f"expected a transformer or an MLP with symmetries, got '{config.network}': "
+            "train it with symmetries 1"
         )
     return replace(network, symmetries=config.symmetries)
 

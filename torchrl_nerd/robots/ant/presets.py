@@ -14,12 +14,14 @@ PUBLISHED = {  # paper, Fig. 3
 }
 PRESET = Preset(
     EvaluationProtocol({"passive": AntRun()}, (100, 500), PUBLISHED),
-    DataConfig(trajectories=30_000, steps=100),
-    TrainConfig(  # the first stage of the model ant; `make model-ant` continues it
+    DataConfig(trajectories=10_000, steps=100),
+    TrainConfig(  # `make model-ant` adds data along a policy
         network="transformer-4x128",
+        symmetries=4,
         predicted_force=True,
-        steps=24_000,
-        rollout_steps=2_000,
+        steps=15_000,
+        rollout_steps=3_000,
+        rollout_lr_ratio=0.25,
         single_step_fraction=0.85,
         use_symmetry=True,
         loss_eps=0.02,
