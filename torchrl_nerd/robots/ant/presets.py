@@ -14,7 +14,7 @@ PUBLISHED = {  # paper, Fig. 3
 }
 PRESET = Preset(
     EvaluationProtocol({"passive": AntRun()}, (100, 500), PUBLISHED),
-    DataConfig(trajectories=10_000, steps=100),
+    DataConfig(trajectories=15_000, steps=100),
     TrainConfig(  # `make model-ant` adds data along a policy
         network="transformer-4x128",
         symmetries=4,
