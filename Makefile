@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: data-ant help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive data-ant model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets

@@ -582,7 +582,8 @@ def symmetric_layers_table(folder: Path = RESULTS) -> str:
     for row in record["results"]["rows"]:
         names.setdefault((row["network"], row["symmetries"]), []).append(row)
     quantities = ("base_position", "base_orientation", "joints")
-    table = [["network", "symmetries", "weights", "time of an update", *HEADS_500]]
+    heads = ("position, m", "orientation, rad", "joints, rad")
+    table = [["network", "symmetries", "weights", "time of an update", *heads]]
     first = None
     for (network, symmetries), alike in names.items():
         means = {
@@ -595,9 +596,6 @@ def symmetric_layers_table(folder: Path = RESULTS) -> str:
         count = f"{alike[0]['weights']:,}"
         table.append([f"`{network}`", str(symmetries), count, share, *errors])
     return with_sources(table, [record])
-
-
-HEADS_500 = ("position, m", "orientation, rad", "joints, rad")
 
 
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
