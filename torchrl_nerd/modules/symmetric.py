@@ -47,10 +47,15 @@ def walsh_signs(order: int) -> Tensor:
     return torch.tensor(signs, dtype=torch.int8)  # stays so where weights are cast
 
 
+def walsh_matrix(signs: Tensor, dtype: torch.dtype) -> Tensor:
+    """The orthogonal matrix ``(K, K)`` of such signs, its own inverse."""
+    return signs.to(dtype) * len(signs) ** -0.5
+
+
 def transform(x: Tensor, signs: Tensor) -> Tensor:
-    """Parts to characters and back, ``(*batch, K, n)``: orthogonal, its own inverse."""
+    """Parts to characters and back, ``(*batch, K, n)``."""
     first = x.movedim(-2, 0)  # (K, *batch, n), which is how blocks leave it in memory
-    mixed = (signs.to(x.dtype) * len(signs) ** -0.5) @ first.flatten(1)
+    mixed = walsh_matrix(signs, x.dtype) @ first.flatten(1)
     return mixed.view(first.shape).movedim(0, -2)
 
 
@@ -71,8 +76,11 @@ class Activation(nn.Module):
         self.register_buffer("signs", walsh_signs(symmetries), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(*batch, K, n)``."""
-        return transform(self.function(transform(x, self.signs)), self.signs)
+        """``(*batch, K, n)``: `transform`, the function, and `transform` once more."""
+        first = x.movedim(-2, 0)  # (K, *batch, n)
+        mixing = walsh_matrix(self.signs, x.dtype)
+        parts = mixing @ first.flatten(1)  # (K, batch * n): fast for the function
+        return (mixing @ self.function(parts)).view(first.shape).movedim(0, -2)
 
 
 class BlockLinear(InnerLinear):
