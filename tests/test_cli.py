@@ -459,6 +459,11 @@ def test_a_scene_is_explained(scene, tmp_path, capsys):
     text, content = capsys.readouterr().out, read(path)
     assert text.startswith(f"{scene.name}: {content['token_width']} features a step")
     assert all(feature["key"] in text for feature in content["features"])
+    counts = ", ".join(map(str, content["symmetries"]))
+    assert f"symmetries of a network: {counts}" in text
+    assert (content["symmetries"] == [1]) == bool(content["why_no_symmetries"])
+    known = {"ant": [1, 2, 4], "cube": [1, 2, 4, 8], "anymal": [1], "cartpole": [1]}
+    assert content["symmetries"] == known.get(scene.name, content["symmetries"])
 
 
 def test_the_shipped_cartpole_is_as_good_as_the_paper(seed):

@@ -257,8 +257,9 @@ def test_symmetries_are_products_of_commuting_mirrors(name, most):
                     flips = signs[k] * signs[other][sources[k]]
                     assert torch.equal(after, sources[k ^ other])
                     assert torch.equal(flips, signs[k ^ other])
-    sizes = "1, 2, 4, 8" if most == 8 else "1, 2, 4"
-    with pytest.raises(SettingError, match=f"symmetries of {sizes}, which .* got 16"):
+    sizes = " or ".join(str(2**n) for n in range(most.bit_length()))
+    assert " or ".join(map(str, symmetry.counts())) == sizes
+    with pytest.raises(SettingError, match=f"symmetries {sizes}, the .* got 16"):
         symmetry.mirrors(16)
 
 
@@ -268,14 +269,42 @@ def test_symmetries_that_no_network_has_are_refused(ant_data):
         TrainConfig(step="unconstrained", symmetries=2)
     with pytest.raises(SettingError, match="or an MLP with symmetries, got 'gru'"):
         make_model(scene, TrainConfig(network="gru", symmetries=2))
-    with pytest.raises(ValueError, match="a power of two that divides width 16, got 3"):
-        make_model(scene, TrainConfig(network="mlp-1x16", symmetries=3))
+    for width, count in ((16, 3), (16, -4), (128, 128)):
+        with pytest.raises(
+            ValueError, match=f"divides width {width} and .* got {count}"
+        ):
+            MLPConfig(1, width, symmetries=count).build(INPUTS, OUTPUTS)
     with pytest.raises(ValueError, match="floating base.* got 'cartpole'"):
         Symmetry(load_scene("cartpole"))
 
 
-def test_a_file_with_other_entries_is_refused(network):
+@pytest.mark.parametrize(
+    ("key", "change", "said"),
+    [
+        (
+            "embed.sources",
+            lambda x: x + 3,
+            "every entry from 0 to 5 once, got .3, 4, 5",
+        ),
+        (
+            "embed.sources",
+            lambda x: 0 * x,
+            "every entry from 0 to 5 once, got .0, 0, 0",
+        ),
+        (
+            "embed.entry_signs",
+            lambda x: 2 * x,
+            "signs 1 or -1 of mirrored entries, got",
+        ),
+        (
+            "embed.entry_signs",
+            lambda x: x / 0,
+            "signs 1 or -1 of mirrored entries, got",
+        ),
+    ],
+)
+def test_a_file_with_other_mirrors_is_refused(network, key, change, said):
     weights = network.state_dict()
-    weights["embed.sources"] = weights["embed.sources"] + 3
-    with pytest.raises(ValueError, match="entries 0 to 5, got entries 3 to 8"):
+    weights[key] = change(weights[key])
+    with pytest.raises(ValueError, match=said):
         network.load_state_dict(weights)

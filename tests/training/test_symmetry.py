@@ -1,5 +1,9 @@
 """A robot's isometries: groups that the MuJoCo solver and the features agree with."""
 
+import copy
+from itertools import product
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Generator
@@ -13,10 +17,14 @@ from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import NETWORKS, MLPConfig
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.contact_points import own_contacts
+from torchrl_nerd.settings import SettingError
+from torchrl_nerd.training.isometries import find_isometries
 from torchrl_nerd.training.losses import rollout_loss
-from torchrl_nerd.training.samples import data_stats, raw_tokens
+from torchrl_nerd.training.samples import cover, data_stats, raw_tokens
 from torchrl_nerd.training.sequences import Sequences
-from torchrl_nerd.training.symmetry import SignedPermutations, Symmetry, find_isometries
+from torchrl_nerd.training.signed_permutations import SignedPermutations, match_entries
+from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import Trainer
 from torchrl_nerd.transforms import StateDelta
 
@@ -40,6 +48,121 @@ def test_the_groups_are_those_of_the_shapes(name, order):
 def test_a_fixed_base_and_a_ground_that_varies_are_refused(name):
     with pytest.raises(ValueError, match=f"one ground .* got '{name}'"):
         find_isometries(load_scene(name))
+
+
+QUADRUPED = """
+<mujoco>
+  <option timestep="0.005"/>
+  <default>
+    <joint type="hinge" axis="0 1 0" damping="0.3" armature="0.01" range="-60 60"/>
+    <geom density="400"/>
+  </default>
+  <worldbody>
+    <geom type="plane" size="20 20 0.1"/>
+    <body pos="0 0 0.45">
+      <freejoint/>
+      <geom type="box" size="0.2 0.12 0.04"/>
+      {legs}
+    </body>
+  </worldbody>
+  <actuator>{motors}</actuator>
+  {more}
+</mujoco>
+"""
+LEG = """
+<body name="leg{n}" pos="{x} {y} 0"><joint name="h{n}"/>
+  <geom type="capsule" size="0.025" fromto="0 0 0 0 0 -0.18" {thigh}/>
+  <body pos="0 0 -0.18"><joint name="k{n}" {knee}/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.18"/>
+  </body>
+</body>
+"""
+
+
+USUAL = {"knee": 'range="-90 20"', "thigh": ""}
+
+
+def quadruped(folder: Path, more: str = "", **first: str) -> Scene:
+    """A robot with a left and a right side, whose ``first`` leg may be another one."""
+    legs, motors = "", ""
+    for n, (x, y) in enumerate(product((0.18, -0.18), (0.14, -0.14))):
+        legs += LEG.format(n=n, x=x, y=y, **(USUAL | first if n == 0 else USUAL))
+        for joint in "hk":
+            motors += f'<motor joint="{joint}{n}" gear="8" ctrlrange="-1 1"/>'
+    path = folder / "robot.xml"
+    path.write_text(QUADRUPED.format(legs=legs, motors=motors, more=more))
+    return Scene.from_mjcf(path)
+
+
+@pytest.mark.parametrize(
+    ("first", "order"),
+    [
+        ({}, 2),
+        ({"knee": 'range="-90 22"'}, 1),
+        ({"knee": 'range="-90 20" damping="0.31"'}, 1),
+        ({"knee": 'range="-90 20" armature="0.0101"'}, 1),
+        ({"thigh": 'friction="0.9"'}, 1),
+        ({"more": '<contact><exclude body1="leg0" body2="leg2"/></contact>'}, 1),
+        ({"more": '<contact><exclude body1="leg0" body2="leg1"/></contact>'}, 2),
+    ],
+    ids=str,
+)
+def test_a_robot_that_touches_itself_may_have_a_mirror(first, order, tmp_path):
+    """MuJoCo's contacts of two of its shapes do not always commute with its mirror.
+
+    A leg that is a little unlike the others is found all the same, and one that touches
+    others.
+    """
+    scene = quadruped(tmp_path, **first)
+    assert own_contacts(scene.model)
+    assert len(find_isometries(scene)) == order
+
+
+def test_isometries_that_features_do_not_have_are_left_out(tmp_path):
+    """Such as what bounds a motor, which few steps tell."""
+    scene = quadruped(tmp_path, knee='range="-90 20" actuatorfrcrange="-1 1"')
+    assert len(find_isometries(scene)) == 2
+    assert Symmetry(scene).counts() == [1]
+    with pytest.raises(SettingError, match="expected symmetries 1, .* got 2"):
+        Symmetry(scene).mirrors(2)
+
+
+def test_products_that_are_no_isometries_are_no_symmetries():
+    """A robot so nearly symmetric that the product of two mirrors is refused."""
+    one, three = [1.0, 1.0, 1.0], [0, 1, 2]
+    flips = [[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]]
+    copies = SignedPermutations([(three, signs) for signs in (one, *flips)])
+    assert copies.mirrors(2) == [0, 1]
+    assert copies.mirrors(4) is None
+
+
+@pytest.mark.parametrize("name", ["ant", "cube"])
+def test_the_range_of_a_training_has_the_symmetries(name, generator):
+    """So that what is clamped is so in every symmetric copy."""
+    scene = load_scene(name)
+    data = simulate(scene, 20, 10, generator)
+    data, symmetry = data[is_sound(data)], Symmetry(scene)
+    stats = symmetry.complete(data_stats(scene, data))
+    model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats)
+    cover(model, data)
+    seen, before = model.training_range, copy.deepcopy(model.training_range)
+    symmetry.complete_range(seen)
+    for key, copies in (("feature", symmetry.tokens), ("target", symmetry.targets)):
+        low, high = seen.get_buffer(f"{key}_low"), seen.get_buffer(f"{key}_high")
+        assert (low <= before.get_buffer(f"{key}_low")).all()
+        assert (high >= before.get_buffer(f"{key}_high")).all()
+        x = 3.0 * torch.randn(50, 1, len(low), dtype=torch.float64, generator=generator)
+        for number in range(len(symmetry.isometries)):
+            choice = torch.full((len(x),), number)
+            there = copies(x.clamp(low, high), choice)
+            torch.testing.assert_close(copies(x, choice).clamp(low, high), there)
+    ends = torch.stack((seen.qpos_low, seen.qpos_high))
+    for isometry in symmetry.isometries:
+        there = isometry.joints(ends).sort(0).values
+        torch.testing.assert_close(there, ends[:, 7:], atol=1e-12, rtol=0)
+        assert (seen.speed[isometry.joint_sources] == seen.speed[6:]).all()
+    assert (seen.qpos_low <= before.qpos_low).all()
+    assert (seen.speed >= before.speed).all()
 
 
 @pytest.fixture
@@ -139,10 +262,10 @@ def test_batches_show_symmetric_copies_of_the_data(scene, data, generator):
 
 def test_what_is_no_symmetry_is_refused():
     x = torch.randn(20, 3).double()
-    with pytest.raises(ValueError, match="entry 1 of a copy"):
-        SignedPermutations(x, [x * torch.tensor([1.0, 2.0, 1.0])])
+    assert match_entries(x, x * torch.tensor([1.0, 2.0, 1.0])) is None
     swapped = torch.stack((x[:, 1], -x[:, 0], x[:, 2]), -1)
-    copies = SignedPermutations(x, [x, swapped])
+    found = [match_entries(x, copy) for copy in (x, swapped)]
+    copies = SignedPermutations([one for one in found if one is not None])
     assert copies.sources.tolist() == [[0, 1, 2], [1, 0, 2]]
     assert copies.signs.tolist() == [[1, 1, 1], [1, -1, 1]]
 

@@ -23,13 +23,13 @@ from torchrl_nerd.scenes.scene import Scene
 class UnconstrainedStep(AnalyticStep):
     """One control step of a robot that touches nothing; see `AnalyticStep`.
 
-    Limits act on the joints of a robot with a fixed base, see `JointLimits`; a floating
-    base's joints move as if they had none. ``velocity_defect (*batch, nv)`` is by how much
-    the second dynamics evaluation changed the step's velocity.
+    Limits act on the joints of a robot with a fixed base, see `JointLimits`.
+    ``velocity_defect (*batch, nv)`` is by how much the second dynamics evaluation changed
+    the step's velocity.
 
     Args:
-        scene: a robot of hinges and slides, on a floating or a fixed base, without dry
-            friction. A ground is allowed and ignored.
+        scene: a robot of hinges and slides, on a fixed base, or on a floating one without
+            joint limits, without dry friction. A ground is allowed and ignored.
 
     Raises:
         ValueError: in one sentence, another robot.
@@ -49,7 +49,12 @@ class UnconstrainedStep(AnalyticStep):
         self.pose = BasePose(model, scene.base)
         self.layout = scene.layout
         self.limits, self.num_solves = None, 1
-        if model.jnt_limited[axes.joints].any() and not scene.base.is_floating:
+        if model.jnt_limited[axes.joints].any():
+            if scene.base.is_floating:
+                raise ValueError(
+                    "expected, for an unconstrained step, a fixed base or joints without "
+                    f"limits, got a floating base with them in scene '{scene.name}'"
+                )
             # MuJoCo's shortest time constant follows from the scene's own substep
             substep = scene.control_step / (scene.substeps // scene.reference_ratio)
             self.limits = JointLimits(model, axes, substep)

@@ -7,6 +7,8 @@ from torchrl_nerd.cli.command import Command
 from torchrl_nerd.cli.options import Positional, SceneName
 from torchrl_nerd.evaluation.explain import explain
 from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.training.symmetry import Symmetry
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,20 @@ class Explain(Command):
 
     def run(self) -> dict[str, Any]:
         """Print the report and return its contents."""
-        report = explain(load_scene(self.scene))
-        print(report)
-        return asdict(report) | {"token_width": report.token_width}
+        scene = load_scene(self.scene)
+        report = explain(scene)
+        counts, why_none = _symmetries(scene)
+        listed = ", ".join(map(str, counts)) + (f": {why_none}" if why_none else "")
+        print(report, f"symmetries of a network: {listed}", sep="\n")
+        found = {"symmetries": counts, "why_no_symmetries": why_none}
+        return asdict(report) | {"token_width": report.token_width} | found
+
+
+def _symmetries(scene: Scene) -> tuple[list[int], str | None]:
+    """Numbers of symmetries that a network can have, or why it is 1 alone."""
+    try:
+        counts = Symmetry(scene).counts()
+    except ValueError as error:
+        return [1], str(error)
+    none = "no mirror or half turn commutes with MuJoCo's step and the features"
+    return counts, none if counts == [1] else None

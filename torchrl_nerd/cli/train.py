@@ -114,11 +114,8 @@ class Train(SceneOptions, DeviceCommand):
             return begin_from(initial, scene, self.config, symmetry)
         return make_model(scene, self.config, symmetry=symmetry)
 
-    def expect_trainable(
-        self, scene: Scene, initial: NeRD | None, data: DataConfig
-    ) -> None:
-        """Refuse settings before data are drawn, not after it."""
-        self.untrained(scene, initial)
+    def expect_long(self, data: DataConfig) -> None:
+        """Refuse trajectories that are too short before they are drawn."""
         if data.steps < self.config.longest:
             raise ValueError(
                 f"expected trajectories of at least {self.config.longest} steps, got "
@@ -131,8 +128,9 @@ class Train(SceneOptions, DeviceCommand):
         (out, folders), initial = self.folders, self.initial(scene)
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
+        self.untrained(scene, initial)  # refuses before data are drawn, or read
         if _is_missing(folders, preset.data):
-            self.expect_trainable(scene, initial, preset.data)
+            self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
             expect_few_dropped(read_json(folders[0] / CARD))
         if self.threads:

@@ -32,12 +32,14 @@ def expect_symmetries(width: int, symmetries: int) -> None:
     """Refuse a number of symmetries that no layer of this width has.
 
     Raises:
-        ValueError: not a power of two, or one that does not divide the width.
+        ValueError: not a power of two, or one that does not divide the widths of the
+            network and its head.
     """
-    if symmetries.bit_count() != 1 or width % symmetries:
+    is_power = symmetries > 0 and symmetries.bit_count() == 1
+    if not is_power or width % symmetries or HEAD_WIDTH % symmetries:
         raise ValueError(
-            f"expected symmetries to be a power of two that divides width {width}, "
-            f"got {symmetries}"
+            f"expected symmetries to be a power of two that divides width {width} and the "
+            f"head's {HEAD_WIDTH}, got {symmetries}"
         )
 
 
@@ -229,14 +231,21 @@ def _blocks(weight: Tensor, count: int) -> nn.Parameter:
 
 
 def _expect_entries(layer: Mirrored, _: Any) -> None:
-    """Refuse sources, loaded from a file, that are no entries.
+    """Refuse mirrors, loaded from a file, that are no signed permutations.
 
     Raises:
-        ValueError: there are some.
+        ValueError: some entry is missing or twice, or a sign neither 1 nor -1.
     """
-    size = layer.sources.shape[1]
-    if bool(((layer.sources < 0) | (layer.sources >= size)).any()):
-        low, high = int(layer.sources.min()), int(layer.sources.max())
-        raise ValueError(
-            f"expected mirrors of entries 0 to {size - 1}, got entries {low} to {high}"
-        )
+    count, size = layer.sources.shape
+    every = torch.arange(size, device=layer.sources.device)
+    is_whole = (layer.sources.sort(1).values == every).all(1)  # (K,)
+    for number, whole in enumerate(is_whole.tolist()):
+        if not whole:
+            raise ValueError(
+                f"expected mirror {number} of {count} to have every entry from 0 to "
+                f"{size - 1} once, got {layer.sources[number].tolist()}"
+            )
+    signs = layer.entry_signs
+    if not (signs.abs() == 1.0).all():
+        odd = float(signs[signs.abs() != 1.0][0])
+        raise ValueError(f"expected signs 1 or -1 of mirrored entries, got {odd}")

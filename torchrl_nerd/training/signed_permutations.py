@@ -16,19 +16,15 @@ STATS_TOL = 1e-3  # standard deviations: more than rounding, less than a network
 class SignedPermutations(nn.Module):
     """Symmetric copies of a kind of vector: ``copy[j] = sign[j] x[source[j]]``.
 
-    Found from samples ``(N, F)`` and their copies by each isometry. Every entry that is
-    ever not zero must be so in a sample.
-
-    Raises:
-        ValueError: an entry of a copy that is none of the original's.
+    ``matched`` is what `match_entries` gives for the copies by each isometry.
     """
 
     sources: Tensor
     signs: Tensor
 
-    def __init__(self, original: Tensor, copies: Sequence[Tensor]) -> None:
+    def __init__(self, matched: Sequence[tuple[list[int], list[float]]]) -> None:
         super().__init__()
-        sources, signs = zip(*(_match(original, x) for x in copies), strict=True)
+        sources, signs = zip(*matched, strict=True)
         keep_indices(self, sources=sources)  # (isometries, F)
         keep_constants(self, signs=signs)
 
@@ -54,32 +50,40 @@ class SignedPermutations(nn.Module):
         """Numbers of ``count = 2^n`` isometries, products of n that commute; None if fewer.
 
         Each undoes itself: mirrors, and half turns. Number k is the product of the
-        generators whose bits are set in k. The isometries are a group, the identity first,
-        and no entries are alike, so that each of them is another permutation.
+        generators whose bits are set in k. The identity is first, and no entries are alike,
+        so that each isometry is another permutation.
         """
         rows = zip(self.sources.tolist(), self.signs.tolist(), strict=True)
         known = [tuple(zip(*row, strict=True)) for row in rows]
         place = {copy: number for number, copy in enumerate(known)}
 
-        def after(second: int, first: int) -> int:
-            """The copy of a copy: by ``first``, then by ``second``."""
+        def after(second: int, first: int) -> int | None:
+            """The copy of a copy: by ``first``, then by ``second``; None: not known."""
             entries = known[first]
             twice = ((entries[j][0], sign * entries[j][1]) for j, sign in known[second])
-            return place[tuple(twice)]
+            return place.get(tuple(twice))
 
         own_inverse = [k for k in range(1, len(known)) if after(k, k) == 0]
         for generators in combinations(own_inverse, count.bit_length() - 1):
             pairs = combinations(generators, 2)
             if all(after(a, b) == after(b, a) for a, b in pairs):
-                members = [0]
+                members: list[int] = [0]
                 for generator in generators:
-                    members += [after(generator, member) for member in members]
-                if len(set(members)) == count:
+                    more = [after(generator, member) for member in members]
+                    members += [member for member in more if member is not None]
+                if len(members) == len(set(members)) == count:
                     return members
         return None
 
 
-def _match(original: Tensor, copy: Tensor) -> tuple[list[int], list[float]]:
+def match_entries(
+    original: Tensor, copy: Tensor
+) -> tuple[list[int], list[float]] | None:
+    """Sources and signs of a copy's entries, from samples ``(N, F)`` of both.
+
+    Every entry that is ever not zero must be so in a sample. None where an entry of the
+    copy is none of the original's.
+    """
     scale = RTOL * (original.abs().amax(0) + 1e-3)
     sources, signs = [], []
     for j, column in enumerate(copy.T):
@@ -91,5 +95,5 @@ def _match(original: Tensor, copy: Tensor) -> tuple[list[int], list[float]]:
                 signs.append(sign)
                 break
         else:
-            raise ValueError(f"entry {j} of a copy is no entry of the original")
+            return None
     return sources, signs

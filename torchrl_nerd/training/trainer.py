@@ -152,6 +152,8 @@ class Trainer:
         cover(model, data, (self.sequences.features, self.sequences.targets))
         if init_from is not None:
             model.training_range.widen(init_from.training_range)
+        if symmetry is not None:
+            symmetry.complete_range(model.training_range)
 
     def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
         """The configured model with fresh weights."""

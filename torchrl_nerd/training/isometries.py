@@ -1,0 +1,228 @@
+"""Isometries of a robot: maps of states and torques that commute with MuJoCo's step.
+
+An ant turned by 90 degrees is the same ant with its legs renumbered. Candidates are the 48
+isometries that map the axes of the base frame to themselves. One is kept if it maps joints
+to joints and shapes to shapes, and commutes with MuJoCo's step.
+"""
+
+from collections.abc import Iterator
+from itertools import permutations, product
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator, Tensor, nn
+
+from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.geometry.base import keep_constants, keep_indices
+from torchrl_nerd.geometry.manifold import FREE, SLIDE
+from torchrl_nerd.geometry.rotations import quat_multiply
+from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
+from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.contact_points import collision_filter, own_contacts
+from torchrl_nerd.scenes.penetration import touching_bodies
+from torchrl_nerd.scenes.sampling import sample_commands
+
+PLACE_TOL = 1e-6  # m, and of a unit vector
+STEP_RTOL = 1e-6  # the solver's own tolerance is 1e-8
+TRIALS = 128
+MAX_DEPTH = 0.01  # m that the trials reach into the ground
+# MuJoCo's contacts of two shapes may depend on which way up they are: of states in which
+# the robot does not touch itself, before or after the step, so many are let pass
+MAX_STRAYED = 1 / 16
+MIRROR = np.diag((1.0, -1.0, 1.0))  # of the world, where the base is mirrored
+OVERSHOOT = 0.2  # of a joint's range, beyond its limits
+# of a shape: what its contacts are computed with, and the radius about its center
+LAW = ("condim", "priority", "friction", "solref", "solimp", "margin", "gap", "rbound")
+
+
+class Isometry(nn.Module):
+    """A map of states and torques that commutes with the dynamics.
+
+    Args:
+        body: ``(3, 3)``, of vectors in the axes of the floating base. Where it is a
+            reflection, the world is mirrored as well, so that the base stays a rotation.
+        sources: ``(nv,)``: dof v of the copy is sign times dof source.
+        signs: ``(nv,)``.
+        actuated: dofs with a motor, in the order of torques.
+    """
+
+    world: Tensor
+    mirror: Tensor
+    turn: Tensor
+    axial: Tensor
+    joint_sources: Tensor
+    joint_signs: Tensor
+    motors: Tensor
+    motor_signs: Tensor
+
+    def __init__(
+        self,
+        body: np.ndarray,
+        sources: np.ndarray,
+        signs: np.ndarray,
+        actuated: list[int],
+    ) -> None:
+        super().__init__()
+        parity = np.linalg.det(body)
+        world, mirror = np.eye(3), np.ones(4)
+        if parity < 0.0:  # axes of rotations in the mirror's plane flip: they are axial
+            world, mirror = MIRROR, np.array((1.0, -1.0, 1.0, -1.0))
+        turn = np.empty(4)
+        mujoco.mju_mat2Quat(turn, (world @ body.T).reshape(-1))
+        keep_constants(self, world=world, mirror=mirror, turn=turn, axial=parity * body)
+        keep_constants(self, joint_signs=signs[6:], motor_signs=signs[actuated])
+        motors = [actuated.index(source) for source in sources[actuated]]
+        keep_indices(self, joint_sources=sources[6:], motors=motors)
+
+    def qpos(self, qpos: Tensor) -> Tensor:
+        """Symmetric copy of positions ``(*batch, nq)``."""
+        position, quat = qpos[..., :3] @ self.world.mT, qpos[..., 3:7] * self.mirror
+        turned = quat_multiply(quat, self.turn)
+        return torch.cat((position, turned, self.joints(qpos)), -1)
+
+    def joints(self, qpos: Tensor) -> Tensor:
+        """Symmetric copy of joint positions ``(*batch, nv - 6)``."""
+        return qpos[..., self.joint_sources + 1] * self.joint_signs
+
+    def qvel(self, qvel: Tensor) -> Tensor:
+        """Symmetric copy of velocities ``(*batch, nv)``."""
+        linear, angular = qvel[..., :3] @ self.world.mT, qvel[..., 3:6] @ self.axial.mT
+        joints = qvel[..., self.joint_sources] * self.joint_signs
+        return torch.cat((linear, angular, joints), -1)
+
+    def torque(self, joint_torque: Tensor) -> Tensor:
+        """Symmetric copy of joint torques ``(*batch, num_actuated)``."""
+        return joint_torque[..., self.motors] * self.motor_signs
+
+    def forward(self, data: TensorDict) -> TensorDict:
+        """Symmetric copy of states or transitions: of every key that is there."""
+        maps = {QPOS: self.qpos, QVEL: self.qvel, JOINT_TORQUE: self.torque}
+        maps |= {NEXT_QPOS: self.qpos, NEXT_QVEL: self.qvel}
+        keys = data.keys(True)
+        copy = {key: apply(data[key]) for key, apply in maps.items() if key in keys}
+        return TensorDict(copy, data.batch_size)
+
+
+def find_isometries(scene: Scene) -> list[Isometry]:
+    """The symmetry group of a robot on its ground, the identity first.
+
+    Raises:
+        ValueError: a fixed base, a ball joint, servos, or a ground that varies.
+    """
+    model, ground = scene.model, scene.terrain
+    is_legged = scene.base.is_floating and model.nv == model.njnt + 5
+    is_varied = ground is not None and ground.is_per_env
+    if not is_legged or is_varied or scene.servos is not None:
+        raise ValueError(
+            "expected a floating base, hinges or slides, motors and one ground for "
+            f"use_symmetry or symmetries, got '{scene.name}'"
+        )
+    identity, *others = _candidates(scene)
+    return [identity, *(other for other in others if _solver_agrees(scene, other))]
+
+
+def _candidates(scene: Scene) -> Iterator[Isometry]:
+    """Isometries that put joints on joints, shapes on shapes and the ground on itself."""
+    actuated, model = list(scene.actuated), scene.model
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.eye(model.nq)[3]  # the base at the origin, not turned
+    mujoco.mj_kinematics(model, data)
+    for order, sign in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        body = np.eye(3)[list(order)] * np.array(sign)[:, None]
+        matched = _match_joints(model, data, body)
+        if matched is None or not _maps_shapes(model, data, body):
+            continue
+        if set(matched[0][actuated]) <= set(actuated):
+            yield Isometry(body, *matched, actuated)
+
+
+def _match_joints(
+    model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """For each dof the one it is mapped from, and the sign; None if one has none."""
+    sources, signs = np.arange(model.nv), np.ones(model.nv)
+    scalar = [j for j in range(model.njnt) if model.jnt_type[j] != FREE]
+    for joint in scalar:
+        axial = 1.0 if model.jnt_type[joint] == SLIDE else np.linalg.det(body)
+        anchor, axis = body @ data.xanchor[joint], axial * body @ data.xaxis[joint]
+        for other in scalar:
+            along = float(axis @ data.xaxis[other])
+            if (
+                model.jnt_type[other] == model.jnt_type[joint]
+                and np.linalg.norm(anchor - data.xanchor[other]) < PLACE_TOL
+                and abs(abs(along) - 1.0) < PLACE_TOL
+            ):
+                dof = model.jnt_dofadr[other]
+                sources[dof], signs[dof] = model.jnt_dofadr[joint], np.sign(along)
+                break
+        else:
+            return None
+    return sources, signs
+
+
+def _maps_shapes(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray) -> bool:
+    """Whether shapes that touch something lie on such shapes, which touch the same.
+
+    How they are turned, and what they weigh, is left to the trial of steps.
+    """
+    touches = collision_filter(model)
+    is_own = model.body_weldid[model.geom_bodyid] > 0
+    own = np.flatnonzero(is_own & touches.any(1))
+    laws = [getattr(model, f"geom_{name}").reshape(model.ngeom, -1) for name in LAW]
+    law = np.concatenate([model.geom_type[:, None], *laws], 1)[own]
+    places, onto = data.geom_xpos[own], []
+    for place, kind in zip(places @ body.T, law, strict=True):
+        near = np.abs(places - place).max(1) < PLACE_TOL
+        alike = np.isclose(law, kind, rtol=PLACE_TOL).all(1)
+        free = [i for i in np.flatnonzero(near & alike) if i not in onto]
+        if not free:
+            return False
+        onto.append(free[0])
+    mutual = touches[np.ix_(own, own)]
+    ground = np.asarray(touches[own][:, ~is_own].any(1))
+    is_same = np.array_equal(mutual, mutual[np.ix_(onto, onto)])
+    return is_same and np.array_equal(ground, ground[onto])
+
+
+def _solver_agrees(scene: Scene, isometry: Isometry) -> bool:
+    """Whether the isometry commutes with the step, on the ground and beyond limits too."""
+    here = states_in_contact(scene, TRIALS, MAX_DEPTH)
+    there = isometry(here)
+    dynamics, ends = MujocoDynamics(scene, num_threads=1), []
+    for start in (here, there):
+        dynamics.reset(start)
+        ends.append(dynamics.step(start, start[JOINT_TORQUE]))
+    expected = isometry.qvel(ends[0][QVEL])
+    change = (expected - there[QVEL]).abs().amax()
+    apart = (expected - ends[1][QVEL]).abs().amax(1)
+    strays = apart > STEP_RTOL * (1.0 + change)  # (TRIALS,)
+    if not own_contacts(scene.model):
+        return not strays.any()
+    alone = ~(_touches_itself(scene, here) | _touches_itself(scene, ends[0]))
+    return bool(strays[alone].double().mean() <= MAX_STRAYED)
+
+
+def _touches_itself(scene: Scene, state: TensorDictBase) -> Tensor:
+    """Whether two of the robot's own bodies touch, ``(n,)``."""
+    pairs = touching_bodies(scene.model, state[QPOS])
+    return torch.tensor([any(low > 0 for low, _ in some) for some in pairs])
+
+
+def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
+    """Random states and torques ``[count]``, up to ``max_depth`` m in the ground.
+
+    Joints are up to `OVERSHOOT` of their ranges beyond them.
+    """
+    generator = Generator().manual_seed(0)
+    state, scale = scene.sample_initial(count, generator)
+    share = torch.linspace(-OVERSHOOT, 1.0 + OVERSHOOT, count, dtype=torch.float64)
+    for joint in scene.model.jnt_limited.nonzero()[0]:
+        low, high = scene.model.jnt_range[joint]
+        mixed = share[torch.randperm(count, generator=generator)]
+        state[QPOS][:, scene.model.jnt_qposadr[joint]] = low + (high - low) * mixed
+    draw = torch.rand(count, dtype=torch.float64, generator=generator)
+    scene.place_on_terrain(state, -max_depth * draw)
+    torque = sample_commands(scene.sampling, scale, 1, generator)
+    return TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
