@@ -162,7 +162,7 @@ def test_rollouts_are_of_one_robot_where_robots_change(length, generator):
 
 def test_symmetry_augmentation_of_varied_robots_are_refused(data, tmp_path):
     config = TrainConfig(use_symmetry=True)
-    with pytest.raises(ValueError, match="varied scene without use_symmetry"):
+    with pytest.raises(ValueError, match="one robot for use_symmetry"):
         Trainer(SCENE, data, SCENE, config, tmp_path)
 
 

@@ -147,8 +147,7 @@ class Trainer:
             self.init_from = fingerprint(init_from)
         self.model = model.to(self.device)
         shown = symmetry if self.config.use_symmetry else None
-        self.sequences = Sequences(model, data, shown)
-        self.resting = resting(data)
+        self.sequences, self.resting = Sequences(model, data, shown), resting(data)
         cover(model, data, (self.sequences.features, self.sequences.targets))
         if init_from is not None:
             model.training_range.widen(init_from.training_range)
@@ -158,8 +157,7 @@ class Trainer:
     def make_model(self, data: TensorDict, symmetry: Symmetry | None) -> NeRD:
         """The configured model with fresh weights."""
         stats = data_stats(self.scene, data, self.config.features)
-        if symmetry is not None:
-            stats = symmetry.complete(stats)
+        stats = stats if symmetry is None else symmetry.complete(stats)
         return make_model(self.scene, self.config, stats, symmetry)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
