@@ -120,7 +120,7 @@ def find_isometries(scene: Scene) -> list[Isometry]:
             f"use_symmetry or symmetries, got '{scene.name}'"
         )
     identity, *others = _candidates(scene)
-    return [identity, *(other for other in others if _solver_agrees(scene, other))]
+    return [identity, *filter(Trial(scene).agrees, others)]
 
 
 def _candidates(scene: Scene) -> Iterator[Isometry]:
@@ -129,10 +129,11 @@ def _candidates(scene: Scene) -> Iterator[Isometry]:
     data = mujoco.MjData(model)
     data.qpos[:] = np.eye(model.nq)[3]  # the base at the origin, not turned
     mujoco.mj_kinematics(model, data)
+    shapes = Shapes(model, data)
     for order, sign in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         body = np.eye(3)[list(order)] * np.array(sign)[:, None]
         matched = _match_joints(model, data, body)
-        if matched is None or not _maps_shapes(model, data, body):
+        if matched is None or not shapes.are_mapped(body):
             continue
         if set(matched[0][actuated]) <= set(actuated):
             yield Isometry(body, *matched, actuated)
@@ -162,49 +163,63 @@ def _match_joints(
     return sources, signs
 
 
-def _maps_shapes(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray) -> bool:
-    """Whether shapes that touch something lie on such shapes, which touch the same.
+class Shapes:
+    """Shapes of a robot that touch something, at the place of its joints in ``data``."""
 
-    How they are turned, and what they weigh, is left to the trial of steps.
-    """
-    touches = collision_filter(model)
-    is_own = model.body_weldid[model.geom_bodyid] > 0
-    own = np.flatnonzero(is_own & touches.any(1))
-    laws = [getattr(model, f"geom_{name}").reshape(model.ngeom, -1) for name in LAW]
-    law = np.concatenate([model.geom_type[:, None], *laws], 1)[own]
-    places, onto = data.geom_xpos[own], []
-    for place, kind in zip(places @ body.T, law, strict=True):
-        near = np.abs(places - place).max(1) < PLACE_TOL
-        alike = np.isclose(law, kind, rtol=PLACE_TOL).all(1)
-        free = [i for i in np.flatnonzero(near & alike) if i not in onto]
-        if not free:
-            return False
-        onto.append(free[0])
-    mutual = touches[np.ix_(own, own)]
-    ground = np.asarray(touches[own][:, ~is_own].any(1))
-    is_same = np.array_equal(mutual, mutual[np.ix_(onto, onto)])
-    return is_same and np.array_equal(ground, ground[onto])
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        touches = collision_filter(model)
+        is_own = model.body_weldid[model.geom_bodyid] > 0
+        own = np.flatnonzero(is_own & touches.any(1))
+        laws = [getattr(model, f"geom_{name}").reshape(model.ngeom, -1) for name in LAW]
+        self.laws = np.concatenate([model.geom_type[:, None], *laws], 1)[own]
+        self.places = data.geom_xpos[own]
+        self.mutual = touches[np.ix_(own, own)]
+        self.ground = np.asarray(touches[own][:, ~is_own].any(1))
 
+    def are_mapped(self, body: np.ndarray) -> bool:
+        """Whether they lie on such shapes, which touch the same.
 
-def _solver_agrees(scene: Scene, isometry: Isometry) -> bool:
-    """Whether the isometry commutes with the step, on the ground and beyond limits too."""
-    here = states_in_contact(scene, TRIALS, MAX_DEPTH)
-    there = isometry(here)
-    dynamics, ends = MujocoDynamics(scene, num_threads=1), []
-    for start in (here, there):
-        dynamics.reset(start)
-        ends.append(dynamics.step(start, start[JOINT_TORQUE]))
-    expected = isometry.qvel(ends[0][QVEL])
-    change = (expected - there[QVEL]).abs().amax()
-    apart = (expected - ends[1][QVEL]).abs().amax(1)
-    strays = apart > STEP_RTOL * (1.0 + change)  # (TRIALS,)
-    if not own_contacts(scene.model):
-        return not strays.any()
-    alone = ~(_touches_itself(scene, here) | _touches_itself(scene, ends[0]))
-    return bool(strays[alone].double().mean() <= MAX_STRAYED)
+        How they are turned, and what they weigh, is left to the trial of steps.
+        """
+        onto: list[int] = []
+        for place, law in zip(self.places @ body.T, self.laws, strict=True):
+            near = np.abs(self.places - place).max(1) < PLACE_TOL
+            alike = np.isclose(self.laws, law, rtol=PLACE_TOL).all(1)
+            free = [i for i in np.flatnonzero(near & alike) if i not in onto]
+            if not free:
+                return False
+            onto.append(int(free[0]))
+        is_same = np.array_equal(self.mutual, self.mutual[np.ix_(onto, onto)])
+        return is_same and np.array_equal(self.ground, self.ground[onto])
 
 
-def _touches_itself(scene: Scene, state: TensorDictBase) -> Tensor:
+class Trial:
+    """Steps of MuJoCo on the ground and beyond limits, that an isometry commutes with."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.dynamics = MujocoDynamics(scene, num_threads=1)
+        self.start = states_in_contact(scene, TRIALS, MAX_DEPTH)
+        self.end = self._step(self.start)
+        self.has_own_contacts = bool(own_contacts(scene.model))
+        touching = (_touch_themselves(scene, x) for x in (self.start, self.end))
+        self.is_alone = ~torch.stack(list(touching)).any(0)  # (TRIALS,)
+
+    def agrees(self, isometry: Isometry) -> bool:
+        """Whether it commutes with the step; see `MAX_STRAYED`."""
+        start, expected = isometry(self.start), isometry.qvel(self.end[QVEL])
+        change = (expected - start[QVEL]).abs().amax()
+        apart = (expected - self._step(start)[QVEL]).abs().amax(1)
+        strays = apart > STEP_RTOL * (1.0 + change)  # (TRIALS,)
+        if not self.has_own_contacts:
+            return not strays.any()
+        return bool(strays[self.is_alone].double().mean() <= MAX_STRAYED)
+
+    def _step(self, start: TensorDictBase) -> TensorDictBase:
+        self.dynamics.reset(start)
+        return self.dynamics.step(start, start[JOINT_TORQUE])
+
+
+def _touch_themselves(scene: Scene, state: TensorDictBase) -> Tensor:
     """Whether two of the robot's own bodies touch, ``(n,)``."""
     pairs = touching_bodies(scene.model, state[QPOS])
     return torch.tensor([any(low > 0 for low, _ in some) for some in pairs])
