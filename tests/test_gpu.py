@@ -43,7 +43,7 @@ def test_a_learned_env_needs_no_optional_package():
     assert done.stdout == "torch.Size([2, 2, 15])\n", done.stderr
 
 
-@pytest.mark.parametrize("letter", slow_but(set(STAGES) - {"d"}, STAGES))
+@pytest.mark.parametrize("letter", slow_but(set(STAGES) - {"b", "d"}, STAGES))
 def test_every_stage_runs(letter, tmp_path):
     """Every item, without an error; a second run measures nothing again."""
     if letter == "c" and not mjx_rates.is_installed():
@@ -106,6 +106,7 @@ def test_one_stage_alone(capsys, tmp_path):
     assert [x.name for x in tmp_path.glob("*.json")] == ["f_profiles.json"]
 
 
+@pytest.mark.slow
 def test_a_stage_that_dies_takes_no_other_with_it(capfd, monkeypatch, tmp_path):
     """As a GPU's fault would end it; each stage is a process of its own."""
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT / 'benchmarks'}")

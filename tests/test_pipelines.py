@@ -216,6 +216,7 @@ def test_ppo_outlives_a_worker_of_ray(example, moment, monkeypatch, capsys):
     assert not torch.equal(*starts)
 
 
+@pytest.mark.slow
 def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path):
     first_order = example("first_order")
     cfg = first_order.Config(

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers import slow_but
 from run_notebooks import NOTEBOOKS, code_cells, run_cells, stored
 
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -24,7 +25,9 @@ def test_its_form_is_a_notebook_s(path: Path):
     assert len(identities) == len(set(identities)) > 5
 
 
-@each_notebook
+@pytest.mark.parametrize(
+    "path", slow_but(NOTEBOOKS[:1], NOTEBOOKS), ids=lambda p: p.stem
+)
 def test_every_cell_prints_what_is_stored(path: Path, monkeypatch, tmp_path):
     """To store outputs anew: python tests/tools/run_notebooks.py."""
     monkeypatch.chdir(tmp_path)

@@ -246,6 +246,7 @@ def test_gymnasium_records_videos_and_statistics(tmp_path, seed):
 
 
 @has_gl
+@pytest.mark.slow
 def test_workers_that_are_spawned_know_the_ids(seed):
     envs = gymnasium.make_vec(
         f"torchrl_nerd.gymnasium:{ID}",

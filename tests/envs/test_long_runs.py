@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 from dynamics_helpers import EnvMaker, random_actions
-from helpers import slow_but
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv
 
@@ -62,7 +61,8 @@ def sizes(dynamics: str, rows: int, steps: int, seed: int) -> list[int]:
 
 
 @each_length
-@pytest.mark.parametrize("dynamics", slow_but(["streaming"], ["streaming", "mujoco"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("dynamics", ["streaming", "mujoco"])
 def test_memory_does_not_grow_with_steps_and_resets(dynamics, rows, steps, seed):
     # in a process of its own: what other tests left behind is reused, or not, at any time
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:

@@ -142,6 +142,7 @@ def idle_policy(env):
     return lambda td: td.set("action", torch.zeros(*td.batch_size, width))
 
 
+@pytest.mark.slow
 def test_parallel_env_may_mix_learned_and_mujoco_dynamics(generator):
     makers = [EnvMaker(TASK, d, generator, HORIZON) for d in ("window", "mujoco")]
     parallel = ParallelEnv(2, [functools.partial(make, ROWS) for make in makers])

@@ -25,7 +25,7 @@ from torchrl_nerd.scenes import Scene
 
 ROWS, STEPS = 4, 50
 QUICK = {("ant/run", "streaming"), ("anymal/forward", "analytic")}
-QUICK |= {("franka/reach_osc", "streaming"), ("double_pendulum/passive", "hybrid")}
+QUICK |= {("double_pendulum/passive", "hybrid")}
 CASES = [(task, kind) for task in TASKS for kind in MODELS]
 
 TRACED = {("cartpole/swingup", "hybrid")}  # streaming ones: see test_compile.py

@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from helpers import slow_but
 from tensordict import TensorDict
 
 from torchrl_nerd import NeRDEnv, make_env
@@ -150,7 +149,8 @@ def test_explain_needs_no_names(scene):
 TRAINED = ("ball before the robot", "closed chain", "tendon limit", "unnamed")
 
 
-@pytest.mark.parametrize("path", slow_but(TRAINED[:1], TRAINED), indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", TRAINED, indirect=True)
 def test_a_model_of_seconds_steps_and_streams(path, tmp_path, short_rollouts, capsys):
     data, out = tmp_path / "data", tmp_path / "run"
     sizes = "--trajectories 40 --steps 12 --quiet".split()

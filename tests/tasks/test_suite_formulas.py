@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from dm_control import suite
+from helpers import slow_but
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.geometry.manifold import normalize_pos
@@ -13,6 +14,7 @@ from torchrl_nerd.tasks.suite_formulas import FORMULAS
 
 TASKS = [f"{domain}-{task}" for domain, task in suite.ALL_TASKS if domain in FORMULAS]
 STATES = 64
+COMPILED = "walker-run", "hopper-hop", "reacher-hard"
 
 
 def test_every_domain_with_formulas_is_in_the_suite():
@@ -94,7 +96,7 @@ def test_body_motion_is_mujocos(scene, generator):
             assert np.abs(mine[row].numpy() - theirs).max() < 1e-9
 
 
-@pytest.mark.parametrize("name", ["walker-run", "hopper-hop", "reacher-hard"])
+@pytest.mark.parametrize("name", slow_but(["walker-run"], COMPILED))
 def test_a_judgement_is_one_graph_and_keeps_its_precision(name, generator):
     task = SuiteTask(f"dm_control/{name}")
     u = torch.rand(3, 1, dtype=torch.float64, generator=generator)

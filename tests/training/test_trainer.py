@@ -124,7 +124,7 @@ def learn(network, share, folder, seed):
     return trainer, before
 
 
-@pytest.mark.parametrize("network", NETWORK_NAMES)
+@pytest.mark.parametrize("network", slow_but(["mlp-4x64"], NETWORK_NAMES))
 def test_bfloat16_learns_as_much_and_leaves_weights_and_outputs_alone(
     network, tmp_path, seed, monkeypatch
 ):

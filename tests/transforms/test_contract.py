@@ -81,7 +81,8 @@ def test_trans_serial_env_check(name, scene):
     check(named(env, scene), name)
 
 
-@each_slow_but("cartpole")
+@pytest.mark.slow
+@each_scene
 def test_trans_parallel_env_check(scene):
     env = ParallelEnv(2, creators(scene, of_transformed=False))
     check(named(TransformedEnv(env, make_compose(scene)), scene), *TRANSFORMS)

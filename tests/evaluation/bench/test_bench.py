@@ -49,7 +49,7 @@ from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import PRESETS, load_scene, protocol_of
 from torchrl_nerd.scenes import Scene
 
-QUICK = ("cartpole", "franka", "cube")  # the fewest models, still one in contact
+QUICK = ("cartpole", "cube")  # the fewest models, still one in contact
 
 
 @pytest.fixture(params=list(PRESETS))
