@@ -31,6 +31,27 @@ def expect_count(least: int, **settings: object) -> None:
             )
 
 
+def expect_same(
+    place: str, kept: Mapping[str, object], asked: Mapping[str, object], group: str = ""
+) -> None:
+    """Refuse to go on in a folder that holds what other settings made.
+
+    Raises:
+        ValueError: naming the first of those asked for that is another one in ``kept``,
+            such as ``config.steps`` inside of a mapping.
+    """
+    for name, value in asked.items():
+        other = kept.get(name)
+        if other == value:
+            continue
+        if isinstance(value, Mapping) and isinstance(other, Mapping):
+            expect_same(place, other, value, f"{group}{name}.")
+        raise ValueError(
+            f"{place} with {group}{name} {other}, asked for {value}: choose another "
+            "folder"
+        )
+
+
 def did_you_mean(name: str, known: Iterable[str], first: Sequence[str] = ()) -> str:
     """`` (did you mean 'ant'?)``: the first of ``first``, or the nearest; or nothing."""
     near = [*first, *get_close_matches(name, known, 1)]

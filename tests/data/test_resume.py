@@ -142,7 +142,9 @@ def test_a_finished_data_set_is_left_as_it_is(tmp_path):
 def test_another_configuration_is_refused_and_nothing_lost(name, value, tmp_path):
     generate(SCENE, CONFIG, tmp_path, quiet=True)
     before = snapshot(tmp_path)
-    with pytest.raises(ValueError, match=f"{tmp_path} already holds.*another folder"):
+    with pytest.raises(
+        ValueError, match=f"{tmp_path} already holds.*config.{name} .*another folder"
+    ):
         generate(SCENE, replace(CONFIG, **{name: value}), tmp_path, quiet=True)
     assert snapshot(tmp_path) == before
 

@@ -187,8 +187,11 @@ def test_rows_after_the_resumed_step_are_dropped(tmp_path):
 def test_another_configuration_is_refused_and_nothing_lost(change, tmp_path):
     make_trainer(SCENE, BRIEF, tmp_path).run(until=15)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
-    with pytest.raises(ValueError, match=f"{tmp_path} holds a run.*another folder"):
+    ((name, value),) = change.items()
+    told = f"{tmp_path} holds a run with config.{name} {getattr(BRIEF, name)}, "
+    with pytest.raises(ValueError) as raised:
         make_trainer(SCENE, replace(BRIEF, **change), tmp_path)
+    assert str(raised.value) == f"{told}asked for {value}: choose another folder"
     after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     assert after == before and len(before) >= 4
 

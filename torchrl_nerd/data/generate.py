@@ -33,6 +33,7 @@ from torchrl_nerd.files import read_json, writable_folder, write_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.variation import ranges_of
 from torchrl_nerd.seeds import fold_in
+from torchrl_nerd.settings import expect_same
 
 CHUNK = 2048  # trajectories simulated together; a killed process loses at most these
 CARD = "data.json"
@@ -198,12 +199,9 @@ def _open_card(
         write_json(path, fresh)  # before any chunk, which never exists without a card
         return fresh
     card = read_json(path)
-    for key in ("scene_hash", "config", "strategy", "ranges", "variation"):
-        if card.get(key) != fresh.get(key):
-            raise ValueError(
-                f"{folder} already holds data with {key} {card.get(key)}, asked for "
-                f"{fresh.get(key)}: choose another folder"
-            )
+    identity = ("scene_hash", "config", "strategy", "ranges", "variation")
+    asked = {key: fresh.get(key) for key in identity}
+    expect_same(f"{folder} already holds data", card, asked)
     _check_counts(card, folder)
     drawn = min(card["chunks_done"] * CHUNK, config.trajectories)
     if card["trajectories"] + card["dropped"] != drawn:

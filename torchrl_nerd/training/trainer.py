@@ -28,6 +28,7 @@ from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
+from torchrl_nerd.settings import expect_same
 from torchrl_nerd.training.capture import Captured
 from torchrl_nerd.training.log import LoggerName, TrainingLog, open_logger
 from torchrl_nerd.training.losses import one_step_loss, rollout_loss
@@ -284,12 +285,7 @@ class Trainer:
 
     def _resume(self) -> None:
         card = read_json(self.folder / STATE)
-        for key, value in self.identity.items():
-            if card.get(key) != value:
-                raise ValueError(
-                    f"{self.folder} holds a run with {key} {card.get(key)}, asked for "
-                    f"{value}: choose another folder"
-                )
+        expect_same(f"{self.folder} holds a run", card, self.identity)
         self.step, self.best = self.state.restore(self.folder)
         seconds = card.get("seconds")
         if not 0 < self.step <= self.config.total_steps or type(seconds) is not float:
