@@ -12,8 +12,7 @@ TOOLS = Path(__file__).parent / "tools"
 
 
 # One of the data; fixed moments of a training are in training/test_resume.py.
-@pytest.mark.slow
-@pytest.mark.parametrize("kills", [1, 100])
+@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.slow)])
 def test_nothing_is_lost(kills, seed, tmp_path):
     command = [sys.executable, "kill_trials.py", "--kills", str(kills)]
     results = tmp_path / "kills.json"
