@@ -233,6 +233,8 @@ def test_it_is_trained_saved_loaded_and_trained_on(ant_data, tmp_path):
     model = trainer.run().eval()
     loaded = load_checkpoint(tmp_path / "second" / "last")
     assert loaded.config == start.config == MLPConfig(1, 16, symmetries=4)
+    (sources, signs), center = Symmetry(scene).tokens.copies, loaded.ood.center
+    torch.testing.assert_close(signs * center[sources], center.expand_as(signs))
     state, paths = ant_data[:, 1], []
     for one in (model, loaded, start):
         dynamics = NeRDDynamics(one)

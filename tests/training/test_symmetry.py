@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
@@ -163,6 +163,29 @@ def test_the_range_of_a_training_has_the_symmetries(name, generator):
         assert (seen.speed[isometry.joint_sources] == seen.speed[6:]).all()
     assert (seen.qpos_low <= before.qpos_low).all()
     assert (seen.speed >= before.speed).all()
+
+
+@pytest.mark.parametrize("name", ["ant", "cube"])
+def test_the_score_of_a_copy_is_that_of_the_original(name, generator):
+    """Without the copies of the data it is another one."""
+    scene = load_scene(name)
+    data = simulate(scene, 20, 10, generator)
+    data, symmetry = data[is_sound(data)], Symmetry(scene)
+    stats = symmetry.complete(data_stats(scene, data))
+    model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats)
+    x = 3.0 * torch.randn(50, 1, symmetry.tokens.signs.shape[1], generator=generator)
+    x = x.double()
+
+    def scores() -> Tensor:
+        """Of every copy (K, 50)."""
+        every = torch.arange(len(symmetry.isometries))[:, None].expand(-1, 50)
+        there = [symmetry.tokens(x, choice) for choice in every]
+        return model.ood.mahalanobis(torch.stack(there)[:, :, 0]) / model.ood.reach
+
+    cover(model, data, copies=symmetry.tokens.copies)
+    torch.testing.assert_close(scores(), scores()[:1].expand_as(scores()))
+    cover(model, data)
+    assert (scores() - scores()[0]).abs().amax() > 0.01
 
 
 @pytest.fixture

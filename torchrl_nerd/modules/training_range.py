@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
+from torchrl_nerd.modules.symmetric import SignedCopies
 from torchrl_nerd.scenes.scene import Scene
 
 MARGIN = 0.1  # of a range's width, on either side
@@ -144,13 +145,23 @@ class OODScore(nn.Module):
         self.register_buffer("reach", one)
 
     @torch.no_grad()
-    def fit(self, features: Tensor) -> None:
-        """Take mean, covariance and quantile of ``(samples, F)``."""
+    def fit(self, features: Tensor, copies: SignedCopies | None = None) -> None:
+        """Take mean, covariance and quantile of ``(samples, F)``.
+
+        With symmetric ``copies`` of the samples the mean and covariance are of all of
+        them, and a copy's score is that of the original.
+        """
         some = features[:: max(1, len(features) // MAX_SAMPLES)].double()
-        self.center.copy_(some.mean(0))
-        around = some - self.center
+        own = torch.arange(some.shape[1], device=some.device)[None]
+        sources, signs = copies or (own, torch.ones_like(own))  # (K, F)
+        center = (signs * some.mean(0)[sources]).mean(0)
+        self.center.copy_(center)
+        around = some - center
+        covariance = around.T @ around / len(some)
+        pairs = covariance[sources[:, :, None], sources[:, None]]  # (K, F, F)
+        covariance = (signs[:, :, None] * signs[:, None] * pairs).mean(0)
         ridge = RIDGE * torch.eye(some.shape[1], dtype=some.dtype, device=some.device)
-        values, axes = torch.linalg.eigh(around.T @ around / len(some) + ridge)
+        values, axes = torch.linalg.eigh(covariance + ridge)
         # the ridge bounds eigenvalues from below, but for rounding beside a huge one
         self.whitening.copy_((axes / values.clamp_min(RIDGE).sqrt()).T)
         length = self.mahalanobis(some)

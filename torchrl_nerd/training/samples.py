@@ -19,6 +19,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
+from torchrl_nerd.modules.symmetric import SignedCopies
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive_of
 from torchrl_nerd.transforms import StateDelta, Stats
@@ -80,13 +81,17 @@ def normalised(model: NeRD, data: TensorDict) -> tuple[Tensor, Tensor]:
 
 
 def cover(
-    model: NeRD, data: TensorDict, samples: tuple[Tensor, Tensor] | None = None
+    model: NeRD,
+    data: TensorDict,
+    samples: tuple[Tensor, Tensor] | None = None,
+    copies: SignedCopies | None = None,
 ) -> None:
     """Fit a model's training range and out-of-distribution score to its data, in place.
 
-    ``samples``: normalised features and targets, where they are there already.
+    ``samples``: normalised features and targets, where they are there already; ``copies``
+    are the symmetric ones of the features, which the score then covers too.
     """
     features, targets = (x.flatten(0, -2) for x in samples or normalised(model, data))
     seen = (data[key].flatten(0, -2) for key in (NEXT_QPOS, NEXT_QVEL))
     model.training_range.fit(features, targets, *seen)
-    model.ood.fit(features)
+    model.ood.fit(features, copies)

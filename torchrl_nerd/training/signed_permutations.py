@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry.base import keep_constants, keep_indices
+from torchrl_nerd.modules.symmetric import SignedCopies
 from torchrl_nerd.transforms import Stats
 
 RTOL = 1e-7  # of equal entries, relative to the largest of a column
@@ -27,6 +28,11 @@ class SignedPermutations(nn.Module):
         sources, signs = zip(*matched, strict=True)
         keep_indices(self, sources=sources)  # (isometries, F)
         keep_constants(self, signs=signs)
+
+    @property
+    def copies(self) -> SignedCopies:
+        """Sources and signs of all of them."""
+        return self.sources, self.signs
 
     def forward(self, x: Tensor, choice: Tensor) -> Tensor:
         """Copies of ``x (batch, length, F)``, each by isometry ``choice (batch,)``."""

@@ -147,9 +147,11 @@ class Trainer:
             model = begin_from(init_from, self.scene, self.config, symmetry)
             self.init_from = fingerprint(init_from)
         self.model = model.to(self.device)
+        symmetry = symmetry and symmetry.to(self.device)
         shown = symmetry if self.config.use_symmetry else None
         self.sequences, self.resting = Sequences(model, data, shown), resting(data)
-        cover(model, data, (self.sequences.features, self.sequences.targets))
+        seen = self.sequences.features, self.sequences.targets
+        cover(model, data, seen, symmetry and symmetry.tokens.copies)
         if init_from is not None:
             model.training_range.widen(init_from.training_range)
         if symmetry is not None:
