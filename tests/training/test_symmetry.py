@@ -1,6 +1,7 @@
 """A robot's isometries: groups that the MuJoCo solver and the features agree with."""
 
 import copy
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -37,6 +38,12 @@ ORDERS = {"ant": 8, "cube": 48, "anymal": 1}
 def scene(request) -> Scene:
     """Each robot that has a symmetry, or may have one."""
     return load_scene(request.param)
+
+
+@cache
+def symmetry_of(name: str) -> Symmetry:
+    """Found once: it takes seconds for the cube's 48."""
+    return Symmetry(load_scene(name))
 
 
 @pytest.mark.parametrize(("name", "order"), ORDERS.items())
@@ -141,7 +148,7 @@ def test_the_range_of_a_training_has_the_symmetries(name, generator):
     """So that what is clamped is so in every symmetric copy."""
     scene = load_scene(name)
     data = simulate(scene, 20, 10, generator)
-    data, symmetry = data[is_sound(data)], Symmetry(scene)
+    data, symmetry = data[is_sound(data)], symmetry_of(scene.name)
     stats = symmetry.complete(data_stats(scene, data))
     model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats)
     cover(model, data)
@@ -170,7 +177,7 @@ def test_the_score_of_a_copy_is_that_of_the_original(name, generator):
     """Without the copies of the data it is another one."""
     scene = load_scene(name)
     data = simulate(scene, 20, 10, generator)
-    data, symmetry = data[is_sound(data)], Symmetry(scene)
+    data, symmetry = data[is_sound(data)], symmetry_of(scene.name)
     stats = symmetry.complete(data_stats(scene, data))
     model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats)
     x = 3.0 * torch.randn(50, 1, symmetry.tokens.signs.shape[1], generator=generator)
@@ -199,7 +206,7 @@ def test_a_copy_of_a_trajectory_is_the_trajectory_of_the_copy(scene, data):
     steps, start = 10, data[:, 0]
     torque = data[JOINT_TORQUE][:, :steps]
     dynamics = MujocoDynamics(scene, num_threads=1)
-    for isometry in find_isometries(scene):
+    for isometry in symmetry_of(scene.name).isometries:
         mirrored = isometry(start)
         dynamics.reset(mirrored)
         path = dynamics.rollout(mirrored, isometry.torque(torque))
@@ -218,7 +225,7 @@ def _apart(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def test_the_group_is_closed_and_has_inverses(scene, data):
     """Every product of two is one of them again."""
     state = data[:, 0]
-    group = find_isometries(scene)
+    group = symmetry_of(scene.name).isometries
     copies = [isometry(state) for isometry in group]
     for first in group[:8]:
         for second in group[-8:]:
@@ -228,7 +235,7 @@ def test_the_group_is_closed_and_has_inverses(scene, data):
 
 
 def test_tokens_and_targets_are_renumbered(scene, data):
-    symmetry = Symmetry(scene)
+    symmetry = symmetry_of(scene.name)
     encode = SceneFeatures(scene), StateDelta(scene)
     flat = data.flatten(0, 1)[::7]
     here = raw_tokens(*encode, flat)
@@ -243,7 +250,7 @@ def test_tokens_and_targets_are_renumbered(scene, data):
 
 def test_statistics_are_those_of_all_copies(scene, data):
     """So that normalised vectors are renumbered as raw ones are."""
-    symmetry = Symmetry(scene)
+    symmetry = symmetry_of(scene.name)
     found = symmetry.complete(data_stats(scene, data))
     copies = [isometry(data) for isometry in symmetry.isometries]
     expected = data_stats(scene, torch.cat(copies))
@@ -263,7 +270,7 @@ def test_statistics_are_those_of_all_copies(scene, data):
 
 def test_batches_show_symmetric_copies_of_the_data(scene, data, generator):
     """Those of one step and those of rollouts, which the MuJoCo solver also takes."""
-    symmetry = Symmetry(scene)
+    symmetry = symmetry_of(scene.name)
     model = NeRD(
         scene,
         NO_PREDICTIONS,
