@@ -23,7 +23,7 @@ class FeatureConfig:
     # scenes that follow it; see `PredictedForce`
     predicted_force: bool = False
     # contacts predicted along the motion that the robot has if nothing touches it, not at
-    # constant velocity; see `PredictedPenetration`
+    # constant velocity; see `AlongUnconstrainedMotion`
     unconstrained_motion: bool = False
     # the robot's parameters, for a model of a varied scene that is told what others
     # find in their history; see `Variation`

@@ -209,7 +209,7 @@ def test_what_far_points_do_is_not_seen(scene, junk, generator, monkeypatch):
     def corrupted(qpos, qvel):
         places, velocity = true(qpos, qvel)
         velocity = velocity.clone()
-        velocity[:, : transform.count][is_far] = junk
+        velocity[0, :, : transform.count][is_far] = junk  # (1, ROWS, P, 3)
         return places, velocity
 
     monkeypatch.setattr(transform.kinematics, "forward", corrupted)

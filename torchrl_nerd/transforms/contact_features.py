@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.base import BasePose, JointAxes, keep_constants, over_ground
 from torchrl_nerd.geometry.kinematics import PointKinematics
+from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
@@ -34,8 +35,9 @@ from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.terrain import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
 from torchrl_nerd.transforms.predicted_contact import (
+    AlongUnconstrainedMotion,
+    AtConstantVelocity,
     PredictedForce,
-    PredictedPenetration,
     times_of,
 )
 
@@ -57,7 +59,7 @@ class ContactFeatures(FeatureTransform):
       contacts over the step, N and N m, see `PredictedForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
-    The K = min(substeps, 5) times are those of `PredictedPenetration`. A scene without
+    The K = min(substeps, 5) times are those of `AtConstantVelocity`. A scene without
     contact gives no keys at all. ``features`` adds predictions; none by default.
     """
 
@@ -104,7 +106,10 @@ class ContactFeatures(FeatureTransform):
         self.count = count
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         self.pose = BasePose(scene.model, scene.base)
-        self.predicted_penetration = PredictedPenetration(scene, self.ground, self.pose)
+        self.layout, self.at_constant_velocity = scene.layout, AtConstantVelocity(scene)
+        if self.rigid_body is not None:
+            given = scene, self.ground, self.pose
+            self.along_unconstrained_motion = AlongUnconstrainedMotion(*given)
         keep_constants(self, radii=points.radii, margins=points.margins)
 
     def contact_features(
@@ -122,25 +127,36 @@ class ContactFeatures(FeatureTransform):
         """
         if self.terrain is None:
             return []
-        found, velocity = self.kinematics(qpos, qvel)
+        states = qpos[None]  # (1, *batch, nq), or (2, *batch, nq) with the step's end
+        if self.rigid_body is None:
+            later = integrate_pos(self.layout, qpos, self.step_size * qvel)
+            states = torch.stack((qpos, later))
+        # where the robot is now alone, points need a velocity
+        found, velocity = self.kinematics(states, qvel[None])
         sizes = (self.count, found.shape[-2] - self.count)
-        now, places = found.split(sizes, -2)  # (*batch, P, 3), ...
-        velocity = velocity[..., : self.count, :]
-        pose = self.pose(qpos)
-        distance, normal = self.ground(now, terrain, *pose)
-        velocity = over_ground(self.base, qvel, now, velocity, pose[1])
+        points, places = found.split(sizes, -2)  # (1 or 2, *batch, P, 3), ...
+        ground = (
+            None if terrain is None else terrain.expand(len(states), *terrain.shape)
+        )
+        pose = self.pose(states)
+        distances, normals = self.ground(points, ground, *pose)
+        now, places, distance, normal = points[0], places[0], distances[0], normals[0]
+        rotation, velocity = pose[1][0], velocity[0, ..., : self.count, :]
+        velocity = over_ground(self.base, qvel, now, velocity, rotation)
         beyond = distance - self.margins
         gate = (beyond / (FADE * (self.radii - self.margins))).clamp(0.0, 1.0)
         gate = gate[..., None]  # (*batch, P, 1)
         speed = (velocity * normal).sum(-1)
         sliding = velocity - speed[..., None] * normal
-        velocity_change = None  # of unconstrained motion over the step
-        if self.rigid_body is not None:
+        if self.rigid_body is None:
+            depths = self.radii - distances  # (2, *batch, P)
+            penetration = self.at_constant_velocity(depths[0], speed, depths[1])
+        else:
             torque = None if drive is None else drive[..., : self.num_torques]
-            given = qpos, qvel, torque, pose[1], places, self.step_size
-            velocity_change = self.step_size * self.rigid_body(*given)
-        motion = qpos, qvel, terrain, velocity_change
-        penetration = self.predicted_penetration(*motion, self.radii - distance, speed)
+            given = qpos, qvel, torque, rotation, places, self.step_size
+            change = self.step_size * self.rigid_body(*given)
+            motion = qpos, qvel, terrain, change
+            penetration = self.along_unconstrained_motion(*motion)
         depth = gate * penetration  # (*batch, P, K)
         moving = gate * torch.cat((speed[..., None], sliding), -1)  # (*batch, P, 4)
         features = [beyond.clamp_max(0.0), moving.flatten(-2), depth.flatten(-2)]

@@ -20,15 +20,40 @@ MAX_TIMES = 5  # within a step
 MIN_SLIP = 1e-9  # m/s: keeps the direction of slip defined at rest
 
 
-class PredictedPenetration(nn.Module):
-    """Predicted penetration of every contact point at K times of the step.
+class AtConstantVelocity(nn.Module):
+    """Predicted penetration at K times of the step, if every point keeps its velocity.
 
     The K = min(substeps, 5) times are spaced evenly from the step's start on: with few
     substeps they are those at which MuJoCo evaluates collision.
     """
 
-    radii: Tensor
     parabola: Tensor
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.period = scene.control_step
+        keep_constants(self, parabola=parabola(times_of(scene)))
+
+    def forward(self, depth: Tensor, speed: Tensor, later: Tensor) -> Tensor:
+        """Penetrations ``(*batch, P, K)``, m, at least zero.
+
+        The parabola through the depth and its rate now and the depth after the step. Of
+        every point ``depth`` and ``later`` are the two ``(*batch, P)``, m, and ``speed
+        (*batch, P)`` is that along its normal now, m/s.
+        """
+        ends = depth, -self.period * speed, later
+        # (*batch, P, 3) @ (3, K)
+        return (torch.stack(ends, -1) @ self.parabola).clamp_min(0.0)
+
+
+class AlongUnconstrainedMotion(nn.Module):
+    """Predicted penetration at the same K times, if no contact changes the motion.
+
+    The cubic through depths and rates at both ends of the step, accurate to 0.02 mm in
+    the double pendulum's impacts.
+    """
+
+    radii: Tensor
     cubic: Tensor
 
     def __init__(self, scene: Scene, ground: TerrainDistance, pose: BasePose) -> None:
@@ -44,42 +69,20 @@ class PredictedPenetration(nn.Module):
         one = times_of(scene)
         two, three = one**2, one**3
         blend = 3.0 * two - 2.0 * three
-        keep_constants(  # polynomials at the K times, by their values at the ends
-            self,
-            radii=points.radii,
-            parabola=parabola(one),
-            cubic=np.stack((1.0 - blend, one - 2.0 * two + three, blend, three - two)),
-        )
+        # polynomials at the K times, by their values and slopes at the ends
+        cubic = np.stack((1.0 - blend, one - 2.0 * two + three, blend, three - two))
+        keep_constants(self, radii=points.radii, cubic=cubic)
 
     def forward(
-        self,
-        qpos: Tensor,
-        qvel: Tensor,
-        terrain: Tensor | None,
-        velocity_change: Tensor | None,
-        depth: Tensor,
-        speed: Tensor,
+        self, qpos: Tensor, qvel: Tensor, terrain: Tensor | None, change: Tensor
     ) -> Tensor:
         """Penetrations ``(*batch, P, K)``, m, at least zero.
 
-        At constant velocity the parabola through the depth and its rate now and the depth
-        after the step. Along unconstrained motion the cubic through depths and rates at
-        both ends, accurate to 0.02 mm in the double pendulum's impacts.
-
-        ``velocity_change (*batch, nv)`` is that of unconstrained motion over the step;
-        None: at constant velocity. Of every point now, ``depth (*batch, P)`` is in m and
-        ``speed (*batch, P)`` that along its normal, m/s.
+        ``change (*batch, nv)`` is that of the velocity over the step.
         """
-        if velocity_change is None:
-            later = integrate_pos(self.layout, qpos, self.period * qvel)
-            points, _ = self.kinematics(later, qvel.new_empty(0, qvel.shape[-1]))
-            distance, _ = self.ground(points, terrain, *self.pose(later))
-            ends = depth, -self.period * speed, self.radii - distance
-            # (*batch, P, 3) @ (3, K)
-            return (torch.stack(ends, -1) @ self.parabola).clamp_min(0.0)
         # semi-implicit Euler: velocity first
-        first = qvel + 0.5 / self.substeps * velocity_change
-        mean, last = first + 0.5 * velocity_change, first + velocity_change
+        first = qvel + 0.5 / self.substeps * change
+        mean, last = first + 0.5 * change, first + change
         later = integrate_pos(self.layout, qpos, self.period * mean)
         # both ends of the step at once: (2, *batch, nq) and (2, *batch, nv)
         states, rates = torch.stack((qpos, later)), torch.stack((first, last))
@@ -168,7 +171,9 @@ class PredictedForce(nn.Module):
         force = merged[:, None] * force  # coinciding points act one by one
         moment = torch.linalg.cross(points, force)
         anchor, tip = places.chunk(2, -2)  # (*batch, J, 3) each
-        force_on, moment_on = self.ancestry @ force, self.ancestry @ moment
+        # one product of matrices, not one for every robot: (2, *batch, 3, P) @ (P, J)
+        both = torch.stack((force, moment)).mT @ self.ancestry.mT
+        force_on, moment_on = both.mT  # (*batch, J, 3) each
         turning = moment_on - torch.linalg.cross(anchor, force_on)
         along = torch.where(self.is_slide[:, None] > 0.0, force_on, turning)
         parts = [((tip - anchor) * along).sum(-1)]  # (*batch, J)

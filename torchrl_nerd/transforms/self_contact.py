@@ -33,7 +33,7 @@ class SelfContactFeatures(FeatureTransform):
       first, at the axes of their capsules, m/s | 4 P |
     | depth | g * penetration at K times of the step at constant velocity, m | K P |
 
-    The K times are those of `PredictedPenetration`. No keys at all where no shapes come
+    The K times are those of `AtConstantVelocity`. No keys at all where no shapes come
     near each other, or where the model's `FeatureConfig` does not ask for them.
     """
 
