@@ -148,13 +148,15 @@ model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequen
 	$(call LEARN_ROLLOUTS,cartpole,1000,250)
 	$(call SHIP_ADAPTIVE,cartpole)
 
-ANT := --data datasets/ant datasets/ant_run --symmetries 4 --rollout-lr-ratio 0.25 \
+ANT := --data datasets/ant datasets/ant_run datasets/ant_spin --symmetries 4 --rollout-lr-ratio 0.25 \
 	--validate-every 4000 --save-every 500 --threads 1
 
 data-ant: $(STAMP)
 	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
 	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 3000 --seed 31 \
 		--out datasets/ant_run
+	$(NERD) data ant --policy torchrl_nerd/policies/ant-spin --trajectories 3000 --seed 41 \
+		--out datasets/ant_spin
 
 model-ant: data-ant ## the Ant's transformer, with the mirrors of the Ant built in
 	$(NERD) train ant $(ANT) --network transformer-4x128 --single-step-fraction 0.85 \
@@ -246,7 +248,7 @@ model-double_pendulum-mlp: $(STAMP) ## the double pendulum's MLP: two stages
 		--out runs/double_pendulum_on
 	cp runs/double_pendulum_on/best/* $(PRETRAINED)/double_pendulum-mlp/
 
-# Policies, learned without MuJoCo. Those of the Ant and of Franka learned in the first
+# Policies, learned without MuJoCo. Those of ant/run and of Franka learned in the first
 # edition's hybrids, whose place the analytic steps have taken.
 POLICIES := torchrl_nerd/policies
 PPO := OMP_NUM_THREADS=1 $(PY) examples/ppo.py
@@ -256,7 +258,7 @@ SHIP_POLICY = mkdir -p $(POLICIES)/$* && cp runs/$@/policy.* $(POLICIES)/$*/
 LEGGED := $(addprefix policy-,ant-run ant-spin ant-spin_track anymal-forward anymal-sideways)
 FRAMES := 8000000
 
-policies: policy-cartpole-swingup $(LEGGED) policy-franka-reach policy-franka-reach_osc policy-franka-reach_torque ## a policy for every task with a goal, eight hours on one core
+policies: policy-cartpole-swingup $(LEGGED) policy-franka-reach policy-franka-reach_osc policy-franka-reach_torque ## a policy for every task with a goal, hours on one core
 
 policy-cartpole-swingup: policy-%: $(STAMP)
 	$(PPO) --total-frames 6000000 --out runs/$@
@@ -265,7 +267,7 @@ policy-cartpole-swingup: policy-%: $(STAMP)
 policy-ant-spin_track: FRAMES := 24000000
 $(LEGGED): policy-%: $(STAMP)
 	$(PPO) --task $(subst -,/,$*) --dynamics analytic --compile --horizon 16 --minibatch 8192 --lr 1e-3 \
-		--total-frames $(FRAMES) --out runs/$@
+		--total-frames $(FRAMES) --evaluate-every 1000 --episodes 256 --out runs/$@
 	$(SHIP_POLICY)
 
 policy-franka-reach: policy-%: $(STAMP)
