@@ -245,8 +245,9 @@ def transfer_table(folder: Path = RESULTS) -> str:
 
 
 def returns_table(folder: Path = RESULTS) -> str:
-    """Returns of the shipped policies of ant/run and franka/reach."""
-    found = (returns_tables(x, folder) for x in ("ant_run*", "franka_reach"))
+    """Returns of the shipped policies of ant/run, ant/spin and franka/reach."""
+    patterns = "ant_run*", "ant_spin", "franka_reach"
+    found = (returns_tables(x, folder) for x in patterns)
     return "\n\n".join(x for x in found if x)
 
 
