@@ -148,15 +148,13 @@ model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequen
 	$(call LEARN_ROLLOUTS,cartpole,1000,250)
 	$(call SHIP_ADAPTIVE,cartpole)
 
-ANT := --data datasets/ant datasets/ant_run datasets/ant_spin --symmetries 4 --rollout-lr-ratio 0.25 \
+ANT := --data datasets/ant datasets/ant_run --symmetries 4 --rollout-lr-ratio 0.25 \
 	--validate-every 4000 --save-every 500 --threads 1
 
 data-ant: $(STAMP)
 	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
 	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 3000 --seed 31 \
 		--out datasets/ant_run
-	$(NERD) data ant --policy torchrl_nerd/policies/ant-spin --trajectories 3000 --seed 41 \
-		--out datasets/ant_spin
 
 model-ant: data-ant ## the Ant's transformer, with the mirrors of the Ant built in
 	$(NERD) train ant $(ANT) --network transformer-4x128 --single-step-fraction 0.85 \
