@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, TrainConfig
@@ -143,14 +144,20 @@ def test_products_that_are_no_isometries_are_no_symmetries():
     assert copies.mirrors(4) is None
 
 
+def small_model(name: str, generator: Generator) -> tuple[NeRD, TensorDict]:
+    """An untrained one whose statistics have the symmetries, and its data."""
+    scene = load_scene(name)
+    data = simulate(scene, 20, 10, generator)
+    data = data[is_sound(data)]
+    stats = symmetry_of(name).complete(data_stats(scene, data))
+    return NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats), data
+
+
 @pytest.mark.parametrize("name", ["ant", "cube"])
 def test_the_range_of_a_training_has_the_symmetries(name, generator):
     """So that what is clamped is so in every symmetric copy."""
-    scene = load_scene(name)
-    data = simulate(scene, 20, 10, generator)
-    data, symmetry = data[is_sound(data)], symmetry_of(scene.name)
-    stats = symmetry.complete(data_stats(scene, data))
-    model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats)
+    model, data = small_model(name, generator)
+    symmetry = symmetry_of(name)
     cover(model, data)
     seen, before = model.training_range, copy.deepcopy(model.training_range)
     symmetry.complete_range(seen)
@@ -175,11 +182,8 @@ def test_the_range_of_a_training_has_the_symmetries(name, generator):
 @pytest.mark.parametrize("name", ["ant", "cube"])
 def test_the_score_of_a_copy_is_that_of_the_original(name, generator):
     """Without the copies of the data it is another one."""
-    scene = load_scene(name)
-    data = simulate(scene, 20, 10, generator)
-    data, symmetry = data[is_sound(data)], symmetry_of(scene.name)
-    stats = symmetry.complete(data_stats(scene, data))
-    model = NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats)
+    model, data = small_model(name, generator)
+    symmetry = symmetry_of(name)
     x = 3.0 * torch.randn(50, 1, symmetry.tokens.signs.shape[1], generator=generator)
     x = x.double()
 
