@@ -8,6 +8,7 @@ from helpers import simulated
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.data.physics_checks import check_log
+from torchrl_nerd.data.recorded import CLEAR, complete
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate, rotate_inverse
 
 XYZW = [1, 2, 3, 0]
@@ -51,6 +52,16 @@ def without(log, row: int, count: int):
 def test_real_tosses_pass_with_all_that_was_asked(log, real_cube):
     checks = check_log(log, real_cube)
     assert len(checks) == 7 and all(check.passes for check in checks)
+
+
+def test_the_ground_is_each_trajectorys_own(generator):
+    scene = load_scene("cube_slope")
+    log = simulated(scene, generator, states=120)
+    assert all(check.passes for check in check_log(log, scene))
+    touches = scene.clearances(log.qpos, log.terrain).amin(-1) <= CLEAR
+    found = complete(log, scene)  # which corrects velocities in flight alone
+    assert 0.2 < touches.double().mean() < 0.98
+    assert torch.equal(found.qvel[touches], log.qvel[touches])
 
 
 def test_where_they_are_and_face_does_not_matter(log, real_cube, generator):

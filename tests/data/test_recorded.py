@@ -39,7 +39,7 @@ def same(a, b):
 
 
 def test_csv_and_npz_give_the_same_tosses(log, real_cube, tmp_path):
-    header = "toss,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz"
+    header = "trajectory,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz"
     write_csv(tmp_path / "log.csv", header, numbers(log), log.qpos, log.qvel)
     assert same(read_log(tmp_path / "log.csv", real_cube), log)
 
@@ -248,8 +248,23 @@ def test_columns_that_are_nearly_right_are_refused(names, said, generator, tmp_p
         read_log(tmp_path / "log.csv", load_scene("cartpole"))
 
 
+@pytest.mark.parametrize("dtype", [np.longdouble, ">f8", np.float32, np.int16])
+def test_numbers_of_any_type_are_read(dtype, tmp_path):
+    qpos = np.arange(8).reshape(4, 2)
+    np.savez(tmp_path / "log.npz", qpos=qpos.astype(dtype))
+    found = read_log(tmp_path / "log.npz", load_scene("cartpole"))
+    assert found.qpos.tolist() == qpos.tolist()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_log_of_no_motion_is_refused(count, tmp_path):
+    np.savez(tmp_path / "log.npz", qpos=np.zeros((count, 2)))
+    with pytest.raises(ValueError, match=f"at least 2 frames in .*, got {count}"):
+        read_log(tmp_path / "log.npz", load_scene("cartpole"))
+
+
 def test_a_pose_without_one_of_its_columns_is_refused(log, real_cube, tmp_path):
-    header = "toss,x,y,z,qw,qx,qy,qz,vx,vy"
+    header = "trajectory,x,y,z,qw,qx,qy,qz,vx,vy"
     write_csv(tmp_path / "log.csv", header, numbers(log), log.qpos, log.qvel[:, :2])
     with pytest.raises(ValueError, match="expected columns vx, vy, vz .* named vz"):
         read_log(tmp_path / "log.csv", real_cube)

@@ -73,6 +73,8 @@ def read_log(path: Path, scene: Scene) -> Recording:
             found = ", ".join(sorted(arrays)) or "nothing"
             raise ValueError(f"expected '{name}' in {path}, found {found}")
     count = len(arrays[needed[0]])
+    if count < 2:
+        raise ValueError(f"expected at least 2 frames in {path}, got {count}")
     shapes = {"time": (count,), "trajectory": (count,)}
     shapes |= {name: (count, size) for name, size in sizes.items()}
     tensors = {}
@@ -82,7 +84,7 @@ def read_log(path: Path, scene: Scene) -> Recording:
                 f"expected '{name}' of shape {shapes[name]} in {path}, "
                 f"got {arrays[name].shape}"
             )
-        tensors[name] = torch.as_tensor(arrays[name], dtype=torch.float64)
+        tensors[name] = torch.from_numpy(arrays[name].astype(np.float64))
         bad = (~tensors[name].reshape(count, -1).isfinite()).any(1).nonzero()
         if len(bad):
             raise ValueError(
@@ -172,13 +174,13 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         for array, its in columns.items()
         if names.issuperset(its)
     }
-    others = {"time": "time", "toss": "trajectory", "trajectory": "trajectory"}
-    for name in sorted(names - others.keys()):
+    others = "time", "trajectory"
+    for name in sorted(names.difference(others)):
         if name.lower() in others:
             raise ValueError(
                 f"expected a column '{name.lower()}' in {path}, got '{name}'"
             )
-    return arrays | {others[name]: table[name] for name in others if name in names}
+    return arrays | {name: table[name] for name in others if name in names}
 
 
 def _expect_columns(path: Path, expected: tuple[str, ...], names: set[str]) -> None:

@@ -156,7 +156,7 @@ def _gravity(fall: Tensor, scene: Scene) -> Check:
 def _depth(log: Recording, swapped: Recording, scene: Scene) -> Check:
     """How deep the lowest contact point ever lies in the ground."""
     found, if_swapped = (
-        -float(scene.clearances(normalize_pos(scene.layout, x.qpos)).min())
+        -float(scene.clearances(normalize_pos(scene.layout, x.qpos), x.terrain).min())
         for x in (log, swapped)
     )
     limit = DEEPEST * float(abs(scene.contacts.positions).max())

@@ -82,7 +82,8 @@ def fit_flight(scene: Scene, recording: Recording) -> dict[str, float]:
     ``p + R c = p0 + v0 t - g t^2 / 2``, linear in all unknowns. Empty where no trajectory
     is off the ground long enough.
     """
-    is_airborne = scene.clearances(recording.qpos).amin(-1) > CLEAR
+    gaps = scene.clearances(recording.qpos, recording.terrain)
+    is_airborne = gaps.amin(-1) > CLEAR
     rows, values = [], []
     for trajectory in recording.trajectories:
         # until it first lands
