@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers import make_scene
 from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate
+from torchrl_nerd.scenes.penalty_law import set_penalty_contact
 
 ROWS = 32
 
@@ -162,6 +164,42 @@ def test_other_robots_and_contacts_are_refused(real_cube):
     model.geom_solref[:] = (0.02, 1.0)
     with pytest.raises(ValueError, match="contacts that are springs and dampers"):
         FreeBodyPenaltyStep(replace(real_cube, model=model))
+
+
+TOSSED = """<mujoco><option cone="elliptic" timestep="0.001" gravity="{gravity}"/>
+  <worldbody><geom type="plane" size="1 1 1" {plane}/><body pos="0 0 1">
+  <joint type="free" damping="{damping}"/><geom type="{shape}" {pose} mass="1"/></body>
+  </worldbody></mujoco>"""
+BOX = {
+    "gravity": "0 0 -9.81",
+    "plane": "",
+    "damping": "0",
+    "shape": "box",
+    "pose": 'size="0.1 0.2 0.1"',
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"plane": 'pos="0 0 -0.3"'}, "another ground"),
+        ({"plane": 'euler="20 0 0"'}, "another ground"),
+        ({"shape": "sphere"}, "round shapes"),
+        ({"pose": 'size="0.1 0.2 0.1" pos="0.1 0 0"'}, "axes of inertia"),
+        ({"pose": 'size="0.1 0.2 0.1" euler="30 0 0"'}, "axes of inertia"),
+        ({"gravity": "1 0 -9.81"}, "gravity to the side"),
+        ({"damping": "0.1"}, "damping"),
+    ],
+)
+def test_a_free_body_with_more_than_it_knows_is_refused(changes, said):
+    def step(**parts):
+        scene = make_scene(TOSSED.format(**{**BOX, **parts}))
+        set_penalty_contact(scene.model, ke=1e4, kd=100.0, kf=100.0, mu=0.5)
+        return FreeBodyPenaltyStep(scene)
+
+    step()
+    with pytest.raises(ValueError, match=f"expected a free body of corners.*{said}"):
+        step(**changes)
 
 
 def test_fitted_parameters_stay_over_another_ground(real_cube):

@@ -17,7 +17,7 @@ from torchrl_nerd.analytic.penalty_contact import PenaltyContactStep
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.scenes.penalty_law import set_penalty_contact
+from torchrl_nerd.scenes.penalty_law import PenaltyLaw, set_penalty_contact
 
 ROWS = 256
 BALL = """<mujoco><option cone="{cone}" timestep="0.001"/><worldbody>
@@ -257,6 +257,47 @@ def test_so_are_contacts_and_limits_of_another_law():
     model.jnt_solref[:] = (0.02, 1.0)
     with pytest.raises(ValueError, match="expected limits that are springs"):
         PenaltyContactStep(replace(scene, model=model))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("geom_solimp", (0.9, 0.95, 0.001, 0.5, 2.0), "with an impedance"),
+        ("geom_margin", 0.01, "with a margin or gap"),
+        ("geom_condim", 1, "with a condim other than 3"),
+        ("geom_priority", 0, "with the ground's priority"),
+        ("jnt_margin", 0.1, "limits that are springs .* with a margin or an imp"),
+        ("jnt_solimp", (0.9, 0.95, 0.001, 0.5, 2.0), "limits that are springs"),
+    ],
+)
+def test_all_that_makes_it_another_law_is_named(field, value, said):
+    scene = load_scene("ant")
+    model = scene.with_substeps(scene.substeps).model
+    getattr(model, field)[:] = value
+    with pytest.raises(ValueError, match=said):
+        PenaltyContactStep(replace(scene, model=model))
+
+
+def test_the_law_is_that_of_the_shapes_that_touch():
+    """A shape that is only seen has no say; two that touch have to agree."""
+    plain = """<mujoco><option cone="elliptic" timestep="0.001"/><worldbody>
+      <geom type="plane" size="1 1 1"/><body pos="0 0 0.2"><freejoint/>{}
+      <geom size="0.1" pos="{} 0 0" density="200"/></body></worldbody></mujoco>"""
+    seen = '<geom size="0.02" contype="0" conaffinity="0" mass="0"/>'
+    both = '<geom size="0.1" pos="0.3 0 0" density="200"/>'
+    laws = []
+    for text in ("", seen, both):
+        scene = make_scene(plain.format(text, -0.3 if text == both else 0.0))
+        set_penalty_contact(scene.model, ke=1e4, kd=100.0, kf=100.0, mu=0.5)
+        if text:
+            scene.model.geom_friction[1, 0] = 0.01
+        if text == both:
+            with pytest.raises(ValueError, match="shapes of one body that differ"):
+                PenaltyContactStep(scene, num_outer_steps=1)
+            continue
+        PenaltyContactStep(scene, num_outer_steps=1)
+        laws.append(PenaltyLaw.of_bodies(scene.model, [1]))
+    assert laws[0].friction == laws[1].friction == 0.5
 
 
 @each_on_ground

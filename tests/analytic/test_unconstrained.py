@@ -56,6 +56,45 @@ def test_it_goes_where_mujoco_goes(name, generator):
     assert slip.median() < 0.02
 
 
+FLOATING = """<mujoco><option timestep="0.001"/><default><geom contype="0"
+  conaffinity="0"/></default><worldbody><body pos="0 0 1">
+  <joint type="free" damping="{damping}" armature="0.1"/>
+  <geom type="box" size="0.1 0.2 0.3" mass="1"/><body pos="0.1 0 0.3">
+  <joint name="a" axis="0 1 0" damping="0.01"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03" mass="0.3"/></body></body>
+  </worldbody><actuator><motor joint="a"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.5, 2.0])
+def test_a_damped_base_slows_as_in_mujoco(damping, generator):
+    scene = replace(make_scene(FLOATING.format(damping=damping)), substeps=10)
+    rows = random_transitions(scene, ROWS, generator)
+    (fast, _), (change, _) = errors(scene, rows)
+    assert (fast.norm(dim=-1) / change.norm(dim=-1)).max() < 0.01
+
+
+def test_soft_limits_leave_the_midpoint_rule_alone(generator):
+    """Where one solve is enough, the second evaluation is still that of the middle."""
+    text = CHAIN.format(integrator="Euler")
+    limit = ' range="-9999 9999" limited="true" solreflimit="0.3 1"'
+    soft = text.replace('axis="1 2 3"', f'axis="1 2 3"{limit}')
+    free, limited = (
+        replace(
+            make_scene(xml.replace("<option", '<option timestep="0.002"')), substeps=5
+        )
+        for xml in (text, soft)
+    )
+    assert UnconstrainedStep(limited).num_solves == 1
+    rows = random_transitions(free, ROWS, generator)
+    start = rows[QPOS], rows[QVEL], rows[JOINT_TORQUE]
+    expected, found = (
+        UnconstrainedStep(free)(*start),
+        UnconstrainedStep(limited)(*start),
+    )
+    for one, other in zip(expected, found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("substeps", [1, 2, 7])
 @pytest.mark.parametrize("integrator", INTEGRATORS)  # "implicit" takes Coriolis so, too
 def test_half_a_step_has_an_eighth_of_the_error(integrator, substeps, generator):

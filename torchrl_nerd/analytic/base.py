@@ -45,6 +45,7 @@ class AnalyticStep(nn.Module, ABC):
 
     def with_terrain(self, scene: Scene) -> "AnalyticStep":
         """The same step for the same robot over another ground."""
+        scene = scene.reference if self.scene.reference_ratio > 1 else scene
         make = cast(Any, type(self))  # takes the fields of its configuration
         step = make(scene, **asdict(self.config)).to(self.device)
         step.load_state_dict(self.state_dict())  # fitted parameters, where it has any

@@ -10,10 +10,11 @@ physical parameters.
 
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.analytic.base import AnalyticStep, StepResult
+from torchrl_nerd.analytic.base import AnalyticStep, StepResult, check_supported
 from torchrl_nerd.configs import FreeBodyConfig
 from torchrl_nerd.geometry.base import keep_constants
 from torchrl_nerd.geometry.rotations import (
@@ -76,11 +77,17 @@ class FreeBodyPenaltyStep(AnalyticStep):
     def __init__(self, scene: Scene, num_substeps: int = 8) -> None:
         super().__init__(scene, FreeBodyConfig(num_substeps), num_defects=6)
         model = scene.model
+        check_supported(scene)
         if model.njnt != 1 or not scene.base.is_floating or len(scene.contacts) == 0:
             raise ValueError(
                 f"expected a single free body on a ground, got scene '{scene.name}'"
             )
-        body = int(model.jnt_bodyid[0])
+        body, odd = int(model.jnt_bodyid[0]), _other_than_modelled(scene)
+        if found := [name for name, is_there in odd.items() if is_there]:
+            raise ValueError(
+                "expected a free body of corners over the plane z = 0, with its centre of "
+                f"mass at its origin, got scene '{scene.name}' with {', '.join(found)}"
+            )
         law = penalty_law.PenaltyLaw.of_bodies(model, [body])
         contact = law.friction, law.stiffness, law.damping, law.slip
         self.num_substeps = num_substeps
@@ -190,3 +197,20 @@ def _swing(rotation: Tensor, angular: Tensor, point: Tensor) -> Tensor:
     """Velocity ``(N, 3)``, world, of a point of the body beside its origin's."""
     moving = torch.linalg.cross(angular, point.expand_as(angular))
     return (rotation @ moving[..., None])[..., 0]
+
+
+def _other_than_modelled(scene: Scene) -> dict[str, bool]:
+    """What the step does not know of, and whether it is there."""
+    model, body = scene.model, int(scene.model.jnt_bodyid[0])
+    plane = None if scene.terrain is None else scene.terrain.fixed_plane
+    is_level = plane is not None and np.allclose(plane, (0.0, 0.0, 1.0, 0.0))
+    pose = (*model.body_ipos[body], *model.body_iquat[body])
+    is_centred = np.allclose(pose, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    return {
+        "another ground": not is_level,
+        "round shapes": bool(scene.contacts.radii.any()),
+        "axes of inertia of their own": not is_centred,
+        "gravity to the side": bool(model.opt.gravity[:2].any()),
+        "damping": bool(model.dof_damping.any()),
+        "armature": bool(model.dof_armature.any()),
+    }

@@ -27,7 +27,7 @@ MIN_IMPEDANCE, MAX_IMPEDANCE = mujoco.mjMINIMP, mujoco.mjMAXIMP
 class JointLimits(nn.Module):
     """Integrates hinges and slides under joint-limit constraints; batch last.
 
-    For robots without a free base; ``substep``: MuJoCo's, s.
+    For robots without a free base.
     """
 
     limits: Tensor  # (2, L, 1): low and high, m or rad
@@ -35,9 +35,9 @@ class JointLimits(nn.Module):
     power: Tensor  # (L, 1)
     law: Tensor  # (3, L, 1): stiffness, damping, weight
 
-    def __init__(self, model: mujoco.MjModel, axes: JointAxes, substep: float) -> None:
+    def __init__(self, model: mujoco.MjModel, axes: JointAxes) -> None:
         super().__init__()
-        self.substep = substep
+        self.substep = float(model.opt.timestep)
         # which joints of ``axes`` have limits
         self.joints = np.flatnonzero(model.jnt_limited[axes.joints]).tolist()
         ids = [axes.joints[joint] for joint in self.joints]
@@ -69,9 +69,9 @@ class JointLimits(nn.Module):
         qvel: Tensor,
         acceleration: Tensor,
         inverse: Tensor,
-        period: float | Tensor,
+        period: float,
         num_solves: int,
-        lag: float | Tensor,
+        lag: float,
     ) -> tuple[Tensor, Tensor]:
         """``qpos`` and ``qvel``, ``(J, N)``, after ``period`` s.
 
@@ -79,7 +79,8 @@ class JointLimits(nn.Module):
         mass matrix. The forces are solved anew in ``num_solves`` equal parts of the period.
         ``lag``, s: substep of semi-implicit Euler; positions move by the new velocity.
         """
-        step = period / max(num_solves, 1)
+        num_solves = max(num_solves, 1)
+        step = period / num_solves
         force = torch.zeros_like(qpos[: len(self.joints)])
         coupling = take(take(inverse, self.joints, 0), self.joints, 1)
         for _ in range(num_solves):

@@ -55,9 +55,7 @@ class UnconstrainedStep(AnalyticStep):
                     "expected, for an unconstrained step, a fixed base or joints without "
                     f"limits, got a floating base with them in scene '{scene.name}'"
                 )
-            # MuJoCo's shortest time constant follows from the scene's own substep
-            substep = scene.control_step / (scene.substeps // scene.reference_ratio)
-            self.limits = JointLimits(model, axes, substep)
+            self.limits = JointLimits(model, axes)
             self.num_solves = self.limits.num_solves(self.step_size)
 
     def _step(

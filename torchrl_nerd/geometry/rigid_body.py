@@ -67,6 +67,7 @@ class RigidBodyDynamics(nn.Module):
         corners = (_four_points(model, body) for body in found)
         self.positions = np.concatenate((axes.positions, *corners))
         self.num_base_dofs = 6 * base.is_floating  # dofs that move every body
+        self.is_base_damped = base.is_floating and bool(model.dof_damping[:3].any())
         joints, below = axes.joints, axes.bodies[: len(axes.joints)]
         self.qpos_addresses = model.jnt_qposadr[joints].tolist()
         ancestry = np.ones((model.nv, len(found)))
@@ -94,7 +95,7 @@ class RigidBodyDynamics(nn.Module):
         joint_torque: Tensor | None,
         rotation: Tensor,
         places: Tensor,
-        period: float | Tensor = 0.0,
+        period: float = 0.0,
     ) -> Tensor:
         """Acceleration ``(*batch, nv)``, in the axes of ``qvel``.
 
@@ -118,7 +119,7 @@ class RigidBodyDynamics(nn.Module):
         joint_torque: Tensor | None,
         rotation: Tensor,
         places: Tensor,
-        period: float | Tensor = 0.0,
+        period: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
         """Mass matrix ``(nv, nv, N)`` and smooth forces ``(nv, N)`` without contacts.
 
@@ -142,6 +143,9 @@ class RigidBodyDynamics(nn.Module):
         mass_matrix = upper + lower + extra[..., None]
         gravity = rows_last((rotation.mT @ self.gravity[:, None])[..., 0], 1)
         smooth = -self._bias(bodies, spin, slide, rate, gravity)
+        if self.is_base_damped:
+            linear = (rotation.mT @ qvel[..., :3, None])[..., 0]  # in B_t
+            rate = torch.cat((rows_last(linear, 1), rate[3:]))
         smooth = smooth - self.damping[:, None] * rate
         if joint_torque is not None:
             torque = rows_last(joint_torque, 1)

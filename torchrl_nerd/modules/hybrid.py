@@ -7,7 +7,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_nerd.analytic import AnalyticStep, make_step
+from torchrl_nerd.analytic import AnalyticStep
 from torchrl_nerd.configs import FeatureConfig
 from torchrl_nerd.modules.nerd import TARGET, Encoded, NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
@@ -91,7 +91,7 @@ class HybridNeRD(NeRD):
 
     def copy_for(self, scene: Scene) -> "HybridNeRD":
         """See `NeRD.copy_for`."""
-        step = make_step(scene, self.analytic_step.config)
+        step = self.analytic_step.with_terrain(scene)
         how = self.scene_features.config, self.config
         return HybridNeRD(scene, step, *how, is_gated=self.is_gated)
 

@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_nerd.scenes.contact_points import terrain_geoms, touching_geoms
+
 IMPEDANCE = 0.001
 SOLIMP = np.array([IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0])
 
@@ -101,17 +103,53 @@ class PenaltyLaw:
     @classmethod
     def of_bodies(cls, model: mujoco.MjModel, bodies: list[int]) -> "PenaltyLaw":
         """The law of each body's contacts; a ValueError where it is another one."""
-        geoms = [int(np.flatnonzero(model.geom_bodyid == body)[0]) for body in bodies]
+        touching = np.array(touching_geoms(model))
+        _expect_law(model, touching[np.isin(model.geom_bodyid[touching], bodies)])
+        owner = model.geom_bodyid[touching]
+        geoms = [int(touching[owner == body][0]) for body in bodies]
         weight = model.body_invweight0[bodies, 0]
         stiffness, damping = _stiffness(model.geom_solref[geoms], weight, "contacts")
         slip = damping * model.opt.impratio
         return cls(stiffness, damping, slip, model.geom_friction[geoms, 0])
 
 
+def _expect_law(model: mujoco.MjModel, geoms: np.ndarray) -> None:
+    """Raise a ValueError where these shapes' contacts with the ground are no such law."""
+    if not len(geoms):
+        return
+    others = model.geom_priority[terrain_geoms(model)]
+    margin = model.geom_margin[geoms] + model.geom_gap[geoms]
+    same = np.column_stack((model.geom_solref[geoms], model.geom_friction[geoms, 0]))
+    bodies = model.geom_bodyid[geoms]
+    first = same[[np.flatnonzero(bodies == body)[0] for body in bodies]]
+    odd = {
+        "an impedance (solimp) of its own": not _is_soft(model.geom_solimp[geoms]),
+        "a margin or gap": margin.any(),
+        "a condim other than 3": (model.geom_condim[geoms] != 3).any(),
+        "the ground's priority": model.geom_priority[geoms].min() <= others.max(),
+        "shapes of one body that differ": (same != first).any(),
+    }
+    if found := [name for name, is_there in odd.items() if is_there]:
+        raise ValueError(
+            "expected contacts that are springs and dampers (see set_penalty_contact), got "
+            f"some with {', '.join(found)}"
+        )
+
+
+def _is_soft(solimp: np.ndarray) -> bool:
+    """Whether impedances are small and constant, so that MuJoCo's forces are the law's."""
+    return bool((solimp[:, :2] <= 10.0 * IMPEDANCE).all())
+
+
 def limit_stiffness(
     model: mujoco.MjModel, joints: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping of limits that follow the law; others are a ValueError."""
+    if model.jnt_margin[joints].any() or not _is_soft(model.jnt_solimp[joints]):
+        raise ValueError(
+            "expected limits that are springs and dampers (see set_penalty_limit), got "
+            "some with a margin or an impedance (solimp) of their own"
+        )
     weight = model.dof_invweight0[model.jnt_dofadr[joints]]
     return _stiffness(model.jnt_solref[joints], weight, "limits")
 
