@@ -119,6 +119,12 @@ def test_normalisation_keeps_the_rotation(generator):
     assert zero.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
 
 
+def test_what_is_no_number_is_no_rotation():
+    odd = torch.tensor([[torch.nan] * 4, [0.0] * 4])
+    found = quat_normalize(odd)
+    assert found[0].isnan().all() and found[1].tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
 def test_wrapped_angles_are_the_same_angles(generator):
     angle = 200.0 * torch.rand(ROWS, dtype=torch.float64, generator=generator) - 100.0
     wrapped = wrap_angle(angle)

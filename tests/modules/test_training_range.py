@@ -6,6 +6,7 @@ from dynamics_helpers import LEARNED, little_data, random_drive, random_model
 from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.training_range import TrainingRange, magnitudes
+from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training.samples import cover, normalised
 
 ROWS = 16
@@ -17,7 +18,7 @@ def test_training_data_are_left_as_they_are(scene, generator):
     assert torch.equal(model.training_range.clamp_features(tokens), tokens)
     assert torch.equal(model.training_range.clamp_target(targets), targets)
     qvel = data["next", "qvel"]
-    assert torch.equal(model.training_range.limit_motion(qvel), qvel)
+    assert torch.equal(model.training_range.limit_motion(qvel, 1.0), qvel)
     qpos = data["next", "qpos"]
     for kept, given in zip(
         model.training_range.stop_joints(qpos, qvel), (qpos, qvel), strict=True
@@ -114,6 +115,13 @@ def test_gradients_are_finite_at_rest(scene, generator):
     )
     after.square().sum().backward()
     assert qvel.grad is not None and qvel.grad.isfinite().all()
+
+
+def test_a_joint_that_never_moved_in_the_data_stays(generator):
+    bounds = random_model(load_scene("cartpole"), generator).training_range
+    bounds.speed[0] = 0.0
+    motion = torch.tensor([[0.0, 0.1], [3.0, 0.1]], dtype=torch.float64)
+    assert bounds.limit_motion(motion, 1.0)[:, 0].tolist() == [0.0, 0.0]
 
 
 def test_a_model_that_saw_no_data_is_bounded_by_nothing(scene, generator):

@@ -16,6 +16,7 @@ from helpers import (
     random_transitions,
     with_points_in_order,
 )
+from tensordict import TensorDict
 
 from torchrl_nerd.keys import (
     CONTACT_DEPTH,
@@ -242,6 +243,18 @@ def test_keys_widths_and_precision(scene, generator):
             want = contact_features(scene, rows)[key].flatten(1).float()
             torch.testing.assert_close(out[key], want)
     assert bool(transform.out_keys) == bool(len(scene.contacts))
+
+
+def test_the_next_states_features_are_over_the_same_ground(generator):
+    """Which data hold once, beside the state before the step."""
+    scene = load_scene("cube_slope")
+    rows = random_transitions(scene, 8, generator)
+    rows["next"] = TensorDict({k: rows[k].flip(0) for k in (QPOS, QVEL)}, [8])
+    found, transform = ContactFeatures(scene)(rows.clone()), ContactFeatures(scene)
+    after = transform(rows["next"].clone().set(TERRAIN, rows[TERRAIN]))
+    for key in transform.out_keys:
+        assert torch.equal(found["next", key], after[key])
+    assert TERRAIN not in found["next"].keys()
 
 
 def test_equal_features_mean_equal_motion_on_a_slope(generator):

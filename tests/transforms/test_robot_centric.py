@@ -1,5 +1,7 @@
 """The robot's own features: blind to place and heading, exact in everything else."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -164,6 +166,14 @@ def test_the_next_state_has_features_too_where_it_is_recorded(generator):
     after = transform(rows.clone())["next"]
     expected = transform(rows["next"].select(QPOS, QVEL))
     torch.testing.assert_close(after[ROBOT_STATE], expected[ROBOT_STATE])
+
+
+def test_joints_that_begin_at_rest_have_finite_features(generator):
+    scene = load_scene("cartpole")
+    rows = random_transitions(scene, 8, generator)
+    still = replace(scene.sampling, qvel_low=(0.0, 0.0), qvel_high=(0.0, 0.0))
+    features = RobotCentric(replace(scene, sampling=still))(rows)
+    assert features[ROBOT_STATE].isfinite().all()
 
 
 def test_states_of_another_robot_are_refused():

@@ -34,7 +34,8 @@ def quat_normalize(q: Tensor) -> Tensor:
     norm = torch.linalg.vector_norm(q, dim=-1, keepdim=True)
     identity = torch.zeros_like(q)
     identity[..., 0] = 1.0
-    return torch.where(norm > 1e-15, q / norm.clamp_min(1e-15), identity)
+    # what is no number stays so: a fault of its env
+    return torch.where(norm <= 1e-15, identity, q / norm.clamp_min(1e-15))
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ MARGIN = 0.1  # of a range's width, on either side
 SPEED_MARGIN = 2.0  # times the largest speed in the data
 UNBOUNDED = 1e300  # finite, so that a share of it is a number
 MAX_POSITION = 1e6  # m and rad: beyond it the state is broken, no joint overshot
+TINY = 1e-30  # m/s and rad/s: a dof that never moves in the data stays at rest
 MIN_WIDTH = 1e-3  # of a normalised feature's range, for `TrainingRange.excess`
 RIDGE = 1e-3  # variance added to every normalised feature before the inverse
 QUANTILE = 0.99  # of training inputs that score at most 1
@@ -107,11 +108,12 @@ class TrainingRange(nn.Module):
         largest = torch.cat((2.0 * self.speed, step * self.speed))
         return change.clamp(-largest, largest)
 
-    def limit_motion(self, motion: Tensor, time: float = 1.0) -> Tensor:
+    def limit_motion(self, motion: Tensor, time: float) -> Tensor:
         """Motions ``(*batch, nv)`` within what the largest speed reaches in ``time`` s."""
         farthest = time * self.speed
         size = magnitudes(self.vectors, motion)
-        return motion * (farthest / torch.maximum(size, farthest))
+        ratio = farthest / torch.maximum(size, farthest).clamp_min(TINY)
+        return motion * ratio
 
     def stop_joints(self, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
         """The state with limited joints no farther than in the data, and none going on."""
@@ -151,7 +153,7 @@ class OODScore(nn.Module):
         With symmetric ``copies`` of the samples the mean and covariance are of all of
         them, and a copy's score is that of the original.
         """
-        some = features[:: max(1, len(features) // MAX_SAMPLES)].double()
+        some = features[:: -(-len(features) // MAX_SAMPLES) or 1].double()
         own = torch.arange(some.shape[1], device=some.device)[None]
         sources, signs = copies or (own, torch.ones_like(own))  # (K, F)
         center = (signs * some.mean(0)[sources]).mean(0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes.scene import Scene
 
 
@@ -51,8 +51,10 @@ class FeatureTransform(StateTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
         """Write the features, and under ``next`` those of the state there."""
         after = tensordict.get("next", None)
-        if after is not None and all(key in after.keys(True) for key in self.in_keys):
-            self._call(after)
+        lacking = set() if after is None else {*self.in_keys} - {*after.keys(True)}
+        if after is not None and lacking <= {TERRAIN}:  # the ground stays: stored once
+            given = after.copy().update(tensordict.select(*lacking, strict=False))
+            after.update(self._call(given).select(*self.sizes, strict=False))
         return self._call(tensordict)
 
     def _features(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:

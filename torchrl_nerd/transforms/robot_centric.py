@@ -29,6 +29,7 @@ from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.transforms.base import FeatureTransform
 
 LIMIT_STEPS = 1.5  # control steps at top speed from which on a limit is a feature
+CLOSEST = 1e-9  # m and rad: least distance of that, of joints that begin at rest
 FADE = 0.25  # share of the margin over which a gated velocity fades in
 NUM_TIMES = 5  # intervals of a step at whose ends limit torques are predicted
 
@@ -153,7 +154,7 @@ class _JointFeatures:
                 low, high = model.jnt_range[joint].tolist()
                 # from the end: the ranges may leave out a floating base, which is first
                 fastest = float(speed[v - model.nv])
-                margin = LIMIT_STEPS * scene.control_step * fastest
+                margin = max(LIMIT_STEPS * scene.control_step * fastest, CLOSEST)
                 if features.predicted_force:
                     stiffness, damping = limit_stiffness(model, [joint])
                     self.predicted.append(v)
