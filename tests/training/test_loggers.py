@@ -114,7 +114,7 @@ def test_tensorboard_forgets_what_a_killed_run_wrote_later(run, results):
 
     write(run, "tensorboard", {}, results)
     time.sleep(1.0)  # within a second TensorBoard tells its files' order by their names
-    log = TrainingLog(run, 10, open_logger("tensorboard", run, 10 + 1, {}))
+    log = TrainingLog(run, 10, open_logger("tensorboard", run, 10, {}))
     log.write({"step": 20, "loss": 7.0})
     log.close()
     board = EventAccumulator(str(run / "tensorboard")).Reload()

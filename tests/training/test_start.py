@@ -100,6 +100,15 @@ def test_features_of_another_width_are_refused_in_a_sentence(generator):
     assert begin_from(initial, scene, MLP).token_size == initial.token_size
     with pytest.raises(ValueError, match=f"inputs and .*got {initial.token_size} and"):
         begin_from(initial, scene, replace(MLP, predicted_force=True))
+    with pytest.raises(ValueError, match="from features .*unconstrained_motion=True"):
+        begin_from(initial, scene, replace(MLP, unconstrained_motion=True))
+
+
+def test_a_model_in_half_precision_has_a_fingerprint(generator):
+    model = random_model(CARTPOLE, generator, "mlp-1x16")
+    before = fingerprint(model)
+    model.network.to(torch.bfloat16)
+    assert fingerprint(model) != before
 
 
 def test_other_networks_and_kinds_are_refused(generator):

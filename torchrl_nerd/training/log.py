@@ -64,7 +64,7 @@ class TrainingLog:
 
 
 class ResumableTensorboardLogger(TensorboardLogger):
-    """TorchRL's logger, which drops what a killed run wrote from ``step`` on."""
+    """TorchRL's logger, which drops what a killed run wrote after ``step``."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.step = step
@@ -73,7 +73,9 @@ class ResumableTensorboardLogger(TensorboardLogger):
     def _create_experiment(self) -> Any:
         from torch.utils.tensorboard import SummaryWriter
 
-        return SummaryWriter(Path(self.log_dir) / self.exp_name, purge_step=self.step)
+        return SummaryWriter(
+            Path(self.log_dir) / self.exp_name, purge_step=self.step + 1
+        )
 
 
 def open_logger(

@@ -134,7 +134,7 @@ def change_times(data: TensorDict) -> Tensor | None:
     None where no robot of the data ``[trajectories, steps]`` changes.
     """
     parameters = data.get(PARAMETERS, None)
-    if parameters is None:
+    if parameters is None or parameters.shape[1] < 2:
         return None
     # (trajectories, steps - 1)
     is_new = (parameters[:, 1:] != parameters[:, :-1]).any(-1)

@@ -1,9 +1,11 @@
 """The model that a training begins with: fresh, or another one's weights."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
@@ -97,6 +99,9 @@ def begin_from(
             f"expected a model to start from with {widths[0]} inputs and {widths[1]} "
             f"outputs as scene '{scene.name}' has, got {found[0]} and {found[1]}"
         )
+    for kind, has, wants in _of_inputs(start, model):
+        if has != wants:
+            raise ValueError(f"expected to start from {kind} {wants}, got {has}")
     if isinstance(model, HybridNeRD) and isinstance(start, HybridNeRD):
         model.is_gated = start.is_gated
     model.network.load_state_dict(start.network.state_dict())
@@ -104,6 +109,13 @@ def begin_from(
     if symmetry is not None:
         _expect_shared(symmetry, model)
     return model
+
+
+def _of_inputs(first: NeRD, second: NeRD) -> Iterator[tuple[str, Any, Any]]:
+    """What the inputs of two models consist of, kind after kind."""
+    yield "features", first.scene_features.config, second.scene_features.config
+    if isinstance(first, HybridNeRD) and isinstance(second, HybridNeRD):
+        yield "the step", first.analytic_step.config, second.analytic_step.config
 
 
 def _named(network: NetworkConfig) -> str:
@@ -136,7 +148,8 @@ def fingerprint(model: NeRD) -> str:
     """Hash of weights, statistics and range, by which a run knows its start."""
     digest = hashlib.sha256()
     for key, value in sorted(model.state_dict().items()):
-        digest.update(key.encode() + value.cpu().contiguous().numpy().tobytes())
+        bits = value.cpu().contiguous().reshape(-1).view(torch.uint8)  # of any type
+        digest.update(key.encode() + bits.numpy().tobytes())
     return digest.hexdigest()[:16]
 
 

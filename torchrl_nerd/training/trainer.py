@@ -169,7 +169,8 @@ class Trainer:
 
     def run(self, until: int | None = None) -> NeRD:
         """Train to the end, or to update ``until``; returns the averaged model."""
-        last = min(until or self.config.total_steps, self.config.total_steps)
+        total = self.config.total_steps
+        last = total if until is None else min(until, total)
         settings = {"scene": self.scene.name, **asdict(self.config)}
         logger = open_logger(self.logger, self.folder, self.step, settings)
         log = TrainingLog(self.folder, self.step, logger)
@@ -179,13 +180,12 @@ class Trainer:
             while self.step < last:
                 loss = self.update()
                 self.step += 1
-                self.errors = {}
+                self.seconds, self.errors = time.monotonic() - began, {}
                 if self._is_due(self.config.validate_every):
                     found = self.validate()
                     log.write({"step": self.step, "loss": float(loss), **found})
                     bar.set_postfix({k: f"{v:.2g}" for k, v in found.items()})
                 if self._is_due(self.config.save_every):
-                    self.seconds = time.monotonic() - began
                     self.save()
                 bar.update()
         log.close()
