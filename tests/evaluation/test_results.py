@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from helpers import slow_but
 
+from torchrl_nerd import __version__
 from torchrl_nerd.evaluation.results import (
     KEYS,
     commit,
@@ -54,6 +55,22 @@ def test_a_script_names_its_own_command(monkeypatch):
     ]
     monkeypatch.setattr("sys.argv", words)
     assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
+    monkeypatch.setattr("sys.argv", [*words[:2], "--json=/tmp/x.json", *words[4:]])
+    assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
+
+
+def test_a_package_in_another_projects_folder_has_a_version_alone(
+    tmp_path, monkeypatch
+):
+    """As one that is installed in an environment inside of a repository."""
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for words in (["init", "-q"], ["commit", "-qm", "theirs", "--allow-empty"]):
+        subprocess.run([*git, *words], cwd=tmp_path, check=True)
+    copy = tmp_path / "results.py"
+    copy.touch()
+    assert len(commit()) >= 40
+    monkeypatch.setattr("torchrl_nerd.evaluation.results.__file__", str(copy))
+    assert commit() == __version__
 
 
 @pytest.mark.parametrize("name", slow_but(["study.part"], ["study", "study.part"]))

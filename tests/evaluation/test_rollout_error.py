@@ -194,6 +194,14 @@ def test_starts_are_the_tasks_and_of_their_seed(name, seed):
     assert torch.equal(first["qpos"], task.initial_state(u)["qpos"])
 
 
+def test_random_actions_are_not_the_numbers_of_the_starts(seed):
+    task, count = make_task("cartpole/swingup"), 1000
+    drawn = initial_states(task, count, seed)["qpos"][:, 0]
+    drive = action_drive(task, count, 1, seed, random_actions=True)
+    torque = drive(0, initial_states(task, count, seed))[0][:, 0]
+    assert abs(torch.corrcoef(torch.stack((drawn, torque)))[0, 1]) < 0.15
+
+
 @each(HANDMADE)
 def test_open_loop_is_step_after_step(name, rng):
     scene = make_scene(HANDMADE[name].model)

@@ -54,6 +54,7 @@ def script_command() -> str:
     if "--json" in words:
         at = words.index("--json")
         del words[at : at + 2]
+    words = [word for word in words if not word.startswith("--json=")]
     module = getattr(sys.modules["__main__"], "__spec__", None)  # of python -m
     if module is not None and module.origin == sys.argv[0]:
         what = ["-m", module.name.removesuffix(".__main__")]
@@ -80,14 +81,19 @@ def read_results(path: Path) -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Commit of the code, with ``-dirty`` where files differ; else its version."""
-    folder = Path(__file__).parent
+    """Commit of the code, ``-dirty`` where files differ; its version if it has none."""
+    here = Path(__file__)
+    # an installed package may lie in the folder of another project's repository
+    is_tracked = ["git", "ls-files", "--error-unmatch", here.name]
     words = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    except OSError:  # no git here
+        for command in (is_tracked, words):
+            done = subprocess.run(
+                command, cwd=here.parent, check=True, capture_output=True, text=True
+            )
+    except (OSError, subprocess.CalledProcessError):  # no git, or no repository of it
         return __version__
-    return done.stdout.strip() if done.returncode == 0 else __version__
+    return done.stdout.strip()
 
 
 def machine(device: str = "cpu") -> dict[str, Any]:

@@ -20,6 +20,7 @@ from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAI
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate, drive, idle
+from torchrl_nerd.seeds import fold_in
 
 Drive = Callable[[int, TensorDictBase], tuple[Tensor, Tensor | None]]
 """``(step, state [n]) -> joint torque (n, num_actuated), N and N m, and ctrl (n, nu)``."""
@@ -69,7 +70,7 @@ def action_drive(
     Actions are zero, or uniform in [-1, 1] at every step. The controller sees the state of
     the dynamics that it drives.
     """
-    generator = Generator().manual_seed(seed)
+    generator = fold_in(seed, 1)  # not those of the initial states
     shape = (steps, num_trajectories, source.controller.num_actions)
     draw = torch.rand(shape, dtype=torch.float64, generator=generator)
     # (steps, n, num_actions), the same for every dynamics

@@ -259,6 +259,10 @@ def test_bad_requests_are_refused_in_a_sentence():
     scene = load_scene("cartpole")
     with pytest.raises(ValueError, match="rounds"):
         bench(scene, BenchConfig(rounds=0))
+    with pytest.raises(ValueError, match="steps of at least 1, got -5"):
+        bench(scene, BenchConfig(steps=-5))
+    with pytest.raises(ValueError, match="batches of at least 1, got 0"):
+        bench(scene, BenchConfig(batches=()))
     with pytest.raises(ValueError, match="batch 0"):
         bench(scene, BenchConfig(batches=(0,)))
     with pytest.raises(ValueError, match="unknown dynamics 'nowhere'"):

@@ -43,7 +43,7 @@ class EvaluationSet:
     case: str
     source: Source  # whose initial states and controller
     start: TensorDict  # initial states, [n]
-    drive: Tensor | Drive  # see `states_of`
+    drive: Drive  # see `states_of`
     solver: str  # of the ground truth, see `mujoco_name`
     ground_truth: Tensor  # positions after each step, (n, steps, nq)
     history: TensorDict | None = None  # motion [n, T] seen before by every candidate

@@ -24,7 +24,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 
 FINEST = 64  # substeps of a ground truth in contact, or four times the scene's own
-PERTURBATION = 1e-4  # m and rad, of every coordinate of the initial state
+PERTURBATION = 1e-4  # m and rad, of every coordinate of the initial positions
 ALL = "all"
 """The case of all cases together."""
 
@@ -48,6 +48,13 @@ class BenchConfig:
     """Of the initial states."""
     steps: int | None = None
     """Horizon of the errors; the paper's by default."""
+
+    def check(self) -> None:
+        """Refuse a number out of range with a SettingError."""
+        counts = {f"batch {batch}": batch for batch in self.batches}
+        counts |= {} if self.steps is None else {"steps": self.steps}
+        expect_at_least(1, rounds=self.rounds, batches=len(self.batches), **counts)
+        expect_at_least(2, num_trajectories=self.num_trajectories)
 
 
 @dataclass(frozen=True)
@@ -124,25 +131,29 @@ def bench(
     Raises:
         ValueError: a setting out of range, or no such model.
     """
-    counts = {f"batch {batch}": batch for batch in config.batches}
-    expect_at_least(1, rounds=config.rounds, **counts)
-    expect_at_least(2, num_trajectories=config.num_trajectories)
+    config.check()
     protocol = protocol_of(scene)
     threads = torch.get_num_threads()  # as many for MuJoCo
     candidates = simulators(scene, threads)
     candidates += models(scene, config.models, device, config.variants)
     published = {horizon for _, horizon, _ in protocol.published}
     horizon = config.steps or max(published or protocol.horizons)
-    about = config.num_trajectories, horizon, config.seed, device
 
     def ground_truth(here: Scene) -> MujocoDynamics:
         return MujocoDynamics(reference_of(here), threads)
 
     sets = [
         evaluation_set(
-            case, source, case in protocol.random_actions, ground_truth, *about
+            case,
+            source,
+            case in protocol.random_actions,
+            ground_truth,
+            config.num_trajectories,
+            horizon,
+            config.seed + number,  # other starts than those of the cases before
+            device,
         )
-        for case, source in protocol.cases.items()
+        for number, (case, source) in enumerate(protocol.cases.items())
     ]
     errors = measure(sets, candidates, quiet=quiet)
     name = f"ground truth, perturbed by {PERTURBATION:.0e}"

@@ -90,4 +90,6 @@ def _rollout_error(dynamics: Dynamics, start: TensorDict) -> float:
     both = MujocoDynamics(scene), dynamics
     paths = [open_loop(one, start, STEPS, command) for one in both]
     errors = position_errors(scene, *paths)  # (n, STEPS) each
-    return float(torch.stack(list(errors.values())).mean((0, 2)).nanmedian())
+    mean = torch.stack(list(errors.values())).mean((0, 2))  # (n,)
+    is_known = paths[0].isfinite().all(-1).all(-1)  # MuJoCo itself did not diverge
+    return float(mean[is_known].nan_to_num(nan=torch.inf).median())
