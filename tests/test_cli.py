@@ -15,6 +15,7 @@ from helpers import EXCERPT, slow_but
 from torchrl_nerd import __version__
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli import COMMANDS, main
+from torchrl_nerd.cli.options import varied_ranges
 from torchrl_nerd.configs import DataConfig, FinetuneConfig
 from torchrl_nerd.data import generate as generate_module
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
@@ -197,6 +198,41 @@ def test_a_dry_run_refuses_what_the_run_would(command, capsys):
     assert "'unicorn'" in refusal(capsys, command, "unicorn", "--dry-run", *more)
 
 
+@pytest.mark.parametrize("dry", [["--dry-run"], []])
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ("eval unicorn", "'unicorn'"),
+        ("eval cartpole --model nowhere", "'nowhere'"),
+        ("eval cube --data {log} --seed 3", "expected --seed without --data"),
+        ("bench unicorn", "'unicorn'"),
+        ("bench cartpole --steps 0", "expected steps of at least 1, got 0"),
+        ("stability unicorn", "'unicorn'"),
+        ("stability cartpole --scale -4", "a scale in (0, 1], got -4.0"),
+        ("transfer cartpole/fly", "'cartpole/fly'"),
+        ("play cartpole/swingup --slowdown -1", "slowdown above 0, got -1.0"),
+        ("play cartpole/swingup --policy x --actions zero", "or --actions, got both"),
+        ("explain unicorn", "'unicorn'"),
+        ("train cartpole --threads 0", "threads of at least 1, got 0"),
+        ("train cartpole --sequence-length 500", "at least 500 steps, got"),
+        ("data cube --from {log} --trajectories 3", "--from without options that draw"),
+        ("data cartpole --noise 0.1", "expected --noise with --policy"),
+        ("finetune cube --from {log} --model nowhere", "'nowhere'"),
+    ],
+)
+def test_bad_input_is_refused_with_and_without_a_dry_run(
+    argv, said, dry, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert said in refusal(capsys, *argv.format(log=EXCERPT).split(), *dry)
+
+
+def test_a_range_beside_the_preset_counts():
+    for vary in (("mass:pole=1:1", "preset"), ("preset", "mass:pole=1:1")):
+        ranges = varied_ranges("cartpole", vary)
+        assert ranges["mass:pole"] == (1.0, 1.0) and len(ranges) > 1
+
+
 def test_an_unknown_command_is_refused(capsys):
     text = refusal(capsys, "fly")
     assert "'fly'" in text and "data, train, eval" in text
@@ -213,7 +249,7 @@ def test_an_unknown_scene_is_refused(command, capsys):
     [
         ("data cartpole --trajectories -5", "trajectories of at least 1, got -5"),
         ("data cartpole --steps 0", "steps of at least 1, got 0"),
-        ("data cube --from a.npz --policy p", "--changes without --from"),
+        ("data cube --from a.npz --policy p", "--from without options that draw"),
         ("train cartpole --steps -1", "steps of at least 0, got -1"),
         ("train cartpole --batch-size -8", "batch_size of at least 1, got -8"),
         ("train cartpole --network huge", "unknown network 'huge'"),

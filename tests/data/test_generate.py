@@ -16,6 +16,7 @@ from torchrl_nerd.data.simulate import (
     is_sound,
     simulate,
 )
+from torchrl_nerd.data.store import chunk_path, read_chunk
 from torchrl_nerd.data.strategies import strategy
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.files import read_json
@@ -163,7 +164,8 @@ def test_broken_trajectories_are_dropped_and_counted(motor_scene, tmp_path, seed
     ranges = {"torque": strong, "zero_torque_fraction": 0.5, "low_torque_fraction": 0.0}
     wild = replace(scene, sampling=replace(scene.sampling, **ranges))
     config = DataConfig(trajectories=60, steps=2, seed=seed)
-    data = load_data(wild, generate(wild, config, tmp_path, quiet=True))
+    generate(wild, config, tmp_path, quiet=True)
+    data = read_chunk(chunk_path(tmp_path, 0), 2)
     card = read_json(tmp_path / "data.json")
     assert card["trajectories"] == len(data) == 60 - card["dropped"]
     assert 10 < len(data) < 50
@@ -171,6 +173,8 @@ def test_broken_trajectories_are_dropped_and_counted(motor_scene, tmp_path, seed
     assert (data["next", "joint_torque"] == 0.0).all()
     drawn = simulate(wild, 60, 2, fold_in(seed, 0))
     assert not unequal(data, drawn[is_sound(drawn)])
+    with pytest.raises(ValueError, match=f"{card['dropped']} of 60 did not"):
+        load_data(wild, tmp_path)
 
 
 @pytest.mark.parametrize("size", [0, -3])

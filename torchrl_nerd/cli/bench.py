@@ -7,6 +7,7 @@ from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional, SceneName
 from torchrl_nerd.evaluation.bench.report import BenchConfig, bench, bench_table
 from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,13 @@ class Bench(BenchConfig, MeasuringCommand):
 
     scene: Positional[SceneName]
 
+    def inputs(self) -> Scene:
+        """The robot and its surroundings."""
+        self.check()
+        return load_scene(self.scene)
+
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""
-        report = bench(load_scene(self.scene), self, self.device, self.quiet)
+        report = bench(self.inputs(), self, self.device, self.quiet)
         print(bench_table(report))
         return asdict(report)

@@ -48,8 +48,13 @@ class Command(ABC):
         how = {"command": type(self).__name__.lower(), "version": __version__}
         return how | {"configuration": self.configuration()} | results
 
+    def inputs(self) -> Any:
+        """What `run` works on; bad input raises ValueError here, before any work."""
+        return None
+
     def plan(self) -> list[str]:
         """What `run` would do, in sentences; bad input is refused as in `run`."""
+        self.inputs()
         return []
 
     def settings(self) -> list[str]:

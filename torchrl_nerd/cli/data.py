@@ -14,6 +14,7 @@ from torchrl_nerd.data.cluster import ray_map
 from torchrl_nerd.data.generate import (
     CARD,
     Draw,
+    counted,
     draw_chunk,
     expect_few_dropped,
     generate,
@@ -22,6 +23,7 @@ from torchrl_nerd.data.log_files import load_recording, write_recording
 from torchrl_nerd.data.simulate import SEGMENT, simulate
 from torchrl_nerd.data.strategies import preset_strategy, strategy
 from torchrl_nerd.files import folder_name, read_json
+from torchrl_nerd.robots import preset_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.training.policy_data import along_policy
@@ -85,16 +87,34 @@ class Data(SceneOptions, Command):
             return "changing", strategy(scene, "changing")
         return preset_strategy(scene)
 
+    def inputs(self) -> tuple[Scene, tuple[str, Draw] | None]:
+        """The robot and how its trajectories are drawn; options that misfit are refused."""
+        if self.recorded is not None:
+            drawing = self.policy, self.ray, self.reference, self.vary, self.changes
+            if any(drawing) or self.config != preset_of(self.scene).data:
+                raise ValueError("expected --from without options that draw data")
+            return recorded_scene(self.scene), None
+        if self.policy is None and self.noise != type(self).noise:
+            raise ValueError(
+                "expected --noise with --policy, whose actions it is added to"
+            )
+        scene = self.load()
+        return scene, self.strategy(scene)
+
     def plan(self) -> list[str]:
         """How many trajectories would be drawn, their size, and how many exist."""
+        scene, strategy = self.inputs()
         if self.recorded is not None:
-            recording, _ = load_recording(self.recorded, recorded_scene(self.scene))
+            recording, _ = load_recording(self.recorded, scene)
             return [f"convert {len(recording)} recorded trajectories"]
-        scene, out = self.load(), self.folder
-        _, draw = self.strategy(scene) or (None, partial(simulate, scene))
+        _, draw = strategy or (None, partial(simulate, scene))
+        out = self.folder
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
-        wanted, card = self.config.trajectories, out / CARD
-        existing = read_json(card)["trajectories"] if card.exists() else 0
+        wanted, existing = self.config.trajectories, 0
+        if (out / CARD).exists():
+            card = read_json(out / CARD)
+            counted(card, out)
+            existing = card["trajectories"]
         return [
             f"draw {wanted} trajectories of {scene.name}, {size * wanted / 1e9:.2g} GB, "
             f"in {out}, where {existing} exist"
@@ -102,12 +122,8 @@ class Data(SceneOptions, Command):
 
     def run(self) -> dict[str, Any]:
         """Write the data set and return its card; bad input or data raise ValueError."""
+        scene, strategy = self.inputs()
         if self.recorded is not None:
-            if self.policy is not None or self.vary or self.changes:
-                raise ValueError(
-                    "expected --policy, --vary and --changes without --from: they draw data"
-                )
-            scene = recorded_scene(self.scene)
             name = f"{folder_name(scene.name)}_recorded"
             out = self.out or Path("datasets") / name
             card = write_recording(self.recorded, scene, out)
@@ -115,9 +131,9 @@ class Data(SceneOptions, Command):
             count = card["trajectories"]
             print(f"{count} recorded trajectories in {out}: they pass all checks")
             return card
-        scene, out = self.load(), self.folder
+        out = self.folder
         mapper = partial(ray_map, address=self.ray) if self.ray else map
-        generate(scene, self.config, out, self.quiet, self.strategy(scene), mapper)
+        generate(scene, self.config, out, self.quiet, strategy, mapper)
         card = read_json(out / CARD)
         print(
             f"{card['trajectories']} trajectories in {out}, {card['dropped']} dropped"

@@ -49,12 +49,14 @@ class Doctor(Command):
                 f"{check['seconds']:>7} s  {'ok' if check['agrees'] else 'DIFFERS'}"
             )
             tqdm.write(f"  {name:<29} {shown}")
+        results = {**found, "models": checks}
         if wrong := [name for name, check in checks.items() if not check["agrees"]]:
+            self.keep(results)
             raise RuntimeError(
                 f"expected every shipped model to repeat its stored steps, "
                 f"{', '.join(wrong)} did not"
             )
-        return {**found, "models": checks}
+        return results
 
 
 def _machine() -> dict[str, str]:

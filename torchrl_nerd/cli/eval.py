@@ -1,6 +1,6 @@
 """``nerd eval``: open-loop error against MuJoCo or recorded trajectories."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -42,7 +42,7 @@ from torchrl_nerd.robots import (
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
 
-SIMULATED = "num_trajectories", "variants", "vary", "history", "reference"
+SIMULATED = "num_trajectories", "seed", "variants", "vary", "history", "reference"
 """Options that recorded trajectories have no use for."""
 
 
@@ -87,19 +87,29 @@ class Eval(MeasuringCommand):
     """Beside it, on recorded trajectories: MuJoCo and the analytic step with the scene's
     own parameters."""
 
-    def run(self) -> dict[str, Any]:
-        """Print the tables and return their rows; bad input raises ValueError."""
+    def inputs(self) -> tuple[Scene, dict[str, Sequence[float]]]:
+        """The robot and what of it varies; bad input, its model included, is refused."""
         if self.data is not None:
             for name in SIMULATED:
                 if getattr(self, name) != getattr(type(self), name):
                     flag = name.replace("_", "-")
                     raise ValueError(f"expected --{flag} without --data")
-            return self.run_recorded(self.data)
+            expect_at_least(2, states=self.states)
+            return recorded_scene(self.scene), {}
         if self.baselines or self.split != "all" or self.states != STATES:
             raise ValueError("expected --data with --baselines, --split or --states")
         expect_at_least(2, num_trajectories=self.num_trajectories)
         expect_at_least(0, history=self.history)
         scene, ranges = load_scene(self.scene), varied_ranges(self.scene, self.vary)
+        if self.model is not None:
+            from_pretrained(self.model, scene.vary(ranges) if ranges else scene)
+        return scene, ranges
+
+    def run(self) -> dict[str, Any]:
+        """Print the tables and return their rows; bad input raises ValueError."""
+        scene, ranges = self.inputs()
+        if self.data is not None:
+            return self.run_recorded(self.data, scene)
         protocol = protocol_of(scene)
         if ranges:
             cases = {k: source.vary(ranges) for k, source in protocol.cases.items()}
@@ -153,10 +163,9 @@ class Eval(MeasuringCommand):
                 published = protocol.published
                 yield error_rows(chosen.scene, case, horizon, errors, published)
 
-    def run_recorded(self, path: Path) -> dict[str, Any]:
+    def run_recorded(self, path: Path, scene: Scene) -> dict[str, Any]:
         """The same for recorded trajectories; a split that is none raises ValueError."""
-        expect_at_least(2, states=self.states)
-        protocol, scene = recorded_protocol(self.scene), recorded_scene(self.scene)
+        protocol = recorded_protocol(self.scene)
         model = from_pretrained(self.model or protocol.model, scene).to(self.device)
         recording, split = load_recording(path, scene)
         if self.split != "all" and self.split not in split:
@@ -180,6 +189,7 @@ class Eval(MeasuringCommand):
         record = super().content(results)
         if self.data is None:
             return record
+        record["seed"] = None  # nothing is drawn
         return {"configuration": self.configuration(), **results, **record}
 
 

@@ -20,9 +20,13 @@ class Explain(Command):
 
     scene: Positional[SceneName]
 
+    def inputs(self) -> Scene:
+        """The robot and its surroundings."""
+        return load_scene(self.scene)
+
     def run(self) -> dict[str, Any]:
         """Print the report and return its contents."""
-        scene = load_scene(self.scene)
+        scene = self.inputs()
         report = explain(scene)
         counts, why_none = _symmetries(scene)
         listed = ", ".join(map(str, counts)) + (f": {why_none}" if why_none else "")

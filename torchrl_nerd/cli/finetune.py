@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 import torch
 import tyro
+from torch import Tensor
 
 from torchrl_nerd.analytic import FreeBodyPenaltyStep
 from torchrl_nerd.checkpoint import CARD, make_card, save_checkpoint
@@ -13,6 +14,7 @@ from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, Positional, SceneName, recorded_scene
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.log_files import load_recording
+from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import check_writable, folder_name, read_json, write_json
 from torchrl_nerd.training.finetune import ANALYTIC, FineTuner, start_model
@@ -38,9 +40,15 @@ class Finetune(DeviceCommand):
     physical parameters); default analytic for the cube, else the robot's model."""
     config: Flat[FinetuneConfig] = field(default_factory=FinetuneConfig)
 
+    def inputs(self) -> tuple[Recording, dict[str, Tensor], Model]:
+        """The log, its trajectories for each purpose, and the model to begin with."""
+        scene = recorded_scene(self.scene)
+        recording, split = load_recording(self.recorded, scene)
+        return recording, split, start_model(scene, self.model).to(self.device)
+
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""
-        recording, split = load_recording(self.recorded, recorded_scene(self.scene))
+        recording, split, _ = self.inputs()
         # which refuse a log too short to learn from
         recording.starts(2, split["train"])
         recording.starts(self.config.states, split["validation"])
@@ -56,8 +64,7 @@ class Finetune(DeviceCommand):
         if (out / CARD).exists():
             raise ValueError(f"{out} already holds a model: choose another --out")
         check_writable(out / CARD)
-        recording, split = load_recording(self.recorded, scene)
-        model = start_model(scene, self.model).to(self.device)
+        recording, split, model = self.inputs()
         made = {
             "start": self.model or (ANALYTIC if model.kind == ANALYTIC else scene.name),
             "device": self.device,

@@ -46,13 +46,14 @@ def varied_ranges(name: str, vary: Sequence[str]) -> dict[str, Sequence[float]]:
     for parameter in names:
         if names.count(parameter) > 1:
             raise ValueError(f"expected '{parameter}' once, got it several times")
+    if "preset" in names:
+        if not (preset := preset_of(name).variation):
+            raise ValueError(
+                f"expected NAME=LOW:HIGH for '{name}', which has no preset to vary"
+            )
+        ranges |= preset  # what is given beside it counts
     for parameter, given in zip(names, vary, strict=True):
         if given == "preset":
-            if not (preset := preset_of(name).variation):
-                raise ValueError(
-                    f"expected NAME=LOW:HIGH for '{name}', which has no preset to vary"
-                )
-            ranges |= preset
             continue
         try:
             low, high = map(float, given.partition("=")[2].split(":"))

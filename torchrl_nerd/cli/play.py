@@ -8,6 +8,7 @@ import tyro
 
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.rendering import require_gl
 from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policies
 from torchrl_nerd.evaluation.side_by_side import (
@@ -68,21 +69,26 @@ class Play(DeviceCommand):
         """Where results and settings go: ``json``, or beside the video."""
         return self.json or self.video.with_name(f"{self.video.name}.json")
 
-    def run(self) -> dict[str, Any]:
-        """Roll out, write the video and return what happened; refuse bad input."""
-        task, out = make_task(self.task), self.video
-        check_video(out)
+    def inputs(self) -> tuple[Actor | FixedActions, int]:
+        """What acts, and for how many steps; refuse bad input."""
+        task = make_task(self.task)
+        check_video(self.video)
         if not 0.0 < self.slowdown < float("inf"):
             raise ValueError(f"expected slowdown above 0, got {self.slowdown}")
         expect_at_least(64, width=self.width)
         shown = min(task.horizon, round(SECONDS / task.step_size))
         steps = shown if self.steps is None else self.steps
         expect_at_least(1, steps=steps)
-        folder, actor = self.policy, self.actions or "random"
-        if folder is None and self.actions is None:
-            folder = shipped_policies().get(self.task)
-        if folder is not None:
-            actor = make_actor(load_policy(folder, task).to(self.device))
+        if self.policy is not None and self.actions is not None:
+            raise ValueError("expected --policy or --actions, got both")
+        folder = self.policy or shipped_policies().get(self.task)
+        if self.actions is not None or folder is None:
+            return self.actions or "random", steps
+        return make_actor(load_policy(folder, task).to(self.device)), steps
+
+    def run(self) -> dict[str, Any]:
+        """Roll out, write the video and return what happened; refuse bad input."""
+        (actor, steps), out = self.inputs(), self.video
         require_gl()
         both, closed_loop = (self.dynamics, "mujoco"), not self.open_loop
         pair = SideBySide(self.task, both, actor, self.seed, closed_loop, self.device)

@@ -8,10 +8,11 @@ from tqdm import tqdm
 from torchrl_nerd.checkpoint import from_pretrained, model_name
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import ModelName, Positional, SceneName
-from torchrl_nerd.dynamics import dynamics_of
-from torchrl_nerd.evaluation.stability.case import as_table, run_cases
+from torchrl_nerd.dynamics import Model, dynamics_of
+from torchrl_nerd.evaluation.stability.case import Case, as_table, run_cases
 from torchrl_nerd.evaluation.stability.cases import CASES
 from torchrl_nerd.robots import load_scene
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError, look_up
 
 
@@ -36,14 +37,17 @@ class Stability(MeasuringCommand):
     compile: bool = False
     """Compile the model's step: long cases take a fraction of the time."""
 
-    def run(self) -> dict[str, Any]:
-        """Print verdicts, then the table, and return the results; refuse bad input."""
+    def inputs(self) -> tuple[list[Case], Scene, str, Model]:
+        """Cases, robot, name of the model and the model; refuse bad input."""
         if not 0.0 < self.scale <= 1.0:
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
         cases = [look_up("case", name, CASES) for name in self.cases or CASES]
-        scene = load_scene(self.scene)
-        name = self.model or self.scene
-        model = from_pretrained(name, scene).to(self.device)
+        scene, name = load_scene(self.scene), self.model or self.scene
+        return cases, scene, name, from_pretrained(name, scene).to(self.device)
+
+    def run(self) -> dict[str, Any]:
+        """Print verdicts, then the table, and return the results; refuse bad input."""
+        cases, scene, name, model = self.inputs()
         tested = dynamics_of(model, compile=self.compile)
         results, count = [], sum(case.supports(tested) for case in cases)
         about = {"model": model_name(name, scene), "kind": model.kind}

@@ -10,19 +10,13 @@ from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint, save_check
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Flat, SceneOptions
 from torchrl_nerd.configs import DataConfig, TrainConfig
-from torchrl_nerd.data.generate import (
-    CARD,
-    expect_few_dropped,
-    generate,
-    load_data,
-    read_card,
-)
+from torchrl_nerd.data.generate import CARD, generate, load_data, read_card
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.files import check_writable, read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.settings import SettingError
+from torchrl_nerd.settings import SettingError, expect_at_least
 from torchrl_nerd.training.log import LoggerName
 from torchrl_nerd.training.start import begin_from, find_symmetry, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
@@ -62,6 +56,8 @@ class Train(SceneOptions, DeviceCommand):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.threads is not None:
+            expect_at_least(1, threads=self.threads)
         if (self.kind == "hybrid") != (self.config.step is not None):
             known = [name for name, preset in PRESETS.items() if preset.hybrid]
             raise SettingError(
@@ -92,11 +88,12 @@ class Train(SceneOptions, DeviceCommand):
         """Which model would be trained on which data, and what exists already."""
         scene, (out, folders) = self.load(), self.folders
         if _is_missing(folders, preset_of(self.scene).data):
-            count = preset_of(self.scene).data.trajectories
-            data = f"draw {count} trajectories, to {folders[0]}"
+            drawn = preset_of(self.scene).data
+            self.expect_long(drawn)
+            data = f"draw {drawn.trajectories} trajectories, to {folders[0]}"
         else:
             for folder in folders:
-                read_card(scene, folder)
+                self.expect_long(read_card(scene, folder)[1])
             data = f"use the data in {', '.join(map(str, folders))}"
         model = self.untrained(scene, self.initial(scene))
         weights = sum(weight.numel() for weight in model.network.parameters())
@@ -132,8 +129,7 @@ class Train(SceneOptions, DeviceCommand):
         if _is_missing(folders, preset.data):
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
-            expect_few_dropped(read_json(folders[0] / CARD))
-        if self.threads:
+        if self.threads is not None:
             torch.set_num_threads(self.threads)
         protocol = protocol_of(scene)
         trainer = Trainer(

@@ -8,9 +8,11 @@ import tyro
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policy
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
 from torchrl_nerd.robots import make_task
+from torchrl_nerd.settings import expect_at_least
 
 
 @dataclass(frozen=True)
@@ -37,12 +39,15 @@ class Transfer(MeasuringCommand):
     seed: int = 500
     """Seed of the resets."""
 
+    def inputs(self) -> Actor:
+        """The policy."""
+        expect_at_least(2, episodes=self.episodes)
+        task, folder = make_task(self.task), self.policy or shipped_policy(self.task)
+        return make_actor(load_policy(folder, task).to(self.device))
+
     def run(self) -> dict[str, Any]:
         """Print a table and return its rows; bad input raises ValueError."""
-        if self.episodes < 2:
-            raise ValueError(f"expected at least 2 episodes, got {self.episodes}")
-        task, folder = make_task(self.task), self.policy or shipped_policy(self.task)
-        actor = make_actor(load_policy(folder, task).to(self.device))
+        actor = self.inputs()
         about = self.task, actor, self.dynamics, self.episodes
         summaries = transfer(
             *about, seed=self.seed, device=self.device, quiet=self.quiet

@@ -135,7 +135,8 @@ def read_card(scene: Scene, folder: Path) -> tuple[dict[str, Any], DataConfig]:
     """The card of a finished data set of a scene, and its configuration.
 
     Raises:
-        ValueError: it is missing, unfinished, recorded, or of another scene or ranges.
+        ValueError: it is missing, unfinished, recorded, of another scene or ranges, or too
+            many of its trajectories were dropped.
     """
     if not (folder / CARD).is_file():
         raise ValueError(f"expected a data set in {folder}, found no {CARD}")
@@ -156,11 +157,12 @@ def read_card(scene: Scene, folder: Path) -> tuple[dict[str, Any], DataConfig]:
             f"expected data that vary {ranges or 'nothing'}, got {folder}, which vary "
             f"{card.get('variation') or 'nothing'}: give --vary as the data were drawn"
         )
-    config = _check_counts(card, folder)
+    config = counted(card, folder)
     if card["trajectories"] + card["dropped"] < config.trajectories:
         raise ValueError(
             f"the data in {folder} are not finished: run the command again"
         )
+    expect_few_dropped(card)
     return card, config
 
 
@@ -202,15 +204,15 @@ def _open_card(
     identity = ("scene_hash", "config", "strategy", "ranges", "variation")
     asked = {key: fresh.get(key) for key in identity}
     expect_same(f"{folder} already holds data", card, asked)
-    _check_counts(card, folder)
+    counted(card, folder)
     drawn = min(card["chunks_done"] * CHUNK, config.trajectories)
     if card["trajectories"] + card["dropped"] != drawn:
         raise ValueError(f"expected {path} to count the trajectories of whole chunks")
     return card
 
 
-def _check_counts(card: dict[str, Any], folder: Path) -> DataConfig:
-    """The configuration of a card whose counts are possible."""
+def counted(card: dict[str, Any], folder: Path) -> DataConfig:
+    """The configuration of a card; counts that cannot be raise ValueError."""
     try:
         config = DataConfig(**card["config"])
         counts = [card[key] for key in ("trajectories", "dropped", "chunks_done")]

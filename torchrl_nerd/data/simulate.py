@@ -14,7 +14,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive, held
 from torchrl_nerd.scenes.sampling import sample_correlated_commands
 
-SEGMENT = 16  # control steps per call of MuJoCo, which keeps every substep of them
+SEGMENT = 16  # control steps per call of MuJoCo
 LARGEST = 1e5  # reference code: a trajectory beyond this has diverged
 
 

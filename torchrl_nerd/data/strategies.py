@@ -124,8 +124,9 @@ def strategy(scene: Scene, name: str) -> Draw:
         if scene.variation is None:
             raise ValueError(f"expected parameters that vary, '{scene.name}' has none")
         return mix(own, partial(simulate, scene, is_changing=True))
+    fitting = [s for s in STRATEGIES if s != "level" or level is not None]
     raise ValueError(
-        f"expected a strategy of {', '.join(STRATEGIES)} for '{scene.name}', got {name}"
+        f"expected a strategy of {', '.join(fitting)} for '{scene.name}', got {name}"
     )
 
 
