@@ -369,12 +369,13 @@ def test_readme_s_rates_of_the_ant_are_what_was_measured():
     )
     said = " ".join(README.read_text().split())
     rate = {name: f"{round(x, -3):,.0f}" for name, x in rates.items()}
-    assert f"{rate[mlp]} control steps per second in `ant-mlp`" in said
-    assert f"{rate[transformer]} in `ant`, both compiled" in said
+    exact = "analytic, compiled"
+    assert f"{rate[exact]} control steps per second in `analytic`" in said
+    assert f"{rate[mlp]} in `ant-mlp` and {rate[transformer]} in `ant`" in said
+    far = f"{errors[exact]:.3f}, {errors[mlp]:.3f} and {errors[transformer]:.3f} m off"
+    assert far in said
     assert f"MuJoCo makes {round(rates[own], -2):,.0f} with its own 16 substeps" in said
-    assert f"With four it makes {rate[four]} and is more exact" in said
-    far = f"{errors[four]:.3f} m off, the networks {errors[mlp]:.3f} and"
-    assert f"{far} {errors[transformer]:.3f}." in said
+    assert f"{rate[four]} with four at {errors[four]:.3f} m" in said
 
 
 def test_tables_of_the_site_are_rendered_from_results(tmp_path):

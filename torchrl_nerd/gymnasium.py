@@ -142,7 +142,13 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Observations, rewards, terminated, truncated of all envs; an empty info."""
+        """Observations, rewards, terminated, truncated of all envs; an empty info.
+
+        Raises:
+            ResetNeeded: no reset before.
+        """
+        if self._shown is None:
+            raise gymnasium.error.ResetNeeded("expected a reset before the first step")
         env, begins = self.env, self._is_over  # (num_envs,): whose action is ignored
         given = as_action(actions).to(env.device)
         after = env.step(TensorDict({ACTION: given}, env.batch_size))["next"]

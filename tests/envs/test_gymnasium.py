@@ -293,6 +293,8 @@ def test_what_is_unknown_is_refused(call, words):
     env = GymnasiumVectorEnv(TASK, "mujoco", 2)
     with pytest.raises(ValueError, match="no reset before"):
         env.reset(options={"reset_mask": np.ones(2, bool)})
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((2, 1), np.float32))
     env.reset()
     with pytest.raises(ValueError, match=words) as refusal:
         call(env)

@@ -192,12 +192,19 @@ def test_entries_that_fail_are_told_where_a_name_is_unknown(
         "from torchrl_nerd.robots import register as r; r(1)"
     )
     (tmp_path / "sound.py").write_text("LOADED = True")
-    entries = ("nowhere", "broken.py", str(tmp_path / "dull.py"), "sound.py")
+    (tmp_path / "random.py").write_text("raise RuntimeError")
+    entries = (
+        "nowhere",
+        "broken.py",
+        str(tmp_path / "dull.py"),
+        "sound.py",
+        "random.py",
+    )
     monkeypatch.setenv(VARIABLE, os.pathsep.join(entries))
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.chdir(tmp_path)
     load_named_robots()
-    assert sys.modules.pop("sound").LOADED and len(NOT_LOADED) == 3
+    assert sys.modules.pop("sound").LOADED and len(NOT_LOADED) == 4
     assert main(["explain", "cart"]) == 2
     said = capsys.readouterr().err
     NOT_LOADED.clear()
@@ -205,3 +212,4 @@ def test_entries_that_fail_are_told_where_a_name_is_unknown(
     assert "names 'nowhere', which fails with ModuleNotFoundError" in said
     assert "names 'broken.py', which fails with ImportError" in said
     assert "TypeError: expected a Robot to register, got int" in said
+    assert "names 'random.py', which fails with ImportError: another module" in said

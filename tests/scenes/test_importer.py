@@ -1,6 +1,7 @@
 """Third-party robots: their actuators, grounds and steps are what their own model has."""
 
 import copy
+import os
 from dataclasses import replace
 from math import pi
 
@@ -544,3 +545,21 @@ def test_a_free_robot_falls_on_the_ground_below_its_place(ground, generator, tmp
     top = {"a thick floor": 0.0}.get(ground, 1.0)
     assert ((end[:, 2] > top) & (end[:, 2] < top + 0.1)).double().mean() > 0.9
     assert ((end[:, 0] - x).abs() < 2.0).all()
+
+
+def test_a_path_means_the_file_that_is_there(tmp_path, monkeypatch):
+    """In another folder, or after a change, it is another robot; else the same object."""
+    body = "<body><joint type='hinge'/><geom size='{}'/></body>"
+    text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    for folder, size in (("a", 0.1), ("b", 0.2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "robot.xml").write_text(text.format(size))
+    sizes = []
+    for folder in ("a", "b"):
+        monkeypatch.chdir(tmp_path / folder)
+        assert load_scene("robot.xml") is load_scene("robot.xml")
+        sizes.append(float(load_scene("robot.xml").model.geom_size[0, 0]))
+    (tmp_path / "b" / "robot.xml").write_text(text.format(0.3))
+    os.utime("robot.xml", ns=(0, 0))  # clocks of some file systems are coarse
+    sizes.append(float(load_scene("robot.xml").model.geom_size[0, 0]))
+    assert sizes == [0.1, 0.2, 0.3]

@@ -10,7 +10,7 @@ from torchrl.envs import CatFrames, TransformedEnv
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.keys import OBSERVATION
-from torchrl_nerd.settings import expect_at_least
+from torchrl_nerd.settings import expect_count
 
 
 def frame_stack_of(actor: Actor) -> int:
@@ -24,7 +24,7 @@ def stack_frames(env: SceneEnv, frame_stack: int) -> SceneEnv:
     The first one after a reset stands for those before it. One frame is ``env`` itself.
 
     Raises:
-        ValueError: less than one frame.
+        ValueError: no whole number of at least one frame.
 
     Examples:
         >>> from torchrl_nerd.envs import make_env
@@ -32,7 +32,7 @@ def stack_frames(env: SceneEnv, frame_stack: int) -> SceneEnv:
         >>> env.rollout(5)["observation"].shape  # 13 numbers each
         torch.Size([4, 5, 39])
     """
-    expect_at_least(1, frame_stack=frame_stack)
+    expect_count(1, frame_stack=frame_stack)
     if frame_stack == 1:
         return env
     stacked = TransformedEnv(env, _Frames(frame_stack, -1, [OBSERVATION]))

@@ -52,7 +52,7 @@ THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
 
 
 def load_scene(name: str | Path) -> Scene:
-    """The scene of that name; the same object at every call.
+    """The scene of that name; the same object at every call, until its file changes.
 
     Args:
         name: a registered one, ``dm_control/DOMAIN-TASK``, ``gymnasium/ID`` or the path

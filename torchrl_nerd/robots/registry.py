@@ -82,15 +82,22 @@ def load_named_robots() -> None:
     stop work with another robot.
     """
     for entry in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
-        module, path = entry, Path(entry)
-        if path.exists():
-            sys.path.insert(0, str(path.resolve().parent))
-            module = path.stem
         try:
-            import_module(module)
+            _load(entry)
         except Exception as error:  # whatever a user's file may raise
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             NOT_LOADED.append(f"{VARIABLE} names '{entry}', which fails with {reason}")
+
+
+def _load(entry: str) -> None:
+    """Import a module, or a file or folder; another module of its name is refused."""
+    if not (path := Path(entry)).exists():
+        import_module(entry)
+        return
+    sys.path.insert(0, str(path.resolve().parent))
+    found = Path(import_module(path.stem).__file__ or path).resolve()
+    if path.resolve() not in (found, found.parent):
+        raise ImportError(f"another module has its name, {found}")
 
 
 def _is_again(scene: Callable, known: Callable | None) -> bool:

@@ -252,7 +252,8 @@ def sample_scale(
     """How violent each trajectory is: scales of torque and velocity ``(count, 1)``.
 
     Both 1 for most trajectories (torque log-uniform from ``min_torque_scale`` to 1, if
-    set); torque 0 in the zero-torque fraction; both U(0, 1) in the low-torque one.
+    set); velocity U(0, 1) in the zero-torque fraction, where torque is 0, and in the
+    low-torque one, where torque is the same number.
     """
     draw = torch.rand(2, count, 1, dtype=torch.float64, generator=generator)
     loud = torch.ones_like(draw[0])

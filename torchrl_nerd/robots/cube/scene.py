@@ -17,7 +17,7 @@ from torchrl_nerd.scenes.scene import Scene
 
 SUBSTEPS = 20  # of 1/2960 s: control step 1/148 s, the real tosses' frame rate
 # N/m, N s/m, N s/m, -; reference code. Stable: a corner weighs at least 0.21 kg, and
-# kd dt / m = 1.6 < 2. In MuJoCo's friction cone slip also lifts (see penalty.py): sliding
+# kd dt / m = 1.6 < 2. In MuJoCo's friction cone slip also lifts: sliding
 # at 1 m/s the cube hops by 1 mm, at 3 m/s by 9 mm, and slows down by mu g all the same.
 CONTACT = {"ke": 1e4, "kd": 1e3, "kf": 50.0, "mu": 0.15}
 # The paper's numbers times the ratio of the masses, so that both cubes fall and bounce

@@ -19,8 +19,8 @@ MAX_START_SPEED = 2.0  # rad/s
 class DoublePendulumPassive(Task):
     """Zero reward, never terminated; the protocol of the paper's appendix C.2.
 
-    Every env has one of the seven evaluation grounds, drawn at each reset, or
-    over the one that ``ground`` names.
+    Every env has one of the seven evaluation grounds, drawn at each reset, or the one that
+    ``ground`` names.
 
     Args:
         ground: 0 (out of reach) to 6; None draws one per env.
