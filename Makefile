@@ -148,23 +148,39 @@ model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequen
 	$(call LEARN_ROLLOUTS,cartpole,1000,250)
 	$(call SHIP_ADAPTIVE,cartpole)
 
-ANT := --data datasets/ant datasets/ant_run --symmetries 4 --rollout-lr-ratio 0.25 \
-	--validate-every 4000 --save-every 500 --threads 1
+# The Ant's networks: single steps and rollouts, then both again with more data along a run.
+ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
+ANT := --symmetries 4 --save-every 500 --threads 1
+FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
+AGAIN := --data $(ANT_DATA) datasets/ant_run_more --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
 
 data-ant: $(STAMP)
 	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
 	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 3000 --seed 31 \
 		--out datasets/ant_run
+	$(NERD) data ant --policy torchrl_nerd/policies/ant-spin --trajectories 3000 --seed 41 \
+		--out datasets/ant_spin
+	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 3000 --seed 51 \
+		--out datasets/ant_run_more
 
 model-ant: data-ant ## the Ant's transformer, with the mirrors of the Ant built in
-	$(NERD) train ant $(ANT) --network transformer-4x128 --single-step-fraction 0.85 \
-		--steps 15000 --rollout-steps 3000 --out runs/ant_transformer
-	cp runs/ant_transformer/best/* $(PRETRAINED)/ant/
+	$(NERD) train ant $(ANT) $(FIRST) --network transformer-4x128 --single-step-fraction 0.85 \
+		--steps 15000 --rollout-steps 3000 --out runs/ant_first
+	$(NERD) train ant $(ANT) $(AGAIN) --network transformer-4x128 --single-step-fraction 0.85 \
+		--validate-every 4000 --init-from runs/ant_first/best \
+		--steps 8000 --rollout-steps 3500 --out runs/ant_second
+	$(NERD) train ant $(ANT) $(AGAIN) --network transformer-4x128 --single-step-fraction 0.85 \
+		--validate-every 1500 --init-from runs/ant_second/best \
+		--steps 0 --rollout-steps 3000 --out runs/ant_third
+	cp runs/ant_third/best/* $(PRETRAINED)/ant/
 
 model-ant-mlp: data-ant ## the Ant's MLP, with the same mirrors
-	$(NERD) train ant $(ANT) --network mlp-4x160 --single-step-fraction 1 \
-		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp
-	cp runs/ant_mlp/best/* $(PRETRAINED)/ant-mlp/
+	$(NERD) train ant $(ANT) $(FIRST) --network mlp-4x160 --single-step-fraction 1 \
+		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp_first
+	$(NERD) train ant $(ANT) $(AGAIN) --network mlp-4x160 --single-step-fraction 1 \
+		--validate-every 4000 --init-from runs/ant_mlp_first/best \
+		--steps 10000 --rollout-steps 4500 --out runs/ant_mlp_second
+	cp runs/ant_mlp_second/best/* $(PRETRAINED)/ant-mlp/
 
 # Transformers that learned single steps on a GPU, in minutes: make model-franka DEVICE=cuda.
 # On two cores the same takes a day. The second stage is short and runs anywhere.
