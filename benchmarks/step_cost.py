@@ -9,6 +9,7 @@ products count (rotations among them), elementwise work does not.
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -24,7 +25,6 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.history import History
-from torchrl_nerd.modules.nerd import Network
 from torchrl_nerd.robots import load_scene, source_of
 
 
@@ -78,7 +78,7 @@ def step_cost(dynamics: Dynamics, state: TensorDict) -> Cost | None:
     )
 
 
-def memory_bytes(network: Network) -> int:
+def memory_bytes(network: Any) -> int:
     """What one more trajectory adds to a network's history."""
     one, two = (
         sum(tensor.nbytes for tensor in _tensors(network.empty_memory(n)))

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import PurePosixPath
+from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -35,3 +36,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             name = file.src_uri.replace(".ipynb", ".md")
             files.append(File.generated(config, name, content=page))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links to notebooks, which work in the repository, lead to their pages on the site."""
+    return re.sub(r"(tutorials/\w+)\.ipynb\)", r"\1.md)", markdown)

@@ -92,7 +92,7 @@ def test_an_action_is_a_spring_to_a_displacement_and_a_damper(name, rng):
 def test_an_absolute_target_is_about_the_center(rng):
     qpos, qvel = random_state(rng)
     center = (0.4, 0.1, 0.3)
-    law = controller(relative_to="absolute", center=center, max_mass=inf)
+    law = controller(center=center, max_mass=inf)
     action = torch.from_numpy(rng.uniform(-1.0, 1.0, (ROWS, 3)))
     _, site = mujoco_acceleration("franka", qpos, qvel, law(action, qpos, qvel))
     target = qpos.new_tensor(center) + 0.1 * action
@@ -170,7 +170,7 @@ def test_numbers_may_come_as_arrays(rng):
     names = {"kp": (50.0,) * 3, "kd": (9.0,) * 3, "home": HOME, "limit": GAIN}
     names |= {"scale": (0.1,) * 3, "center": (0.4, 0.0, 0.4)}
     arrays = {name: np.array(value) for name, value in names.items()}
-    one, other = (controller(relative_to="absolute", **x) for x in (names, arrays))
+    one, other = (controller(**x) for x in (names, arrays))
     action = torch.from_numpy(rng.normal(size=(ROWS, 3)))
     assert torch.equal(one(action, qpos, qvel), other(action, qpos, qvel))
 
@@ -214,10 +214,8 @@ BAD = {
     "3 numbers as kd, got 1": {"kd": (1.0,)},
     "7 numbers as home, got 3": {"home": (0.0,) * 3},
     "7 numbers as limit, got 2": {"limit": (1.0,) * 2},
-    "3 numbers as center, got 1": {"relative_to": "absolute", "center": (1.0,)},
-    "expected center with three absolute": {"relative_to": "absolute"},
-    "3 actions and center": {"center": (0.0,) * 3},
-    "relative_to current or absolute, got 'home'": {"relative_to": "home"},
+    "3 numbers as center, got 1": {"center": (1.0,)},
+    "center with three actions alone, got 6": {"center": (0.0,) * 3, "size": 6},
     "max_mass above 0, got 0": {"max_mass": 0.0},
     "kp of at least 0.0, got nan": {"kp": (1.0, nan, 1.0)},
     "kd of at least 0.0, got -1": {"kd": (1.0, -1.0, 1.0)},

@@ -150,7 +150,9 @@ def _make_csv(folder: Path) -> None:
     log = read_log(EXCERPT, load_scene(CUBE))
     toss = log.trajectory_of(torch.arange(len(log.qpos)))
     table = torch.cat((toss[:, None].double(), log.qpos), -1)
-    names = ",".join(("toss", *FREE_BODY["position"], *FREE_BODY["quaternion_wxyz"]))
+    names = ",".join(
+        ("trajectory", *FREE_BODY["position"], *FREE_BODY["quaternion_wxyz"])
+    )
     path = folder / "tosses.csv"
     np.savetxt(path, table.numpy(), delimiter=",", header=names, comments="")
 

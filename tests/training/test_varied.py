@@ -156,6 +156,10 @@ def test_rollouts_are_of_one_robot_where_robots_change(length, generator):
             state = dynamics.step(state, torque)
             torch.testing.assert_close(state[QPOS], qpos[:, step], rtol=0.0, atol=1e-9)
     assert sequences.change is not None
+    with pytest.raises(
+        ValueError, match=f"at most {sequences.longest} steps with robots"
+    ):
+        sequences.rollout(4, sequences.longest + 1, generator)
     none = change_times(data[: len(data) // 3])
     assert none is None and change_times(data.exclude(PARAMETERS)) is None
 
@@ -227,7 +231,7 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     assert "expected steps of at least 17, got 16" in capsys.readouterr().err
     for more in (("--changes",), ("--vary", "preset")):
         assert main(["data", "cartpole", "--from", "log.npz", *more]) == 2
-        assert "without --from" in capsys.readouterr().err
+        assert "--from without options" in capsys.readouterr().err
     for bad in ("mass:pole", "mass:pole=1", "mass:pole=a:b", "mass:rod=1:2"):
         assert (
             main(["data", "cartpole", "--vary", bad, "--out", str(tmp_path / "x")]) == 2

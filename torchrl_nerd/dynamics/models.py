@@ -1,7 +1,7 @@
 """Dynamics that torch computes: learned, hybrid and analytic models as `Dynamics`."""
 
 import copy
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,7 +13,7 @@ from torchrl_nerd.dynamics.base import Dynamics, check_step
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.history import WindowNetwork
-from torchrl_nerd.modules.nerd import NeRD, Network
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes.commands import drive_of
 from torchrl_nerd.scenes.variation import ranges_of
 
@@ -197,7 +197,7 @@ class NeRDDynamics(TorchDynamics):
             raise ValueError(f"expected a window of at least 1 token, got {window}")
         self.model = model.eval()
         self.told = ranges_of(model.scene_features.variation)
-        self.network = cast(Network, model.network)
+        self.network = model.network
         if inference == "window":
             self.network = WindowNetwork(model.network, window, model.token_size)
         self._num_envs = 0  # in the memory

@@ -12,14 +12,13 @@ The drive is the joint torque and servos' controls. NeRD (CoRL 2025), sections 3
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import FeatureConfig
-from torchrl_nerd.modules.history import History
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
 from torchrl_nerd.scenes.scene import Scene
@@ -31,18 +30,6 @@ TOKEN, TARGET = "token", "target"  # keys of the statistics
 
 State = tuple[Tensor, Tensor]
 """``qpos (*batch, nq)`` and ``qvel (*batch, nv)``, float64."""
-
-
-class Network(Protocol):
-    """What every network can do; `step` takes the history that its own kind makes."""
-
-    def empty_memory(self, rows: int) -> History:
-        """An empty history for ``rows`` envs."""
-        ...
-
-    def step(self, token: Tensor, memory: Any) -> Tensor:
-        """Output for the next token, ``(num_envs, F) -> (num_envs, D)``."""
-        ...
 
 
 class Encoded(NamedTuple):
@@ -68,7 +55,7 @@ class NeRD(nn.Module):
     """
 
     kind: ClassVar[str] = "learned"
-    network: Any  # a module that is a `Network`
+    network: Any  # has `empty_memory(rows)` and `step(token, memory)`
     compile_single_threaded: ClassVar[bool] = False
 
     def __init__(

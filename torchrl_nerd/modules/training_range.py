@@ -85,12 +85,9 @@ class TrainingRange(nn.Module):
         """Include another one's bounds; unchanged where that one was never fitted."""
         if not other.is_fitted:
             return
-        for name in ("feature", "target", "qpos"):
-            for end, wider in (("low", torch.minimum), ("high", torch.maximum)):
-                mine = self.get_buffer(f"{name}_{end}")
-                theirs = other.get_buffer(f"{name}_{end}").to(mine.device)
-                mine.copy_(wider(mine, theirs))
-        self.speed.copy_(torch.maximum(self.speed, other.speed.to(self.speed.device)))
+        for name, mine in self.named_buffers():  # lower bounds, upper ones and speeds
+            wider = torch.minimum if name.endswith("_low") else torch.maximum
+            mine.copy_(wider(mine, other.get_buffer(name).to(mine.device)))
 
     def clamp_features(self, features: Tensor) -> Tensor:
         """Normalised features ``(*batch, F)`` within the range; NaN stays."""

@@ -4,8 +4,6 @@ Source: Khatib, A unified approach for motion and force control of robot manipul
 operational space formulation, 1987, https://doi.org/10.1109/JRA.1987.1087068.
 """
 
-from typing import Literal
-
 import mujoco
 import numpy as np
 import torch
@@ -48,9 +46,8 @@ class OperationalSpaceController:
         scale: m (rad) per unit of action.
         home: joint positions ``(nq,)``.
         limit: largest torque of each actuated dof, N m or N; None for none.
-        relative_to: the target is relative to the present pose (``current``), taken anew
-            at every control step, or, for positions alone, to ``center`` (``absolute``).
-        center: m, world.
+        center: m, world: what the target is relative to, for positions alone; None: the
+            present pose, taken anew at every control step.
         home_kp: stiffness toward home, 1/s^2.
         home_kd: damping of the joints in the null space, 1/s.
         max_mass: kg (kg m^2 for rotations).
@@ -69,7 +66,6 @@ class OperationalSpaceController:
         scale: Row,
         home: Row,
         limit: Row | None = None,
-        relative_to: Literal["current", "absolute"] = "current",
         center: Row | None = None,
         home_kp: float = 10.0,
         home_kd: float = 6.0,
@@ -78,7 +74,6 @@ class OperationalSpaceController:
         self.kp, self.kd, self.scale, self.home = map(_row, (kp, kd, scale, home))
         self.limit = None if limit is None else _row(limit)
         self.center = None if center is None else _row(center)
-        self.relative_to = relative_to
         self.home_kp, self.home_kd, self.max_mass = home_kp, home_kd, max_mass
         self.actuated, base = driven_dofs(model), Base.from_model(model)
         self._check(model)
@@ -101,16 +96,9 @@ class OperationalSpaceController:
     def _check(self, model: mujoco.MjModel) -> None:
         if len(self.scale) not in AXES:
             raise ValueError(f"expected 3 or 6 numbers as scale, got {len(self.scale)}")
-        if self.relative_to not in ("current", "absolute"):
+        if self.center is not None and self.num_actions > 3:
             raise ValueError(
-                f"expected relative_to current or absolute, got {self.relative_to!r}"
-            )
-        has_center = self.center is not None
-        fits = has_center == (self.relative_to == "absolute")
-        if not fits or (has_center and self.num_actions > 3):
-            raise ValueError(
-                "expected center with three absolute actions and nowhere else, got "
-                f"{self.num_actions} actions and center {self.center}"
+                f"expected center with three actions alone, got {self.num_actions}"
             )
         lengths = {"kp": self.num_actions, "kd": self.num_actions, "home": model.nq}
         lengths |= {"limit": len(self.actuated), "center": 3}

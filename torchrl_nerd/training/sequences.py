@@ -67,7 +67,12 @@ class Sequences:
         self.inputs, self.data = Inputs.of(model, data, self.features), data
         self.symmetry = symmetry.to(self.targets.device) if symmetry else None
         self.scene, self.steps = model.scene, data.batch_size[1]
-        self.change = change_times(data)
+        self.change, self.longest = change_times(data), self.steps
+        if (
+            self.change is not None
+        ):  # the longer part of each trajectory, the least of them
+            part = torch.maximum(self.change, self.steps - self.change)
+            self.longest = int(part.min())
 
     def pick(
         self, batch_size: int, length: int, generator: Generator
@@ -111,7 +116,16 @@ class Sequences:
     def rollout(
         self, batch_size: int, length: int, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-        """``qpos``, ``qvel (batch, length + 1, ...)``, commands, ground, parameters."""
+        """``qpos``, ``qvel (batch, length + 1, ...)``, commands, ground, parameters.
+
+        Raises:
+            ValueError: longer than one robot of some trajectory stays.
+        """
+        if length > self.longest:
+            raise ValueError(
+                f"expected rollouts, history included, of at most {self.longest} steps "
+                f"with robots that change, got {length}"
+            )
         trajectory, time_index = self.pick(batch_size, length, generator)
         if self.change is not None:
             time_index = self._of_one_robot(trajectory, time_index)
