@@ -212,7 +212,7 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     for dry in ((), ("--dry-run",)):
         assert main(["train", "cartpole", "--vary", "preset", *run, *dry]) == 2
         assert "expected data that vary" in capsys.readouterr().err
-    assert main(["train", "cartpole", *vary, *run, "--dry-run"]) == 0
+    assert main(["train", "cartpole", *vary, *how, "--dry-run"]) == 0
     changing = (
         "--changes",
         "--out",
