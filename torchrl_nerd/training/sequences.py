@@ -68,9 +68,8 @@ class Sequences:
         self.symmetry = symmetry.to(self.targets.device) if symmetry else None
         self.scene, self.steps = model.scene, data.batch_size[1]
         self.change, self.longest = change_times(data), self.steps
-        if (
-            self.change is not None
-        ):  # the longer part of each trajectory, the least of them
+        if self.change is not None:
+            # the longer part of each trajectory, and the least of these
             part = torch.maximum(self.change, self.steps - self.change)
             self.longest = int(part.min())
 
