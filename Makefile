@@ -119,7 +119,7 @@ LONG := --sequence-length 160 --batch-size 12 --validate-every 9000
 
 # At last robots that change within a trajectory: single steps, then rollouts as well.
 define LEARN_CHANGES
-	$(NERD) data $(1) --vary preset --changes --trajectories 7000 --steps 200 --seed 3 \
+	$(NERD) data $(1) --vary preset --strategy changing --trajectories 7000 --steps 200 --seed 3 \
 		--out datasets/$(1)_changing
 	$(NERD) train $(1) $(ADAPTIVE) $(LONG) --data datasets/$(1)_changing \
 		--init-from runs/$(1)_$(2)/last --steps 3000 --lr 0.004 --adamw-lr 0.0012 \

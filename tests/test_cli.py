@@ -217,6 +217,8 @@ def test_a_dry_run_refuses_what_the_run_would(command, capsys):
         ("train cartpole --sequence-length 500", "at least 500 steps, got"),
         ("data cube --from {log} --trajectories 3", "--from without options that draw"),
         ("data cartpole --noise 0.1", "expected --noise with --policy"),
+        ("data ant --policy x --strategy resting", "--strategy without --policy"),
+        ("data cartpole --strategy level", "expected a strategy of correlated, rest"),
         ("finetune cube --from {log} --model nowhere", "'nowhere'"),
     ],
 )

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from tensordict import TensorDict
 from torch import Generator
 
 from torchrl_nerd.checkpoint import make_card
+from torchrl_nerd.cli import main
 from torchrl_nerd.configs import NO_PREDICTIONS, DataConfig
 from torchrl_nerd.data.generate import (
     CARD,
@@ -288,6 +290,18 @@ def test_a_folder_holds_one_strategy(tmp_path, seed):
         with pytest.raises(ValueError, match=f"{tmp_path} already holds.*strategy"):
             generate(scene, config, tmp_path, quiet=True, strategy=other)
     generate(scene, config, tmp_path, quiet=True, strategy=("calm", calm))
+
+
+def test_the_command_draws_by_a_named_strategy(tmp_path, monkeypatch, seed):
+    scene, size = load_scene("cartpole"), ("--trajectories", "9", "--steps", "4")
+    monkeypatch.chdir(tmp_path)
+    asked = ("--strategy", "resting", "--seed", str(seed), "--quiet")
+    assert main(["data", "cartpole", *asked, *size]) == 0
+    folder = Path("datasets/cartpole-resting")
+    assert read_json(folder / CARD)["strategy"] == "resting"
+    drawn = strategy(scene, "resting")(9, 4, fold_in(seed, 0))
+    data = load_data(scene, folder)
+    assert_equal(TensorDict(dict(data.items()), [9, 4]), drawn)
 
 
 def test_cards_say_what_is_set(scene, tmp_path, seed):

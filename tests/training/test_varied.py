@@ -214,7 +214,8 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
         assert "expected data that vary" in capsys.readouterr().err
     assert main(["train", "cartpole", *vary, *how, "--dry-run"]) == 0
     changing = (
-        "--changes",
+        "--strategy",
+        "changing",
         "--out",
         str(tmp_path / "changing"),
         *made[:3],
@@ -226,10 +227,10 @@ def test_the_command_line_varies_data_and_training(tmp_path, capsys):
     capsys.readouterr()
     assert main(["data", "cartpole", *changing]) == 2
     assert "expected parameters that vary" in capsys.readouterr().err
-    short = ("--steps", "16", "--changes", "--out", str(tmp_path / "short"))
+    short = ("--steps", "16", *changing[:2], "--out", str(tmp_path / "short"))
     assert main(["data", "cartpole", *vary, *short]) == 2
     assert "expected steps of at least 17, got 16" in capsys.readouterr().err
-    for more in (("--changes",), ("--vary", "preset")):
+    for more in (changing[:2], ("--vary", "preset")):
         assert main(["data", "cartpole", "--from", "log.npz", *more]) == 2
         assert "--from without options" in capsys.readouterr().err
     for bad in ("mass:pole", "mass:pole=1", "mass:pole=a:b", "mass:rod=1:2"):

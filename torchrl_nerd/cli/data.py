@@ -21,7 +21,7 @@ from torchrl_nerd.data.generate import (
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
 from torchrl_nerd.data.simulate import SEGMENT, simulate
-from torchrl_nerd.data.strategies import preset_strategy, strategy
+from torchrl_nerd.data.strategies import Strategy, preset_strategy, strategy
 from torchrl_nerd.files import folder_name, read_json
 from torchrl_nerd.robots import preset_of
 from torchrl_nerd.scenes import Scene
@@ -41,7 +41,7 @@ class Data(SceneOptions, Command):
 
     Example: nerd data cartpole --vary mass:pole=0.3:3.0 motor=0.6:1.4
 
-    Example: nerd data cartpole --vary preset --changes --steps 200
+    Example: nerd data cartpole --vary preset --strategy changing --steps 200
 
     Example: nerd data ant --trajectories 1000000 --ray auto
 
@@ -57,10 +57,10 @@ class Data(SceneOptions, Command):
     """Folder of a policy (see examples/ppo.py) that acts, from the resets of its task."""
     noise: float = 0.5
     """Largest standard deviation of the noise on a policy's actions, in [-1, 1]."""
-    changes: bool = False
-    """Let each hidden parameter change with a chance of a half, once in half of the
-    trajectories, after a multiple of 16 steps; see --vary. Starts and torques are those of
-    the robot's ranges, not of its preset's strategy."""
+    strategy: Strategy | None = None
+    """Another way to draw starts and torques than the preset's, see docs/training.md.
+    With `changing`, each hidden parameter of --vary changes with a chance of a half, once
+    in half of the trajectories, after a multiple of 16 steps."""
     ray: str | None = None
     """Ray cluster that generates the same data: HOST:PORT, auto, or local."""
     quiet: bool = False
@@ -69,28 +69,30 @@ class Data(SceneOptions, Command):
     @property
     def folder(self) -> Path:
         """Of the data set that is generated."""
-        name = f"{self.run_name}-changing" if self.changes else self.run_name
-        return self.out or Path("datasets") / name
+        names = filter(None, (self.run_name, self.strategy))
+        return self.out or Path("datasets") / "-".join(names)
 
-    def strategy(self, scene: Scene) -> tuple[str, Draw] | None:
-        """Name and function that draw: the policy's, or the preset's.
+    def drawing(self, scene: Scene) -> tuple[str, Draw] | None:
+        """Name and function that draw: the policy's, the strategy's or the preset's.
 
         Raises:
-            ValueError: hidden parameters change along a policy, or in too few steps.
+            ValueError: a strategy beside a policy, one that does not fit the robot, or
+                too few steps for hidden parameters to change.
         """
-        if self.policy is not None and self.changes:
-            raise ValueError("expected --changes without --policy")
+        if self.policy is not None and self.strategy is not None:
+            raise ValueError("expected --strategy without --policy")
         if self.policy is not None:
             return along_policy(scene, self.policy, self.noise)
-        if self.changes:
+        if self.strategy is None:
+            return preset_strategy(scene)
+        if self.strategy == "changing":
             expect_at_least(SEGMENT + 1, steps=self.config.steps)
-            return "changing", strategy(scene, "changing")
-        return preset_strategy(scene)
+        return self.strategy, strategy(scene, self.strategy)
 
     def inputs(self) -> tuple[Scene, tuple[str, Draw] | None]:
         """The robot and how its trajectories are drawn; options that misfit are refused."""
         if self.recorded is not None:
-            drawing = self.policy, self.ray, self.reference, self.vary, self.changes
+            drawing = self.policy, self.ray, self.reference, self.vary, self.strategy
             if any(drawing) or self.config != preset_of(self.scene).data:
                 raise ValueError("expected --from without options that draw data")
             return recorded_scene(self.scene), None
@@ -99,7 +101,7 @@ class Data(SceneOptions, Command):
                 "expected --noise with --policy, whose actions it is added to"
             )
         scene = self.load()
-        return scene, self.strategy(scene)
+        return scene, self.drawing(scene)
 
     def plan(self) -> list[str]:
         """How many trajectories would be drawn, their size, and how many exist."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, Literal, cast, get_args
 
 import torch
 from tensordict import TensorDict
@@ -19,7 +19,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import held, idle
 from torchrl_nerd.scenes.sampling import log_uniform
 
-STRATEGIES = "correlated", "level", "resting", "changing"
+Strategy = Literal["correlated", "level", "resting", "changing"]
 MAX_CORRELATION_TIME = 1.0  # s; the shortest is one control step
 
 
@@ -124,7 +124,7 @@ def strategy(scene: Scene, name: str) -> Draw:
         if scene.variation is None:
             raise ValueError(f"expected parameters that vary, '{scene.name}' has none")
         return mix(own, partial(simulate, scene, is_changing=True))
-    fitting = [s for s in STRATEGIES if s != "level" or level is not None]
+    fitting = [s for s in get_args(Strategy) if s != "level" or level is not None]
     raise ValueError(
         f"expected a strategy of {', '.join(fitting)} for '{scene.name}', got {name}"
     )
