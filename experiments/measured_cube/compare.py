@@ -16,8 +16,8 @@ from torchrl_nerd import from_pretrained, load_scene
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.dynamics import Dynamics, dynamics_of
 from torchrl_nerd.evaluation.recorded_error import STATES, compare, errors_as_text
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import open_loop
-from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import recorded_protocol
 from torchrl_nerd.training.finetune import start_model
 
@@ -40,7 +40,7 @@ def main() -> None:
     starts = recording.starts(STATES, split[args.part])
     table = compare(models, scene, recording, starts)
     print(errors_as_text(table, protocol.published))
-    write_json(args.out / f"{args.part}.json", table)
+    write_results(args.out / f"{args.part}.json", table)
     first = recording.offsets[split[args.part][args.toss], None]
     window = recording.windows(first, STATES)
     shown = ("MuJoCo, fitted", "MuJoCo, fitted with centre", protocol.model)

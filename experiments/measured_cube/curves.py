@@ -2,7 +2,7 @@
 
     python experiments/measured_cube/curves.py
 
-Reads the curves that `nerd finetune` writes, and prints when each came to its best.
+Reads the records of two trainings, and prints when each came to its best.
 """
 
 import argparse
@@ -11,7 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from toss_plot import COLORS, STYLES
 
-from torchrl_nerd.files import read_json
+from torchrl_nerd.evaluation.results import read_results
 from torchrl_nerd.training.finetune import Curve, converged
 
 RESULTS = Path(__file__).parent / "results"
@@ -44,7 +44,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=RESULTS / "finetune_curves.png")
     args = parser.parse_args()
-    curves = {name: read_json(path)["curve"] for name, path in CURVES.items()}
+    curves = {
+        name: read_results(path)["results"]["curve"] for name, path in CURVES.items()
+    }
     for name, curve in curves.items():
         print(name, {key: round(x, 4) for key, x in converged(curve).items()})
     plot_curves(curves, args.out)

@@ -17,7 +17,7 @@ from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.evaluation.recorded_error import STATES, window_errors
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import weighted_error
 from torchrl_nerd.training.physics_fit import (
@@ -78,7 +78,7 @@ def main() -> None:
     }
     print(results)
     if args.json:
-        write_json(args.json, results)
+        write_results(args.json, results)
 
 
 if __name__ == "__main__":

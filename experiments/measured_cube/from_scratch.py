@@ -23,7 +23,7 @@ from torchrl_nerd.configs import NO_PREDICTIONS, FinetuneConfig
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.files import write_json
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.scenes import Scene
@@ -111,7 +111,7 @@ def main() -> None:
     tuner = FineTuner(model, tosses, train, validation, config)
     best = tuner.run()
     save_checkpoint(best, args.out, make_card(best, tuner.card()))
-    write_json(args.out / "curve.json", {"curve": tuner.curve})
+    write_results(args.out / "curve.json", {"curve": tuner.curve})
     print(tuner.card()["finetuning"])
 
 

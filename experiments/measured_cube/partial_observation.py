@@ -27,8 +27,8 @@ from torchrl_nerd.evaluation.recorded_error import (
     summarize_windows,
     window_errors,
 )
+from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import Errors, open_loop, position_errors
-from torchrl_nerd.files import write_json
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import start_model, weighted_error
 from torchrl_nerd.training.physics_fit import fit_flight, fit_parameters
@@ -139,7 +139,7 @@ def main() -> None:
         print(name, means)
     if args.json:
         how = {"case": asdict(case), "parameters": fit.step.values()}
-        write_json(args.json, {**how, "errors": results})
+        write_results(args.json, {**how, "errors": results})
 
 
 if __name__ == "__main__":

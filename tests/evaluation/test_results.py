@@ -19,7 +19,8 @@ from torchrl_nerd.evaluation.results import (
 )
 
 RESULTS = Path(__file__).parents[2] / "results"
-FILES = sorted(RESULTS.rglob("*.json"))
+CUBE = RESULTS.parent / "experiments" / "measured_cube" / "results"
+FILES = sorted((*RESULTS.rglob("*.json"), *CUBE.glob("*.json")))
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
@@ -55,6 +56,11 @@ def test_a_script_names_its_own_command(monkeypatch):
     ]
     monkeypatch.setattr("sys.argv", words)
     assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
+    words[0] = str(CUBE.parent / "curves.py")
+    monkeypatch.setattr("sys.argv", words[:2])
+    named = "python experiments/measured_cube/curves.py ant"
+    assert make_record([])["command"] == named
+    words[0] = "/some/where/experiments/try.py"
     monkeypatch.setattr("sys.argv", [*words[:2], "--json=/tmp/x.json", *words[4:]])
     assert make_record([])["command"] == "python experiments/try.py ant --rows 3"
 

@@ -59,7 +59,9 @@ def script_command() -> str:
     if module is not None and module.origin == sys.argv[0]:
         what = ["-m", module.name.removesuffix(".__main__")]
     else:
-        what = [f"{script.parent.name}/{script.name}"]
+        root, path = Path(__file__).parents[2], script.resolve()
+        inside = path.is_relative_to(root)
+        what = [str(path.relative_to(root) if inside else Path(*path.parts[-2:]))]
     return shlex.join(["python", *what, *words])
 
 
