@@ -16,7 +16,6 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import tyro
-from torch import Generator
 from tyro.conf import Positional
 
 from torchrl_nerd.configs import DataConfig
@@ -26,6 +25,7 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_commands
+from torchrl_nerd.seeds import fold_in
 
 CONTROL = int(  # applied force, and where the ground is
     mujoco.mjtState.mjSTATE_QFRC_APPLIED
@@ -52,7 +52,7 @@ def seconds_of_rollout(
     scene: Scene, trajectories: int, steps: int, seed: int, threads: int
 ) -> float:
     """One bare call of MuJoCo."""
-    generator = Generator().manual_seed(seed)
+    generator = fold_in(seed, 0)  # as the first chunk of a data set
     start, scale = scene.sample_initial(trajectories, generator)
     model = engine_model(scene, has_actuators=False)
     data = [mujoco.MjData(model) for _ in range(threads)]

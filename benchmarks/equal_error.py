@@ -10,7 +10,7 @@ rate, beyond its fastest point at that point's rate.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import exp, inf, isfinite, log, nan
+from math import exp, inf, isfinite, isnan, log, nan
 from pathlib import Path
 
 import tyro
@@ -42,7 +42,7 @@ class Ratio:
     | field | meaning |
     |---|---|
     | ``scene``, ``model``, ``kind``, ``batch`` | of which benchmark |
-    | ``low``, ``high`` | smallest and largest ratio over the quantities |
+    | ``low``, ``high`` | smallest and largest ratio over the quantities; NaN: it diverges |
     """
 
     scene: str
@@ -76,9 +76,10 @@ def ratios(report: BenchReport) -> Iterator[Ratio]:
                 if error.name == row.name:
                     simulators = _simulators(report, row.batch, error.quantity)
                     rival = rate_at(error.mean, simulators)
-                    found.append(row.steps_per_s / rival if rival else inf)
+                    ratio = row.steps_per_s / rival if rival else inf
+                    found.append(ratio if isfinite(error.mean) else nan)
             name = row.name.removesuffix(VARIANT)
-            both = min(found), max(found)
+            both = (nan, nan) if any(map(isnan, found)) else (min(found), max(found))
             yield Ratio(report.scene, name, row.kind, row.batch, *both)
 
 
@@ -110,6 +111,8 @@ def table(found: list[Ratio]) -> str:
 
 def written(ratio: Ratio) -> str:
     """One number, or two where quantities differ."""
+    if isnan(ratio.low):
+        return "diverges"
     if not isfinite(ratio.high):
         return "MuJoCo is never so accurate"
     low, high = f"{ratio.low:.1f}", f"{ratio.high:.1f}"

@@ -103,7 +103,8 @@ def main(cfg: Config) -> None:
     agent, ground_truth, learned = train(cfg)
     total = f"{len(ground_truth)} transitions of MuJoCo"
     print(f"{total}; the last {len(learned)} learned ones")
-    returns = transfer(cfg.task, agent.actor, (cfg.dynamics,), cfg.episodes)
+    about = cfg.task, agent.actor, (cfg.dynamics,)
+    returns = transfer(*about, cfg.episodes, seed=cfg.seed + 2)
     print(transfer_table(returns))
 
 

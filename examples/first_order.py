@@ -184,10 +184,10 @@ def go_on(
 
 
 def main(cfg: Config) -> None:
-    """Learn through NeRD, measure in NeRD and in MuJoCo."""
+    """Learn through the dynamics, measure in them and in MuJoCo."""
     torch.manual_seed(cfg.seed)
     policy, _ = train(cfg)
-    where = ["nerd", "mujoco"]
+    where = [cfg.dynamics, "mujoco"]
     actor = make_actor(policy)
     returns = transfer(cfg.task, actor, where, cfg.episodes, seed=cfg.seed + 2)
     print(transfer_table(returns))

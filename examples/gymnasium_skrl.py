@@ -42,9 +42,9 @@ class Config:
     seed: int = 0
 
 
-def make_env(cfg: Config, dynamics: str) -> GymnasiumWrapper:
+def make_env(cfg: Config, dynamics: str, seed: int) -> GymnasiumWrapper:
     """Gymnasium's batched env, as skrl sees it."""
-    envs = gymnasium.make_vec(cfg.env, cfg.num_envs, dynamics=dynamics, seed=cfg.seed)
+    envs = gymnasium.make_vec(cfg.env, cfg.num_envs, dynamics=dynamics, seed=seed)
     return GymnasiumWrapper(envs)
 
 
@@ -92,14 +92,14 @@ def returns(agent: PPO, env: GymnasiumWrapper, steps: int) -> torch.Tensor:
 def main(cfg: Config) -> dict[str, float]:
     """Learn in one dynamics, measure there and in MuJoCo; mean returns by dynamics."""
     set_seed(cfg.seed)
-    env = make_env(cfg, cfg.dynamics)
+    env = make_env(cfg, cfg.dynamics, cfg.seed)
     agent = make_agent(env, cfg)
     settings = {"timesteps": cfg.steps, "close_environment_at_exit": False}
     SequentialTrainer(env=env, agents=agent, cfg=settings | {"headless": True}).train()
     agent.enable_training_mode(False)
     found = {}
     for dynamics in dict.fromkeys((cfg.dynamics, "mujoco")):
-        sums = returns(agent, make_env(cfg, dynamics), cfg.episode)
+        sums = returns(agent, make_env(cfg, dynamics, cfg.seed + 2), cfg.episode)
         found[dynamics] = float(sums.mean())
         print(f"{dynamics}: {sums.mean():.1f}, std {sums.std():.1f}")
     return found

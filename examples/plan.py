@@ -55,6 +55,10 @@ def make_planner(cfg: Config) -> CEMPlanner:
     Its candidates are a batch dimension of its own, which an env of fixed size refuses:
     `StatelessEnv` takes any batch and sets its envs to the states in it.
     """
+    if cfg.best > cfg.candidates:
+        raise ValueError(
+            f"expected best of at most {cfg.candidates}, the candidates, got {cfg.best}"
+        )
     size = cfg.num_envs * cfg.candidates
     model = StatelessEnv(make_env(HeldSwingup(), cfg.dynamics, size))
     return CEMPlanner(model, cfg.horizon, cfg.rounds, cfg.candidates, cfg.best)

@@ -31,6 +31,7 @@ from torchrl_nerd.evaluation.policy import Policy, make_actor, mlp, save_policy
 from torchrl_nerd.evaluation.policy_transfer import report_transfer, transfer
 from torchrl_nerd.files import write_json
 from torchrl_nerd.robots import PPO_CONFIGS
+from torchrl_nerd.settings import expect_at_least
 from torchrl_nerd.tasks import Task
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -93,8 +94,9 @@ def update(
 
 
 def num_frames(cfg: Run) -> tuple[int, int]:
-    """Actions in a batch, and in all batches."""
-    return (n := cfg.num_envs * cfg.horizon), cfg.total_frames // n * n
+    """Actions in a batch, and in all batches; less than a batch is refused."""
+    expect_at_least(n := cfg.num_envs * cfg.horizon, total_frames=cfg.total_frames)
+    return n, cfg.total_frames // n * n
 
 
 def collect(cfg: Run, env: EnvBase, actor: Actor) -> Iterable[TensorDictBase]:

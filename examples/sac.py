@@ -122,7 +122,8 @@ def main(cfg: Config) -> None:
     agent, buffer = train(cfg)
     fraction = buffer[torch.arange(len(buffer))]["is_mujoco"].float().mean()
     print(f"{len(buffer)} transitions, {fraction:.0%} of them MuJoCo's")
-    returns = transfer(cfg.task, agent.actor, (cfg.dynamics,), cfg.episodes)
+    about = cfg.task, agent.actor, (cfg.dynamics,)
+    returns = transfer(*about, cfg.episodes, seed=cfg.seed + 2)
     print(transfer_table(returns))
 
 

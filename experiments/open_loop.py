@@ -180,7 +180,8 @@ def compare(scene: Scene, model: Path, cfg: Config) -> dict[str, Any]:
     In float32, and with the matrices of its blocks in bfloat16.
     """
     engines = simulators(scene, threads=1)
-    learned = models(scene, [str(model)], variants=("compiled", "bf16"))
+    found = models(scene, [str(model)], variants=("compiled", "bf16"))
+    learned = [c for c in found if c.kind == "learned"]
     zeroed = without_network(cast(NeRD, load_checkpoint(model, scene)))
     off = Candidate(ZEROED, "learned", lambda _: NeRDDynamics(zeroed))
     # eager and compiled in float32, then in bfloat16

@@ -288,7 +288,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             if found
             else "-"
         )
-        cells.append(f"{own['true_mean']:.0f}" if own else "not measured")
+        cells.append(f"{own['mujoco_mean']:.0f}" if own else "not measured")
         lines.append(" | ".join(cells))
     return "\n".join(f"| {line} |" for line in lines)
 

@@ -20,7 +20,7 @@ from typing import Any
 from learner import run, use_one_thread
 from tyro.conf import Positional
 
-from torchrl_nerd.checkpoint import shipped_models
+from torchrl_nerd.checkpoint import model_name, shipped_models
 from torchrl_nerd.evaluation.policy import load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import GROUND_TRUTH, transfer
 from torchrl_nerd.evaluation.results import write_results
@@ -64,7 +64,8 @@ def play(cfg: Config, policy: Path) -> list[dict[str, Any]]:
     """A row for each model that the policy did not learn in."""
     use_one_thread()
     task, learned_in = make_task(cfg.task), policy.parent.name
-    unmet = [name for name in cfg.names() if name != learned_in]
+    own = model_name(learned_in, task.scene)
+    unmet = [name for name in cfg.names() if name not in (learned_in, own)]
     actor = make_actor(load_policy(policy, task))
     found = transfer(task, actor, unmet, cfg.episodes, seed=cfg.seed)
     reached = found[GROUND_TRUTH].mean

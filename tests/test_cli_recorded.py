@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import EXCERPT, simulated
+from helpers import EXCERPT, simulated, slow_but
 from torch import Generator
 
 from torchrl_nerd import load_scene
@@ -63,7 +63,7 @@ def network(real_cube, tmp_path):
     return str(save_checkpoint(model, tmp_path / "network", make_card(model)))
 
 
-@pytest.mark.parametrize("update", ["physics", "all"])
+@pytest.mark.parametrize("update", slow_but(["all"], ["physics", "all"]))
 def test_what_was_fine_tuned_is_measured(update, network, tmp_path, capsys):
     out, results = tmp_path / "run", tmp_path / "results.json"
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", str(out)]
@@ -131,6 +131,10 @@ def test_other_robots_and_splits_are_refused(network, tmp_path, capsys):
     text = refusal(capsys, "data", "ant", "--from", str(EXCERPT), "--out", out)
     assert "expected 'qpos'" in text and "position" in text
     assert "nowhere" in refusal(capsys, "eval", "cube", "--data", "nowhere.npz")
+    for states, is_published in (("80", True), ("10", False)):
+        argv = ["eval", "cube", "--data", str(EXCERPT), "--states", states]
+        assert main(argv) == 0
+        assert ("paper" in capsys.readouterr().out) == is_published
     argv = ["eval", "cube", "--data", str(EXCERPT), "--split", "best"]
     assert "'best'" in refusal(capsys, *argv)
     argv = ["finetune", "cube", "--from", str(EXCERPT), "--out", out]

@@ -87,6 +87,14 @@ def test_ppo_learns_in_one_dynamics_and_is_measured_in_all(
     load_policy(tmp_path, make_task(cfg.task))
 
 
+def test_ppo_of_less_than_a_batch_is_refused(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import ppo
+
+    with pytest.raises(ValueError, match="total_frames of at least 2048, got 1000"):
+        ppo.num_frames(ppo.Run(total_frames=1000, num_envs=64, horizon=32))
+
+
 def test_ppo_is_short():
     assert len((EXAMPLES / "ppo.py").read_text().splitlines()) <= 150
 

@@ -8,11 +8,17 @@ from itertools import count
 import pytest
 import torch
 from dynamics_helpers import HAS_COMPILER, random_actions, random_drive, roll
+from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_nerd import NeRDEnv, from_pretrained
+from torchrl_nerd.analytic import make_step
 from torchrl_nerd.compiled import WARM, RowThreads, parts_of
+from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics, models
+from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.modules.transformer import TransformerConfig
+from torchrl_nerd.robots import load_scene
 
 TASK, ROWS, STEPS = "double_pendulum/passive", 6, 4
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
@@ -118,3 +124,17 @@ def test_what_must_stay_whole_does(generator, monkeypatch):
     assert NeRDDynamics(from_pretrained("cartpole")).parts(ROWS) == 1
     torch.set_num_threads(1)
     assert NeRDDynamics(model).parts(ROWS) == 1
+
+
+@pytest.mark.parametrize("inference", ["streaming", "window"])
+def test_a_history_is_not_cut_in_parts(inference, generator):
+    """A hybrid with a transformer, and one that recomputes a window of tokens."""
+    scene = load_scene("double_pendulum")
+    step = make_step(scene)
+    network = TransformerConfig(1, 16, 2, band=4)
+    model = HybridNeRD(scene, step, NO_PREDICTIONS, network)
+    dynamics = NeRDDynamics(model, inference, compile=True)
+    start, _ = scene.sample_initial(4 * models.MIN_WORK, generator)
+    state = TensorDict(start, [len(start["qpos"])]).select("qpos", "qvel")
+    dynamics.reset(state)
+    assert dynamics.is_single_threaded and dynamics.parts(len(state)) == 1

@@ -1,5 +1,6 @@
 """Rates at equal error, and pictures of benchmarks, from files of results."""
 
+import math
 from dataclasses import asdict
 
 import draw_benchmarks
@@ -49,6 +50,8 @@ def test_beyond_mujoco_s_points(generator):
     assert (found.low, found.high) == pytest.approx((3.0 / fastest, 3.0 / fastest))
     (found,) = equal_error.ratios(report((0.5, 3.0), *true))
     assert "never so accurate" in equal_error.written(found)
+    (found,) = equal_error.ratios(report((math.nan, 3.0), *true))
+    assert equal_error.written(found) == "diverges"
 
 
 def test_files_of_results_are_read_and_drawn(tmp_path):

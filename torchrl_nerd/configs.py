@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from math import inf
 from typing import Literal, get_args
 
-from torchrl_nerd.settings import SettingError, expect_at_least
+from torchrl_nerd.settings import SettingError, expect_at_least, expect_share
 
 COUNTS = (
     *("batch_size", "sequence_length", "rollout_batch_size", "rollout_length"),
@@ -128,6 +128,12 @@ class TrainConfig:
         for name, value in asdict(self).items():
             if not isinstance(value, str | None):
                 expect_at_least(1 if name in COUNTS else 0, **{name: value})
+        fractions = "single_step_fraction", "bf16_fraction", "ema"
+        expect_share(**{name: getattr(self, name) for name in fractions})
+        if not self.total_steps:
+            raise SettingError(
+                "expected steps or rollout_steps of at least 1, got none"
+            )
         if self.use_symmetry and self.step is not None:
             raise SettingError(
                 "expected training without use_symmetry for a hybrid, got it with one"
@@ -193,7 +199,8 @@ class FinetuneConfig:
             raise SettingError(f"expected a finite number of epochs, got {self.epochs}")
         counts = ("evaluations", "batch_size", "sequence_length")
         counts = (*counts, "validate_every", "patience")
-        numbers = ("epochs", "lr", "clip", "short_history_fraction")
+        numbers = ("epochs", "lr", "clip")
+        expect_share(short_history_fraction=self.short_history_fraction)
         for least, names in ((1, counts), (0, numbers)):
             expect_at_least(least, **{name: getattr(self, name) for name in names})
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from errno import EEXIST, EISDIR
 from math import isfinite
 from pathlib import Path
+from threading import get_ident
 from typing import Any
 
 
@@ -43,7 +44,7 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         if not _is_running(left.suffixes[-2]):
             left.unlink(missing_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    aside = path.with_name(f".{path.name}.{get_ident()}.{os.getpid()}.tmp")
     try:
         write(aside)
         with open(aside, "rb+") as file:

@@ -21,6 +21,13 @@ def expect_at_least(least: float, **settings: float) -> None:
             raise SettingError(f"expected {name} of at least {least}, got {value}")
 
 
+def expect_share(**settings: float) -> None:
+    """Raise a SettingError that names the first setting outside [0, 1]."""
+    for name, value in settings.items():
+        if not 0.0 <= value <= 1.0:
+            raise SettingError(f"expected {name} from 0 to 1, got {value}")
+
+
 def expect_count(least: int, **settings: object) -> None:
     """Raise a SettingError for what is no whole number of at least ``least``."""
     for name, value in settings.items():

@@ -136,7 +136,9 @@ def run_stage(letter: str, options: argparse.Namespace) -> None:
     setup = Setup(device, options.tiny, options.seed, options.out / "runs")
     print(f"{letter}: {stage.about}, {seconds:.0f} s at most", flush=True)
     items = importlib.import_module(f"gpu.{stage.module}").items(setup)
-    command = shlex.join(["make", "gpu", f"ARGS=--only {letter}"])
+    words = ["--only", letter, "--seed", str(options.seed)]
+    words += ["--device", options.device, *(["--tiny"] if options.tiny else [])]
+    command = shlex.join(["make", "gpu", f"ARGS={shlex.join(words)}"])
     path = options.out / f"{letter}_{stage.module}.json"
     results = run_items(items, path, setup, seconds, command)
     if results["not_measured"]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -32,6 +32,11 @@ class Setup:
     is_tiny: bool = False
     seed: int = 0
     folder: Path = Path("runs/gpu")
+
+    def described(self) -> dict[str, Any]:
+        """What results depend on, as JSON has it."""
+        about = {"device": str(self.device), "is_tiny": self.is_tiny}
+        return about | {"seed": self.seed}
 
     @property
     def is_gpu(self) -> bool:
@@ -87,7 +92,9 @@ def run_items(
     """
     done: dict[str, Any] = {}
     if path.exists():
-        done = read_results(path)["results"]["items"]  # pyright: ignore
+        found = cast(dict, read_results(path)["results"])
+        if found.get("setup") == setup.described():  # of another one nothing is kept
+            done = found["items"]
     done = {name: x for name, x in done.items() if name in items and "error" not in x}
     ends = time.monotonic() + seconds
     for name, item in items.items():
@@ -114,7 +121,7 @@ def _write(
     path: Path, items: dict[str, Item], done: dict[str, Any], setup: Setup, command: str
 ) -> dict[str, Any]:
     missing = [name for name in items if "error" in done.get(name, {"error": ""})]
-    results = {"items": done, "not_measured": missing}
+    results = {"items": done, "not_measured": missing, "setup": setup.described()}
     path.parent.mkdir(parents=True, exist_ok=True)
     how = {"command": command, "device": str(setup.device)}
     write_results(path, results, setup.seed, **how)

@@ -157,6 +157,11 @@ def test_gradients_are_those_of_the_motion(real_cube, generator):
     torch.testing.assert_close(slope, gradient @ change, rtol=1e-3, atol=1e-9)
 
 
+def test_it_has_a_substep_at_least(real_cube):
+    with pytest.raises(ValueError, match="num_substeps, a whole number .* got 0"):
+        FreeBodyPenaltyStep(real_cube, 0)
+
+
 def test_other_robots_and_contacts_are_refused(real_cube):
     with pytest.raises(ValueError, match="single free body"):
         FreeBodyPenaltyStep(load_scene("cartpole"))
@@ -166,7 +171,7 @@ def test_other_robots_and_contacts_are_refused(real_cube):
         FreeBodyPenaltyStep(replace(real_cube, model=model))
 
 
-TOSSED = """<mujoco><option cone="elliptic" timestep="0.001" gravity="{gravity}"/>
+TOSSED = """<mujoco><option cone="{cone}" timestep="0.001" gravity="{gravity}"/>
   <worldbody><geom type="plane" size="1 1 1" {plane}/><body pos="0 0 1">
   <joint type="free" damping="{damping}"/><geom type="{shape}" {pose} mass="1"/></body>
   </worldbody></mujoco>"""
@@ -174,6 +179,7 @@ BOX = {
     "gravity": "0 0 -9.81",
     "plane": "",
     "damping": "0",
+    "cone": "elliptic",
     "shape": "box",
     "pose": 'size="0.1 0.2 0.1"',
 }
@@ -189,6 +195,7 @@ BOX = {
         ({"pose": 'size="0.1 0.2 0.1" euler="30 0 0"'}, "axes of inertia"),
         ({"gravity": "1 0 -9.81"}, "gravity to the side"),
         ({"damping": "0.1"}, "damping"),
+        ({"cone": "pyramidal"}, "pyramidal friction cones"),
     ],
 )
 def test_a_free_body_with_more_than_it_knows_is_refused(changes, said):

@@ -143,3 +143,19 @@ def test_gradients_pass_through_an_end(generator):
         return unconstrained(rows[QPOS], rows[QVEL], torque)[1]
 
     assert torch.autograd.gradcheck(speed, (torque,), eps=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("solref", ["-100000 -1", "-100000 -20", "0.2 0.02"])
+def test_springs_that_are_hardly_damped_stay_bounded(solref):
+    """A control step of twenty substeps, fifty times: as fast as in MuJoCo at most."""
+    text = f'''<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody><body>
+      <joint axis="0 1 0" limited="true" range="-10 10" solreflimit="{solref}"/>
+      <geom size="0.1" pos="0.3 0 0" contype="0" mass="1"/></body></worldbody></mujoco>'''
+    scene = replace(make_scene(text), substeps=20)
+    limited = UnconstrainedStep(scene)
+    qpos, qvel = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
+    speeds = []
+    for _ in range(50):
+        qpos, qvel, _ = limited(qpos, qvel)
+        speeds.append(float(qvel.abs()))
+    assert max(speeds) < 1.5

@@ -242,11 +242,73 @@ def test_nobody_stages_four_times():
         PenaltyContactStep(ON_GROUND[0], num_stages=3)
 
 
-@pytest.mark.parametrize("outer", [0, 3])
-def test_outer_steps_of_unlike_lengths_are_refused(outer):
-    sentence = f"expected outer steps that divide 16 substeps, got {outer}"
-    with pytest.raises(ValueError, match=sentence):
-        PenaltyContactStep(load_scene("ant"), num_outer_steps=outer)
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"num_outer_steps": 3}, "outer steps that divide 16 substeps, got 3"),
+        (
+            {"num_outer_steps": 0},
+            "num_outer_steps, a whole number of at least 1, got 0",
+        ),
+        ({"merged_substeps": -2}, "merged_substeps, a whole number of at least 1"),
+    ],
+)
+def test_steps_that_cannot_be_are_refused(changes, said):
+    with pytest.raises(ValueError, match=said):
+        PenaltyContactStep(load_scene("ant"), **changes)
+
+
+LAW = {"ke": 2e3, "kd": 20.0, "kf": 30.0, "mu": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('size="1 1 1"', 'size="1 1 1" margin="0.02"', "a margin or gap"),
+        ("</worldbody>", "{}</worldbody>", "that the file overrides"),
+        ("</worldbody>", "{}</worldbody>", "an exact inertia of constraints"),
+        ('timestep="0.001"', 'timestep="0.001" noslip_iterations="5"', "without slip"),
+        ('size="0.1"', 'size="0.1" adhesion="50"', "shapes that adhere"),
+    ],
+)
+def test_contacts_that_mujoco_changes_are_refused(old, new, said):
+    flag = "override" if "overrides" in said else "diagexact"
+    option = f'<option><flag {flag}="enable"/></option>'
+    text = BALL.format(cone="elliptic").replace(old, new.format(""), 1)
+    if "{}" in new:
+        text = text.replace("</mujoco>", f"{option}</mujoco>")
+    model = mujoco.MjModel.from_xml_string(text)
+    set_penalty_contact(model, **LAW)
+    with pytest.raises(ValueError, match=said):
+        PenaltyContactStep(make_scene(model), num_outer_steps=1)
+
+
+def test_an_impedance_that_grows_is_no_spring():
+    model = ball().model
+    model.geom_solimp[:, :2] = 1e-3, 1e-2
+    with pytest.raises(ValueError, match="an impedance"):
+        PenaltyContactStep(make_scene(model), num_outer_steps=1)
+
+
+MEETING = """<mujoco><option cone="elliptic" timestep="0.001"/><worldbody>
+  <geom type="plane" size="1 1 1"/><body pos="0 0 0.1"><joint axis="0 1 0"/>
+  <geom type="capsule" size="0.05" fromto="0 0 0 0.5 0 0" {first}/>
+  <body pos="0.5 0 0"><joint axis="0 1 0"/>
+  <geom type="capsule" size="0.05" fromto="0 0 0 0.5 0 0" {second}/></body></body>
+  </worldbody></mujoco>"""
+
+
+def test_points_that_meet_have_one_law():
+    """Where two links meet, MuJoCo has a contact of each."""
+    scenes = []
+    for ratio in (1.0, 2.0):
+        model = mujoco.MjModel.from_xml_string(MEETING.format(first="", second=""))
+        set_penalty_contact(model, **LAW)
+        model.geom_solref[2] *= ratio
+        scenes.append(make_scene(model))
+    PenaltyContactStep(scenes[0], num_outer_steps=1)
+    with pytest.raises(ValueError, match="one contact law of shapes that meet"):
+        PenaltyContactStep(scenes[1], num_outer_steps=1)
 
 
 def test_so_are_contacts_and_limits_of_another_law():

@@ -172,6 +172,11 @@ def test_forces_that_it_does_not_model_are_refused(what, field):
         ),
         ("<option", '<option><flag spring="disable"/></option><option', "switched off"),
         ("<option", '<option><flag limit="disable"/></option><option', "switched off"),
+        (
+            "<option",
+            '<option><flag eulerdamp="disable"/></option><option',
+            "switched off",
+        ),
         ('stiffness="3"', 'stiffness="3 1"', "that grows"),
         ('damping="0.2"', 'damping="0.2 0.1"', "that grows"),
     ],

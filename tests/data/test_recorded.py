@@ -240,6 +240,7 @@ def test_other_columns_of_a_csv_are_ignored(generator, tmp_path):
     [
         (("trajectory", *CARTPOLE[:4], "joint_torque_1"), "none named joint_torque_0"),
         (("Trajectory", *CARTPOLE), "a column 'trajectory' .* got 'Trajectory'"),
+        (("trajectory", *CARTPOLE[:4], "torque_0"), "of 'joint_torque' .* 'torque_0'"),
     ],
 )
 def test_columns_that_are_nearly_right_are_refused(names, said, generator, tmp_path):

@@ -300,6 +300,10 @@ def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch):
     assert find_gl() is None
     env = make_env("ant/run", "mujoco")
     env.reset()
-    with pytest.raises(ValueError, match="install libegl1") as refusal:
+    with pytest.raises(ValueError, match="MUJOCO_GL .* got 'off': unset it") as refusal:
         env.render()
     assert "\n" not in str(refusal.value)
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr("torchrl_nerd.envs.rendering._renders", lambda name: False)
+    with pytest.raises(ValueError, match="install libegl1"):
+        env.render()

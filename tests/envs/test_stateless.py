@@ -46,3 +46,16 @@ def test_specs_are_those_of_one_row(generator):
     assert env.action_spec.shape == one.action_spec.shape[1:]
     assert set(env.observation_spec.keys()) == set(one.observation_spec.keys())
     assert not env.batch_locked and env.batch_size == torch.Size([])
+
+
+def test_a_reset_takes_what_the_env_has_just_given(generator):
+    env = StatelessEnv(EnvMaker("cartpole/swingup", "mujoco", generator)(4))
+    first = env.reset()
+    before = first["qpos"].clone()
+    again = env.reset(first)  # begins new episodes, as in ``env``
+    assert not torch.equal(again["qpos"], before)
+    before = again["qpos"].clone()
+    mask = torch.tensor([True, False, True, False])[:, None]
+    after = env.reset(again.set("_reset", mask))["qpos"]
+    assert torch.equal(after[1::2], before[1::2])
+    assert not (after[::2] == before[::2]).any()

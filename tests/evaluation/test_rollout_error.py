@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import HANDMADE, make_scene, random_quats, random_states
+from scipy import stats
 from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import from_pretrained
@@ -22,6 +23,7 @@ from torchrl_nerd.evaluation.rollout_error import (
     unit_of,
 )
 from torchrl_nerd.robots import TASKS, load_scene, make_task
+from torchrl_nerd.seeds import fold_in
 
 ROWS, STEPS = 6, 5
 
@@ -137,6 +139,18 @@ def test_units():
     assert unit_of(floater, "base_orientation") == unit_of(floater, "joints") == "rad"
 
 
+def test_starts_are_those_of_no_data_set(seed):
+    """Of a scene both are drawn by `Scene.sample_initial`."""
+    scene = load_scene("ant")
+    start = initial_states(scene, 3, seed)["qpos"]
+    for chunk in (0, seed, seed + 1):
+        assert not torch.equal(
+            start, scene.sample_initial(3, fold_in(0, chunk))[0]["qpos"]
+        )
+        drawn = scene.sample_initial(3, fold_in(seed, chunk))[0]["qpos"]
+        assert not torch.equal(start, drawn)
+
+
 def test_summaries_by_hand(rng):
     scene, rows = load_scene("cartpole"), int(rng.integers(2, 90))
     error = rng.exponential(size=(rows, 7))
@@ -144,7 +158,7 @@ def test_summaries_by_hand(rng):
     per_trajectory = error.mean(1)
     assert summary.unit == "m"
     assert summary.mean == pytest.approx(error.mean())
-    half = 1.96 * np.std(per_trajectory, ddof=1) / np.sqrt(rows)
+    half = stats.t.ppf(0.975, rows - 1) * np.std(per_trajectory, ddof=1) / np.sqrt(rows)
     assert summary.interval == pytest.approx(half)
     assert summary.final == pytest.approx(error[:, -1].mean())
     assert summary.p95 == pytest.approx(np.quantile(per_trajectory, 0.95))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from dynamics_helpers import EnvMaker, random_model
-from helpers import slow_but
+from helpers import make_scene, slow_but
 
 from torchrl_nerd.cli.main import INTERRUPTED, main
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
@@ -88,6 +88,31 @@ def test_every_seed_has_starts_of_its_own(generator):
     first, other, again, far = (x["qpos"] for x in drawn[::2])
     assert torch.equal(other, again)
     assert not torch.equal(first, other) and not torch.equal(first, far)
+
+
+def test_a_case_that_cannot_be_measured_does_not_end_the_others():
+    def restless(trial):
+        """It rests."""
+        raise ValueError("expected a robot that comes to rest, it did not")
+
+    calm = Case(lambda _: iter([Metric("x", 0.5, 1.0)]))
+    dynamics = MujocoDynamics(load_scene("cartpole"))
+    skipped, result = run_cases(dynamics, [Case(restless), calm])
+    assert skipped.skipped == "expected a robot that comes to rest, it did not"
+    assert skipped.tested == skipped.ground_truth == {} and not result.skipped
+    assert "restless" not in as_table([skipped, result]) and result.passes
+
+
+FLOATING = """<mujoco><worldbody><body><freejoint/><geom size="0.1"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["drop", "resting", "sliding"])
+def test_what_lands_needs_a_ground(name):
+    cube = load_scene("cube")
+    assert CASES[name].applies(cube)
+    assert not CASES[name].applies(make_scene(FLOATING))
+    assert not CASES[name].applies(load_scene("cartpole"))
 
 
 @pytest.mark.parametrize("value", [1.0, 1.1, float("nan"), float("inf")])

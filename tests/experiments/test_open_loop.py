@@ -39,6 +39,7 @@ def standing_policy(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_motion_along_a_policy_is_what_the_policy_did(tmp_path):
     """Its actions from the recorded states give the recorded motion again."""
     cfg = Config(HOPPER, policy=standing_policy(tmp_path), test_trajectories=3)

@@ -3,6 +3,7 @@
 import mujoco
 import pytest
 import torch
+from helpers import slow_but
 from unseen_terrain import UNSEEN_TERRAIN, Options, double_pendulum_over, main
 
 from torchrl_nerd.checkpoint import from_pretrained
@@ -39,7 +40,7 @@ def test_starts_are_those_over_planes_and_in_the_clear(case, seed):
     assert task.scene.clearances(start[QPOS]).min() > 0.0
 
 
-@each_case
+@pytest.mark.parametrize("case", slow_but([*CASES][:1], CASES))
 def test_the_pendulum_hits_the_ground_and_the_trained_model_follows(case, seed):
     """Far nearer to the ground truth than the same model without any ground in reach."""
     task, rows, steps = CASES[case], 64, 40

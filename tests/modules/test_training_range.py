@@ -4,6 +4,7 @@ import torch
 from dynamics_helpers import LEARNED, little_data, random_drive, random_model
 
 from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.geometry.constants import cast_constants
 from torchrl_nerd.geometry.manifold import differentiate_pos
 from torchrl_nerd.modules.training_range import TrainingRange, magnitudes
 from torchrl_nerd.robots import load_scene
@@ -129,3 +130,9 @@ def test_a_model_that_saw_no_data_is_bounded_by_nothing(scene, generator):
     assert not bounds.is_fitted
     wild = 1e9 * torch.randn(ROWS, 5, generator=generator).double()
     assert torch.equal(bounds.clamp_features(wild), wild)
+
+
+def test_a_model_that_knows_no_range_says_so_in_any_precision():
+    for dtype in (torch.float64, torch.float32):
+        known = TrainingRange(load_scene("cartpole"), 3, 2)
+        assert not cast_constants(known, dtype).is_fitted

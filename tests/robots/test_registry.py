@@ -20,6 +20,7 @@ from torchrl_nerd.robots import PRESETS, make_task, preset_of, register, task_id
 from torchrl_nerd.robots.registry import (
     NOT_LOADED,
     TABLES,
+    TASKS,
     VARIABLE,
     load_named_robots,
 )
@@ -116,6 +117,10 @@ def test_a_module_that_is_loaded_again_replaces_its_robot(tmp_path, monkeypatch)
     assert gymnasium.registry[gymnasium_id("cart/stay")].max_episode_steps == 1000
     with pytest.raises(ValueError, match="'cart' is among the scenes of another robot"):
         register(ROBOT)
+    path.write_text(SOURCE.format(horizon=100).replace("cart/stay", "cart/wait"))
+    importlib.reload(module)
+    assert make_task("cart/wait").horizon == 100
+    assert [task for task in TASKS if task.startswith("cart/")] == ["cart/wait"]
 
 
 BAD = [

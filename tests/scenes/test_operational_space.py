@@ -239,6 +239,23 @@ PASSIVE = """<mujoco><worldbody><body><joint name="a"/><geom size="0.1" pos="1 0
   </worldbody><actuator><motor joint="a"/></actuator></mujoco>"""
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("<body>", '<body gravcomp="1">', "gravity compensation"),
+        ("<worldbody>", '<option density="1000"/><worldbody>', "air or water"),
+        ('name="a"', 'name="a" frictionloss="1"', "dry friction"),
+        ("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>', "off"),
+    ],
+)
+def test_forces_that_it_does_not_know_are_refused(old, new, said):
+    model = mujoco.MjModel.from_xml_string(TWO_LINKS.replace(old, new, 1))
+    with pytest.raises(ValueError, match=said):
+        OperationalSpaceController(
+            model, "tip", (1.0,) * 3, (1.0,) * 3, (1.0,) * 3, (0.0, 0.0)
+        )
+
+
 def test_other_robots_are_refused_in_a_sentence():
     numbers = {"kp": (1.0,) * 3, "kd": (1.0,) * 3, "scale": (1.0,) * 3}
     model = mujoco.MjModel.from_xml_string(PASSIVE.format('<joint name="b"/>'))

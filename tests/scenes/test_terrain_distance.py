@@ -225,12 +225,13 @@ def test_a_floating_base_needs_ground_of_a_known_shape(kind):
         _ = make_scene(xml).terrain
 
 
-def test_a_mocap_body_with_two_planes_is_refused():
-    planes = 2 * '<geom type="plane" size="0 0 1"/>'
-    body = f'<body mocap="true">{planes}</body>'
-    xml = f"<mujoco><worldbody>{body}{ROBOT}</worldbody></mujoco>"
-    with pytest.raises(ValueError, match="one plane on a mocap body"):
-        _ = make_scene(xml).terrain
+def test_a_mocap_body_with_more_than_a_plane_is_refused():
+    plane = '<geom type="plane" size="0 0 1"/>'
+    for more in (plane, '<geom type="box" size="1 1 1"/>', "<body/>"):
+        body = f'<body mocap="true">{plane}{more}</body>'
+        xml = f"<mujoco><worldbody>{body}{ROBOT}</worldbody></mujoco>"
+        with pytest.raises(ValueError, match="one plane on a mocap body"):
+            _ = make_scene(xml).terrain
 
 
 def test_a_box_on_a_mocap_body_stands_where_the_file_has_it():

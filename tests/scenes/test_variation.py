@@ -216,3 +216,26 @@ def test_motors_that_would_not_vary_alike_everywhere_are_refused(joint, actuator
     scene = make_scene(ONE_HINGE.format(joint=joint, actuator=actuator))
     with pytest.raises(ValueError, match=said):
         scene.vary({"motor:h": (0.5, 1.0)})
+
+
+BALL_AND_HINGE = """<mujoco><worldbody><body><joint name="b" type="ball"/>
+<geom size="0.1" pos="0.2 0 0"/><body pos="0.3 0 0"><joint name="h"/>
+<geom size="0.1" pos="0.1 0 0"/></body></body></worldbody>
+<actuator><motor joint="b" gear="1 0 0"/><motor joint="h"/></actuator></mujoco>"""
+
+
+def test_motors_without_a_name_are_all_motors():
+    """Those of balls too, whether torques or controls drive them."""
+    scene = make_scene(BALL_AND_HINGE).vary({"motor": (2.0, 2.0)})
+    twice = np.full((1, 1), 2.0)
+    assert (scene.variation.strength(twice) == 2.0).all()
+    gains = scene.variation.fields(twice)["actuator_gainprm"][0, :, 0]
+    assert gains.tolist() == [2.0, 2.0]
+
+
+@pytest.mark.parametrize("kind", ["com_x", "payload_z"])
+def test_the_centre_of_a_simple_body_stays(kind):
+    """Of such bodies, as lone boxes are, MuJoCo keeps no place of the centre."""
+    ranges = {kind: (-0.01, 0.01), **({"payload": (0, 1)} if "load" in kind else {})}
+    with pytest.raises(ValueError, match=f"no simple one for '{kind}'"):
+        load_scene("cube").vary(ranges)

@@ -1,11 +1,15 @@
 """Tasks against their formulas (NeRD, appendix B and C), written again in NumPy."""
 
+import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from dynamics_helpers import random_drive
 from tensordict import TensorDict
 
+from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import TASKS, load_scene, make_task
 
 ROWS = 64
@@ -197,6 +201,28 @@ def test_a_scene_of_another_robot_is_refused(other):
             said = f"the robot of '{task.scene.name}', got another robot in '{other}'"
             with pytest.raises(ValueError, match=said):
                 task.with_scene(scene)
+
+
+@pytest.mark.parametrize("name", ["franka/reach_osc", "gymnasium/Humanoid-v5"])
+def test_another_scene_of_the_robot_is_seen_whatever_was_read_before(name, generator):
+    """As a task that was never asked for anything sees it."""
+    model = copy.copy(make_task(name).scene.model)
+    model.body_mass *= np.linspace(1.0, 3.0, model.nbody)
+    heavy = replace(make_task(name).scene, model=model)
+    read, fresh = make_task(name), make_task(name).with_scene(heavy)
+    state = random_state(read, generator)
+    action = torch.zeros(ROWS, read.controller.num_actions)
+    read.reward(state, action, state), read.observation(state)
+    again = read.with_scene(heavy)
+    for task in (again, fresh):
+        assert task.scene is heavy
+    torques = [
+        task.controller(action.double(), state[QPOS], state[QVEL])
+        for task in (again, fresh)
+    ]
+    assert torch.equal(*torques)
+    rewards = [task.reward(state, action, state) for task in (again, fresh)]
+    assert torch.equal(*rewards)
 
 
 def test_unknown_tasks_and_grounds_are_refused_in_one_sentence():

@@ -12,9 +12,10 @@ from torchrl_nerd.training.physics_fit import CENTRE, fit_flight, fit_parameters
 TOSSES, STATES = 12, 16
 
 
-def made(scene, step, generator, height):
+def made(scene, step, generator, height, is_turning=True):
     """Tosses of a cube whose lowest corner starts that high, m."""
     state = scene.sample_initial(TOSSES, generator)[0]
+    state["qvel"][:, 3:] *= is_turning
     scene.place_on_terrain(state, torch.full((TOSSES,), height, dtype=torch.float64))
     path = [(state["qpos"], state["qvel"])]
     with torch.no_grad():
@@ -34,6 +35,15 @@ def test_flight_tells_gravity_and_the_centre_of_mass(real_cube, generator):
     assert fit_flight(real_cube, tosses) == pytest.approx(
         ground_truth, abs=1e-5, rel=1e-4
     )
+
+
+def test_a_centre_that_no_turn_shows_stays_in_the_middle(real_cube, generator):
+    """Drops that do not turn tell of gravity alone."""
+    step = FreeBodyPenaltyStep(real_cube)
+    tosses = made(real_cube, step, generator, height=1.0, is_turning=False)
+    found = fit_flight(real_cube, tosses)
+    assert found["gravity"] == pytest.approx(step.values()["gravity"], rel=1e-4)
+    assert [found[name] for name in CENTRE] == pytest.approx([0.0] * 3, abs=1e-6)
 
 
 def test_tosses_without_flight_tell_nothing(real_cube, generator):

@@ -157,6 +157,7 @@ def test_a_stopped_run_resumes_to_the_same_bits(stop, whole, tmp_path):
     assert_same_bits(tmp_path, whole)
 
 
+@pytest.mark.slow
 def test_a_run_with_a_start_goes_on_to_the_same_bits(tmp_path, generator):
     start = random_model(load_scene(SCENE), generator, CONFIG.network)
     for folder in ("whole", "stopped"):

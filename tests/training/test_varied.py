@@ -1,9 +1,11 @@
 """Models of varied robots: told their parameters or not, trained after a history."""
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
+from helpers import slow_but
 from tensordict import TensorDict
 
 from torchrl_nerd import NeRDEnv, make_env
@@ -115,8 +117,13 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("other", OTHERS)
-@pytest.mark.parametrize("is_told", [True, False])
+@pytest.mark.parametrize(
+    ("other", "is_told"),
+    slow_but(
+        [("names", True), ("names", False), ("number", True)],
+        product(OTHERS, (True, False)),
+    ),
+)
 def test_a_told_model_knows_its_own_parameters_alone(other, is_told, data, tmp_path):
     """By folder, as an object, guarded, and over another ground; others adapt to all."""
     task = make_task("cartpole/swingup").vary(OTHERS[other])
@@ -159,9 +166,18 @@ def test_rollouts_are_of_one_robot_where_robots_change(length, generator):
     with pytest.raises(
         ValueError, match=f"at most {sequences.longest} steps with robots"
     ):
-        sequences.rollout(4, sequences.longest + 1, generator)
+        sequences.expect_rollouts(sequences.longest + 1)
+    sequences.expect_rollouts(sequences.longest)
     none = change_times(data[: len(data) // 3])
     assert none is None and change_times(data.exclude(PARAMETERS)) is None
+
+
+def test_rollouts_longer_than_one_robot_stays_are_refused_at_once(generator, tmp_path):
+    """Before the single steps that would come first."""
+    data = strategy(SCENE, "changing")(24, 48, generator)
+    config = TrainConfig(steps=3, rollout_steps=1, rollout_history=32)
+    with pytest.raises(ValueError, match="history included, of at most .* got 40"):
+        Trainer(SCENE, data[is_sound(data)], SCENE, config, tmp_path)
 
 
 def test_symmetry_augmentation_of_varied_robots_are_refused(data, tmp_path):
@@ -170,6 +186,7 @@ def test_symmetry_augmentation_of_varied_robots_are_refused(data, tmp_path):
         Trainer(SCENE, data, SCENE, config, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_line_measures_after_a_history(tmp_path, capsys, monkeypatch):
     """Beside MuJoCo, which knows every robot, and one that is nominal for all."""
 

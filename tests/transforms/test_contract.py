@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers import slow_but
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import (
@@ -28,6 +29,8 @@ from transform_helpers import (
 )
 
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, OBSERVATION, QPOS, QVEL, STATE_DELTA
+from torchrl_nerd.robots import load_scene
+from torchrl_nerd.transforms import Normalize, RobotCentric, Stats
 
 each_transform = pytest.mark.parametrize("name", TRANSFORMS)
 each_scene = pytest.mark.parametrize("scene", TASK_OF)
@@ -67,7 +70,7 @@ def test_serial_trans_env_check(name, scene):
     check(named(env, scene), name)
 
 
-@each_slow_but("ant")
+@each_slow_but("cartpole")
 def test_parallel_trans_env_check(scene):
     env = ParallelEnv(2, creators(scene, of_transformed=True))
     check(named(env, scene), *TRANSFORMS)
@@ -201,3 +204,16 @@ def test_an_env_moves_as_it_does_without_the_transform(name, scene):
         bare = plain.step(bare.set("action", action))["next"]
         for key in (QPOS, QVEL, "reward", "done"):
             assert torch.equal(root[key], bare[key])
+
+
+def test_tensors_may_be_given_by_their_names(generator):
+    """As to TorchRL's own transforms: they give the tensors alone."""
+    scene = load_scene("cartpole")
+    qpos, qvel = torch.randn(2, 5, 2, generator=generator).double()
+    transform = RobotCentric(scene)
+    found = transform(qpos=qpos, qvel=qvel)
+    expected = transform(TensorDict({"qpos": qpos, "qvel": qvel}, [5]))
+    assert torch.equal(found, expected["robot_state"])
+    normalize = Normalize({"x": Stats.of(qpos)})
+    expected = normalize(TensorDict({"x": qpos.clone()}, [5]))["x"]
+    assert torch.equal(normalize(x=qpos.clone()), expected)

@@ -195,3 +195,34 @@ def test_the_inverse_acts_on_what_an_env_is_given():
 def test_an_inverse_without_statistics_is_refused():
     with pytest.raises(ValueError, match=r"with statistics \(\['x'\]\), got \['y'\]"):
         Normalize({"x": Stats.unit(2)}, in_keys_inv=["y"])
+
+
+def test_a_dot_in_a_key_is_a_key_like_another():
+    keys = ("a.b", "a_b", ("a", "b"))
+    transform = Normalize({key: Stats.of(torch.randn(9, 3)) for key in keys})
+    assert len({*transform.names.values()}) == 3
+    x = torch.randn(4, 3)
+    found = transform(TensorDict({"a.b": x}, [4]))["a.b"]
+    expected = (x - transform.mean("a.b")) / transform.std("a.b")
+    torch.testing.assert_close(found, expected.float())
+
+
+def test_whole_numbers_and_statistics_of_nothing_are_refused():
+    transform = Normalize({"n": Stats.of(torch.tensor([[0.0], [10.0]]))})
+    with pytest.raises(
+        ValueError, match="n of floating-point numbers, got torch.int64"
+    ):
+        transform(TensorDict({"n": torch.tensor([[0], [7]])}, [2]))
+    with pytest.raises(ValueError, match="statistics of samples, got none of"):
+        Normalize({"n": Stats.of(torch.empty(0, 1))})
+
+
+def test_bounds_of_what_is_seen_are_normalised():
+    env = make_env("cartpole/swingup", "nerd", num_envs=3, seed=0, guard="flag")
+    stats = {"trust": Stats.of(torch.rand(100, 1))}
+    env = TransformedEnv(env, Normalize(stats))
+    check_env_specs(env)
+    space = env.observation_spec["trust"].space
+    mean, std = stats["trust"].mean.item(), stats["trust"].std.item()
+    assert space.low.unique().item() == pytest.approx(-mean / std)
+    assert space.high.unique().item() == pytest.approx((1.0 - mean) / std)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import StepConfig
+from torchrl_nerd.geometry.rigid_body import other_forces
 from torchrl_nerd.scenes.contact_points import own_contacts, touching_geoms
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.shapes import EXACT, geom_kind
@@ -22,11 +23,7 @@ class StepResult(NamedTuple):
     velocity_defect: Tensor  # (*batch, K): embedded error estimate, rad/s and m/s
 
 
-FORCES = sum(
-    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
-    for name in ("GRAVITY", "SPRING", "DAMPER", "LIMIT", "CONSTRAINT", "ACTUATION")
-)
-"""Flags of MuJoCo that switch off forces which an analytic step has."""
+ENABLE = mujoco.mjtEnableBit
 
 
 class AnalyticStep(nn.Module, ABC):
@@ -91,22 +88,16 @@ def check_supported(scene: Scene) -> None:
     """Raise a ValueError that names all forces which no analytic step models."""
     model = scene.model
     kinds = {geom_kind(model, geom) for geom in touching_geoms(model)}
-    names = ("armature", "damping", "dampingpoly")
-    polynomials = model.jnt_stiffnesspoly, model.dof_dampingpoly
-    of_actuators = (getattr(model, f"actuator_{name}") for name in names)
-    forces = {
-        "dry friction": model.dof_frictionloss.any(),
-        "air or water": model.opt.density or model.opt.viscosity,
+    flags = model.opt.enableflags
+    forces = other_forces(model) | {
         "self-contact": own_contacts(model),
         "contact pairs with a law of their own": model.npair,
-        "equality constraints": model.neq,
-        "tendons": model.ntendon,
-        "gravity compensation": model.body_gravcomp.any(),
+        "contacts that the file overrides": flags & ENABLE.mjENBL_OVERRIDE,
+        "an exact inertia of constraints": flags & ENABLE.mjENBL_DIAGEXACT,
+        "a solver without slip": model.opt.noslip_iterations,
+        "shapes that adhere": model.geom_adhesion.any(),
         "cylinders, ellipsoids or meshes on the ground": not kinds <= {*EXACT},
         "servos of MuJoCo": scene.servos is not None,
-        "actuators with damping or mass": any(x.any() for x in of_actuators),
-        "stiffness or damping that grows": any(x.any() for x in polynomials),
-        "forces switched off": model.opt.disableflags & FORCES,
     }
     found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:

@@ -10,6 +10,7 @@ physical parameters.
 
 from typing import ClassVar
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -24,6 +25,7 @@ from torchrl_nerd.geometry.rotations import (
 )
 from torchrl_nerd.scenes import penalty_law
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.settings import expect_count
 
 # what a unit of ``raw`` changes a parameter's logarithm by: those that tosses tell well
 # move little, so that one step size suits all
@@ -75,6 +77,7 @@ class FreeBodyPenaltyStep(AnalyticStep):
     spin: Tensor  # (12, 4)
 
     def __init__(self, scene: Scene, num_substeps: int = 8) -> None:
+        expect_count(1, num_substeps=num_substeps)
         super().__init__(scene, FreeBodyConfig(num_substeps), num_defects=6)
         model = scene.model
         check_supported(scene)
@@ -213,4 +216,5 @@ def _other_than_modelled(scene: Scene) -> dict[str, bool]:
         "gravity to the side": bool(model.opt.gravity[:2].any()),
         "damping": bool(model.dof_damping.any()),
         "armature": bool(model.dof_armature.any()),
+        "pyramidal friction cones": model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC,
     }

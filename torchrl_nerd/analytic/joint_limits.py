@@ -45,7 +45,9 @@ class JointLimits(nn.Module):
         margin = model.jnt_margin[ids]
         solimp = model.jnt_solimp[ids]
         springs = _springs(model, model.jnt_solref[ids], solimp[:, 1], self.substep)
-        self.max_damping = float(springs[1].max())
+        # 1/s: dampers, and springs that swing faster than they are damped
+        most = solimp[:, 1].clip(MIN_IMPEDANCE, MAX_IMPEDANCE)
+        self.max_rate = float(max(springs[1].max(), (most * springs[0] ** 0.5).max()))
         law = *springs, model.dof_invweight0[model.jnt_dofadr[ids]]
         impedance, power = _impedance_parameters(solimp)
         # a number where joints agree: a square takes no time, a power most of the step's
@@ -60,7 +62,7 @@ class JointLimits(nn.Module):
 
     def num_solves(self, period: float) -> int:
         """How often to solve for the forces in ``period`` s: at most as often as MuJoCo."""
-        wanted = ceil(period * self.max_damping / MAX_DAMPED)
+        wanted = ceil(period * self.max_rate / MAX_DAMPED)
         return min(wanted, round(period / self.substep))
 
     def forward(

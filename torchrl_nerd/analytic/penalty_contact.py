@@ -21,6 +21,7 @@ from torchrl_nerd.configs import PenaltyContactConfig, Precision
 from torchrl_nerd.geometry.base import JointAxes
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.settings import expect_count
 
 
 class PenaltyContactStep(AnalyticStep):
@@ -51,6 +52,9 @@ class PenaltyContactStep(AnalyticStep):
         merged_substeps: int = 1,
         precision: Precision = "float32",
     ) -> None:
+        expect_count(
+            1, num_outer_steps=num_outer_steps, merged_substeps=merged_substeps
+        )
         if num_stages not in (1, 2):
             raise ValueError(f"expected 1 or 2 stages, got {num_stages}")
         check_supported(scene)
@@ -64,7 +68,7 @@ class PenaltyContactStep(AnalyticStep):
                 f"'{scene.name}'"
             )
         substeps = max(1, scene.substeps // merged_substeps)
-        if num_outer_steps < 1 or substeps % num_outer_steps:
+        if substeps % num_outer_steps:
             raise ValueError(
                 f"expected outer steps that divide {substeps} substeps, got "
                 f"{num_outer_steps}"

@@ -21,6 +21,7 @@ from torchrl_nerd.geometry.base import JointAxes, keep_constants, keep_indices
 from torchrl_nerd.geometry.motion import cross
 from torchrl_nerd.geometry.spd import matvec
 from torchrl_nerd.scenes import Scene, penalty_law
+from torchrl_nerd.scenes.contact_points import shape_points
 
 MIN_SLIP = 1e-6  # m/s: keeps the direction of slip defined at rest
 
@@ -62,6 +63,7 @@ class SubstepIntegrator(nn.Module):
                 f"'{scene.name}'"
             )
         law = penalty_law.PenaltyLaw.of_bodies(model, points.bodies)
+        _expect_one_law(scene, law)
         # share of the tangential force beyond the cone that becomes normal force
         share = law.friction / model.opt.impratio
         scale = 1.0 / (1.0 + law.friction * share)
@@ -194,3 +196,17 @@ def _rotated(vectors: Tensor, rotation: Tensor) -> Tensor:
     rotation = rotation.permute(1, 2, 0).to(vectors)
     rotation = rotation.reshape(3, 3, *[1] * (vectors.ndim - 2), -1)
     return (rotation * vectors).sum(1)
+
+
+def _expect_one_law(scene: Scene, law: penalty_law.PenaltyLaw) -> None:
+    """Refuse points of several bodies that are merged into one but follow other laws."""
+    bodies, *_ = shape_points(scene.model, scene.max_contact_points)
+    leads = np.array(scene.contacts.stands_for, int)
+    own = np.array(bodies, int)[leads >= 0].tolist()
+    each, leads = penalty_law.PenaltyLaw.of_bodies(scene.model, own), leads[leads >= 0]
+    for name, value in vars(law).items():
+        if not np.allclose(getattr(each, name), value[leads]):
+            raise ValueError(
+                "expected one contact law of shapes that meet in a point, got several in "
+                f"scene '{scene.name}'"
+            )

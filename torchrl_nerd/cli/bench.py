@@ -5,6 +5,7 @@ from typing import Any
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional, SceneName
+from torchrl_nerd.evaluation.bench.candidates import models
 from torchrl_nerd.evaluation.bench.report import BenchConfig, bench, bench_table
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
@@ -24,9 +25,11 @@ class Bench(BenchConfig, MeasuringCommand):
     scene: Positional[SceneName]
 
     def inputs(self) -> Scene:
-        """The robot and its surroundings."""
+        """The robot and its surroundings; bad input, a model's name too, is refused."""
         self.check()
-        return load_scene(self.scene)
+        scene = load_scene(self.scene)
+        models(scene, self.models)
+        return scene
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""

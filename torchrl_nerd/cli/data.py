@@ -69,7 +69,8 @@ class Data(SceneOptions, Command):
     @property
     def folder(self) -> Path:
         """Of the data set that is generated."""
-        names = filter(None, (self.run_name, self.strategy))
+        drawn_by = "policy" if self.policy else self.strategy
+        names = filter(None, (self.run_name, drawn_by))
         return self.out or Path("datasets") / "-".join(names)
 
     def drawing(self, scene: Scene) -> tuple[str, Draw] | None:
@@ -91,12 +92,14 @@ class Data(SceneOptions, Command):
 
     def inputs(self) -> tuple[Scene, tuple[str, Draw] | None]:
         """The robot and how its trajectories are drawn; options that misfit are refused."""
+        is_noisy = self.noise != type(self).noise
         if self.recorded is not None:
             drawing = self.policy, self.ray, self.reference, self.vary, self.strategy
-            if any(drawing) or self.config != preset_of(self.scene).data:
+            other = self.config != preset_of(self.scene).data
+            if any(drawing) or other or is_noisy:
                 raise ValueError("expected --from without options that draw data")
             return recorded_scene(self.scene), None
-        if self.policy is None and self.noise != type(self).noise:
+        if self.policy is None and is_noisy:
             raise ValueError(
                 "expected --noise with --policy, whose actions it is added to"
             )

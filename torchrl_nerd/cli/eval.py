@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from torch import Tensor
+
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import (
@@ -16,7 +18,8 @@ from torchrl_nerd.cli.options import (
     varied_ranges,
 )
 from torchrl_nerd.data.log_files import load_recording
-from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
+from torchrl_nerd.data.recorded import Recording
+from torchrl_nerd.dynamics import Dynamics, Model, MujocoDynamics, dynamics_of
 from torchrl_nerd.evaluation.bench.candidates import (
     Candidate,
     analytic_step,
@@ -35,6 +38,7 @@ from torchrl_nerd.evaluation.bench.summary import summary_table, warnings
 from torchrl_nerd.evaluation.recorded_error import STATES, compare, errors_as_text
 from torchrl_nerd.robots import (
     EvaluationProtocol,
+    RecordedProtocol,
     load_scene,
     protocol_of,
     recorded_protocol,
@@ -101,9 +105,34 @@ class Eval(MeasuringCommand):
         expect_at_least(2, num_trajectories=self.num_trajectories)
         expect_at_least(0, history=self.history)
         scene, ranges = load_scene(self.scene), varied_ranges(self.scene, self.vary)
-        if self.model is not None:
-            from_pretrained(self.model, scene.vary(ranges) if ranges else scene)
+        self.models(scene.vary(ranges) if ranges else scene, "cpu")
         return scene, ranges
+
+    def models(self, scene: Scene, device: str) -> list[Candidate]:
+        """Those asked for, with their variants; a name that is none is refused."""
+        names = [] if self.model is None else [self.model]
+        return models(scene, names, device, self.variants)
+
+    def recorded(
+        self, path: Path, scene: Scene
+    ) -> tuple[RecordedProtocol, Model, Recording, Tensor]:
+        """Protocol, model, log and starts of its windows; a split that is none refused."""
+        protocol = recorded_protocol(self.scene)
+        model = from_pretrained(self.model or protocol.model, scene).to(self.device)
+        recording, split = load_recording(path, scene)
+        if self.split != "all" and self.split not in split:
+            expected = ", ".join(("all", *split))
+            raise ValueError(f"expected split {expected}, got '{self.split}'")
+        chosen = None if self.split == "all" else split[self.split]
+        return protocol, model, recording, recording.starts(self.states, chosen)
+
+    def plan(self) -> list[str]:
+        """How many windows of a log would be measured."""
+        scene, _ = self.inputs()
+        if self.data is None:
+            return []
+        *_, starts = self.recorded(self.data, scene)
+        return [f"measure {len(starts)} windows of {self.states} states"]
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their rows; bad input raises ValueError."""
@@ -130,10 +159,9 @@ class Eval(MeasuringCommand):
                 "parameters."
             )
             candidates.append(
-                Candidate(f"{solver_name}, nominal", "simulator", _as_in_its_file)
+                Candidate(f"{solver_name}, nominal", "simulator", self.nominal)
             )
-        names = [] if self.model is None else [self.model]
-        candidates += models(scene, names, self.device, self.variants)
+        candidates += self.models(scene, self.device)
         parts = self.measure(protocol, candidates)
         rows = [row for part in parts for row in part]
         print(f"\n{summary_table(scene, rows)}\n")
@@ -150,6 +178,10 @@ class Eval(MeasuringCommand):
         """MuJoCo with the scene's own solver or the reference solver."""
         return MujocoDynamics(scene.reference if self.reference else scene)
 
+    def nominal(self, scene: Scene) -> MujocoDynamics:
+        """The same, with the robot as its file has it, whatever varies."""
+        return self.ground_truth(replace(scene, variation=None))
+
     def measure(
         self, protocol: EvaluationProtocol, candidates: list[Candidate]
     ) -> Iterator[list[ErrorRow]]:
@@ -164,15 +196,8 @@ class Eval(MeasuringCommand):
                 yield error_rows(chosen.scene, case, horizon, errors, published)
 
     def run_recorded(self, path: Path, scene: Scene) -> dict[str, Any]:
-        """The same for recorded trajectories; a split that is none raises ValueError."""
-        protocol = recorded_protocol(self.scene)
-        model = from_pretrained(self.model or protocol.model, scene).to(self.device)
-        recording, split = load_recording(path, scene)
-        if self.split != "all" and self.split not in split:
-            expected = ", ".join(("all", *split))
-            raise ValueError(f"expected split {expected}, got '{self.split}'")
-        chosen = None if self.split == "all" else split[self.split]
-        starts = recording.starts(self.states, chosen)
+        """The same for recorded trajectories."""
+        protocol, model, recording, starts = self.recorded(path, scene)
         tested: dict[str, Dynamics] = {}
         if self.baselines:
             tested["MuJoCo"] = MujocoDynamics(scene)
@@ -180,7 +205,8 @@ class Eval(MeasuringCommand):
                 tested["analytic"] = dynamics_of(from_pretrained("analytic", scene))
         tested["model"] = dynamics_of(model)
         table = compare(tested, scene, recording, starts, self.states)
-        print(errors_as_text(table, protocol.published, self.states))
+        published = protocol.published if self.states == STATES else {}
+        print(errors_as_text(table, published, self.states))
         shared = {"scene": scene.name, "split": self.split, "windows": len(starts)}
         return {**shared, **table["model"], "others": table}
 
@@ -191,8 +217,3 @@ class Eval(MeasuringCommand):
             return record
         record["seed"] = None  # nothing is drawn
         return {"configuration": self.configuration(), **results, **record}
-
-
-def _as_in_its_file(scene: Scene) -> Dynamics:
-    """MuJoCo with the robot as its file has it, whatever varies."""
-    return MujocoDynamics(replace(scene, variation=None))

@@ -48,10 +48,9 @@ class Finetune(DeviceCommand):
 
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""
-        recording, split, _ = self.inputs()
-        # which refuse a log too short to learn from
-        recording.starts(2, split["train"])
-        recording.starts(self.config.states, split["validation"])
+        recording, split, model = self.inputs()
+        parts = split["train"], split["validation"]
+        FineTuner(model, recording, *parts, self.config)  # refuses what it cannot learn
         return [f"{name}: {len(part)} trajectories" for name, part in split.items()]
 
     def run(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import tyro
 
 from torchrl_nerd.cli.command import DeviceCommand
 from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.rendering import require_gl
 from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policies
@@ -76,6 +77,7 @@ class Play(DeviceCommand):
         if not 0.0 < self.slowdown < float("inf"):
             raise ValueError(f"expected slowdown above 0, got {self.slowdown}")
         expect_at_least(64, width=self.width)
+        make_env(self.task, self.dynamics)
         shown = min(task.horizon, round(SECONDS / task.step_size))
         steps = shown if self.steps is None else self.steps
         expect_at_least(1, steps=steps)

@@ -43,7 +43,15 @@ class Stability(MeasuringCommand):
             raise SettingError(f"expected a scale in (0, 1], got {self.scale}")
         cases = [look_up("case", name, CASES) for name in self.cases or CASES]
         scene, name = load_scene(self.scene), self.model or self.scene
-        return cases, scene, name, from_pretrained(name, scene).to(self.device)
+        model = from_pretrained(name, scene).to(self.device)
+        tested = dynamics_of(model)
+        for case in cases if self.cases else ():
+            if not case.supports(tested):
+                raise SettingError(
+                    f"expected cases that apply to '{scene.name}' and its {model.kind} "
+                    f"model, got {case.name}"
+                )
+        return cases, scene, name, model
 
     def run(self) -> dict[str, Any]:
         """Print verdicts, then the table, and return the results; refuse bad input."""
@@ -56,7 +64,9 @@ class Stability(MeasuringCommand):
         trials = run_cases(tested, cases, self.seed, self.scale)
         for result in tqdm(trials, "cases", count, leave=False, disable=self.quiet):
             verdict = "pass" if result.passes else "FAIL"
-            tqdm.write(f"{result.case:<21}{verdict:<6}{result.seconds:>7} s")
+            verdict = "skip" if result.skipped else verdict
+            line = f"{result.case:<21}{verdict:<6}{result.seconds:>7} s"
+            tqdm.write(f"{line}  {result.skipped}".rstrip())
             results.append(result)
             found[result.case] = asdict(result)
             self.keep(found)  # hours of long cases outlive an interruption

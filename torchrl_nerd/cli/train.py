@@ -16,7 +16,7 @@ from torchrl_nerd.files import check_writable, read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import PRESETS, preset_of, protocol_of, source_of
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.settings import SettingError, expect_at_least
+from torchrl_nerd.settings import SettingError, expect_at_least, expect_same
 from torchrl_nerd.training.log import LoggerName
 from torchrl_nerd.training.start import begin_from, find_symmetry, make_model
 from torchrl_nerd.training.trainer import STATE, Trainer
@@ -43,7 +43,8 @@ class Train(SceneOptions, DeviceCommand):
     out: Path | None = None
     """Folder of the run; default runs/SCENE, for a hybrid runs/SCENE-hybrid."""
     data: tuple[Path, ...] = ()
-    """Folders of data sets; default datasets/SCENE, generated if it does not exist."""
+    """Folders of data sets; default datasets/SCENE, which is generated if it does not
+    exist."""
     init_from: str | None = None
     """Continue training from a shipped model (its name) or a checkpoint (its folder)."""
     config: Flat[TrainConfig] = field(default_factory=TrainConfig)
@@ -87,7 +88,7 @@ class Train(SceneOptions, DeviceCommand):
     def plan(self) -> list[str]:
         """Which model would be trained on which data, and what exists already."""
         scene, (out, folders) = self.load(), self.folders
-        if _is_missing(folders, preset_of(self.scene).data):
+        if self.is_to_draw(folders):
             drawn = preset_of(self.scene).data
             self.expect_long(drawn)
             data = f"draw {drawn.trajectories} trajectories, to {folders[0]}"
@@ -95,6 +96,9 @@ class Train(SceneOptions, DeviceCommand):
             for folder in folders:
                 self.expect_long(read_card(scene, folder)[1])
             data = f"use the data in {', '.join(map(str, folders))}"
+        if (out / STATE).exists():
+            asked = {"config": asdict(self.config), "scene_hash": scene.hash}
+            expect_same(f"{out} holds a run", read_json(out / STATE), asked)
         model = self.untrained(scene, self.initial(scene))
         weights = sum(weight.numel() for weight in model.network.parameters())
         return [
@@ -111,6 +115,11 @@ class Train(SceneOptions, DeviceCommand):
             return begin_from(initial, scene, self.config, symmetry)
         return make_model(scene, self.config, symmetry=symmetry)
 
+    def is_to_draw(self, folders: tuple[Path, ...]) -> bool:
+        """Whether data are drawn: a folder that was named holds some already."""
+        is_named = self.data and not (folders[0] / CARD).exists()
+        return not is_named and _is_missing(folders, preset_of(self.scene).data)
+
     def expect_long(self, data: DataConfig) -> None:
         """Refuse trajectories that are too short before they are drawn."""
         if data.steps < self.config.longest:
@@ -126,7 +135,7 @@ class Train(SceneOptions, DeviceCommand):
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
         self.untrained(scene, initial)  # refuses before data are drawn, or read
-        if _is_missing(folders, preset.data):
+        if self.is_to_draw(folders):
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads is not None:

@@ -8,6 +8,7 @@ import tyro
 
 from torchrl_nerd.cli.command import MeasuringCommand
 from torchrl_nerd.cli.options import Positional
+from torchrl_nerd.envs import make_env
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.evaluation.policy import load_policy, make_actor, shipped_policy
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
@@ -40,9 +41,11 @@ class Transfer(MeasuringCommand):
     """Seed of the resets."""
 
     def inputs(self) -> Actor:
-        """The policy."""
+        """The policy; dynamics that the task does not have are refused."""
         expect_at_least(2, episodes=self.episodes)
         task, folder = make_task(self.task), self.policy or shipped_policy(self.task)
+        for name in self.dynamics:
+            make_env(task, name)
         return make_actor(load_policy(folder, task).to(self.device))
 
     def run(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@ docs/howto/logs.md names the arrays and columns, with shapes, units and frames, 
 """
 
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -179,6 +180,12 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         if name.lower() in others:
             raise ValueError(
                 f"expected a column '{name.lower()}' in {path}, got '{name}'"
+            )
+        stem, _, number = name.rpartition("_")
+        meant = get_close_matches(stem, set(ARRAYS).difference(arrays), 1)
+        if number.isdecimal() and meant:
+            raise ValueError(
+                f"expected columns of '{meant[0]}' in {path}, got '{name}'"
             )
     return arrays | {name: table[name] for name in others if name in names}
 

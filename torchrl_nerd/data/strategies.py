@@ -106,7 +106,7 @@ def strategy(scene: Scene, name: str) -> Draw:
     | ``correlated`` | correlated torques, from one control step to a second |
     | ``level`` | two parts of the scene's own, one over ground that is hit vertically |
     | ``resting`` | two parts of the scene's own, one of perturbed rest states |
-    | ``changing`` | two parts of the scene's own, one whose hidden parameters change |
+    | ``changing`` | equal parts of the scene's own and of robots that change |
 
     Raises:
         ValueError: no such strategy, or one that does not fit the scene.

@@ -68,10 +68,11 @@ class BatchParameters:
         changed = np.flatnonzero((parameters != self._values).any(1))
         if len(changed):
             self.variation.check(torch.from_numpy(parameters[changed]))
-            values = self._values[changed] = parameters[changed]
+            values = parameters[changed]
             for name, value in self.variation.fields(values).items():
                 self.batch.expand(name)[changed] = value
             self.batch.set_const(changed)
+            self._values[changed] = values
             self._strength[changed] = self.variation.strength(values)
             self._delay[changed] = self.variation.delay(values)
 

@@ -75,7 +75,8 @@ class NeRDEnv(SceneEnv):
 
     Args:
         task: id of a registered task, a scene, or a task.
-        model: a model, or the name of one, see `from_pretrained`.
+        model: a model, which is moved to the device and set to evaluate, or the name of
+            one, see `from_pretrained`.
         num_envs, seed, dump_dir: see `SceneEnv`.
         state_dtype: of state and features; float32 for GPUs without a fast float64, or
             without any, such as ``mps``. The model given is copied.

@@ -77,12 +77,14 @@ class RenderedEnv(EnvBase):
         return self._renderer(state, height, width, camera_id)
 
     def add_pixels(self, pixels_only: bool = False) -> None:
-        """Show ``pixels`` of ``render_size`` at every reset and step.
+        """Show ``pixels`` of ``render_size`` at every reset and step; once is for good.
 
         Args:
             pixels_only: instead of all other entries that an agent could see; a state
                 can then not be set through transforms.
         """
+        if self.from_pixels:
+            return
         self.from_pixels, self.pixels_only = True, pixels_only
         shape = torch.Size((*self.batch_size, *self.render_size, 3))
         how = {"shape": self.batch_size, "device": self.device}

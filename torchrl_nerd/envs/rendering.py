@@ -67,6 +67,11 @@ def _renders(name: str) -> bool:
 def require_gl() -> str:
     """The library of `find_gl`, or a ValueError that says what to install."""
     name = find_gl()
+    if name is None and (asked := os.environ.get("MUJOCO_GL")):
+        raise ValueError(
+            "expected MUJOCO_GL to name an OpenGL library that works on this machine, got "
+            f"'{asked}': unset it, or install that library"
+        )
     if name is None:
         raise ValueError(
             "expected an OpenGL library for rendering, but none works on this machine: "

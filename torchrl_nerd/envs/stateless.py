@@ -17,6 +17,8 @@ class StatelessEnv(EnvBase):
     state. A view of a `SceneEnv`: a tensordict of another state than it was left in sets
     that state, with an empty history; one that it has just returned goes on, with its
     history. A reset begins episodes as in ``env``; without a tensordict, all of them.
+    Rollouts that drop ended elements (``break_when_all_done``) change their number, which
+    an ``env`` cannot.
 
     Args:
         env: what steps; every tensordict has ``num_envs`` elements, such as states to
@@ -46,7 +48,7 @@ class StatelessEnv(EnvBase):
     def _reset(
         self, tensordict: TensorDictBase | None = None, **kwargs: object
     ) -> TensorDictBase:
-        given = None if tensordict is None else tensordict.reshape(-1)
+        given = None if tensordict is None else tensordict.reshape(-1).copy()
         after = self.env.reset(given)
         return after if tensordict is None else after.reshape(tensordict.shape)
 

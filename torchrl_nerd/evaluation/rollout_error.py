@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
+from scipy.special import stdtrit
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
@@ -21,6 +22,9 @@ from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import actuate, drive, idle
 from torchrl_nerd.seeds import fold_in
+
+# the part of a seed that starts in a scene's ranges have: no data set has so many chunks
+UNSEEN = 2**24 - 1
 
 Drive = Callable[[int, TensorDictBase], tuple[Tensor, Tensor | None]]
 """``(step, state [n]) -> joint torque (n, num_actuated), N and N m, and ctrl (n, nu)``."""
@@ -49,6 +53,7 @@ def initial_states(source: Source, num_trajectories: int, seed: int) -> TensorDi
     """Initial states ``[n]`` of a task's resets or a scene's sampling ranges."""
     generator, n = Generator().manual_seed(seed), num_trajectories
     if isinstance(source, Scene):
+        generator = fold_in(seed, UNSEEN)
         values = source.sample_initial(n, generator)[0]
     else:
         u = torch.rand(n, source.num_uniforms, generator=generator, dtype=torch.float64)
@@ -231,7 +236,8 @@ def unit_of(scene: Scene, quantity: str) -> str:
 
 def interval_of_mean(samples: Tensor) -> float:
     """Half width of the 95% interval of the mean of independent samples ``(n,)``."""
-    return float(1.96 * samples.std() / len(samples) ** 0.5)
+    width = float(stdtrit(len(samples) - 1, 0.975))  # Student's, for few samples
+    return float(width * samples.std() / len(samples) ** 0.5)
 
 
 def summarize(

@@ -52,8 +52,12 @@ class Base:
         if model.nu and model.ntree > 1:
             data = mujoco.MjData(model)
             mujoco.mj_fwdPosition(model, data)
-            driven = model.dof_treeid[data.moment_colind[: data.moment_rownnz.sum()]]
-            drives = np.bincount(driven, minlength=model.ntree)
+            dofs = data.moment_colind[: data.moment_rownnz.sum()]
+            actuators = np.repeat(np.arange(model.nu), data.moment_rownnz)
+            # an actuator counts once for a tree, however many of its dofs it moves
+            pairs = np.stack((actuators, model.dof_treeid[dofs]))
+            trees = np.unique(pairs, axis=1)[1]
+            drives = np.bincount(trees, minlength=model.ntree)
         root = roots[int(drives.argmax())]
         others = tuple(body for body in roots if body != root)
         if not is_free(model, root):

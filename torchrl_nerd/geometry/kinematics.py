@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.geometry.base import Base, ancestors, is_free
+from torchrl_nerd.geometry.base import Base, ancestors, is_free, keep_constants
 from torchrl_nerd.geometry.constants import take
 from torchrl_nerd.geometry.manifold import BALL, SLIDE, body_joints
 from torchrl_nerd.geometry.motion import (
@@ -158,7 +158,7 @@ class _Joint(nn.Module):
     """One joint of each body of a group.
 
     With K the cross-product matrix of its axis, a hinge's rotation by q is
-    I + sin(q) K + (1 - cos(q)) K^2. Constants are in the frame before ``turns``.
+    I + K^2 + sin(q) K - cos(q) K^2. Constants are in the frame before ``turns``.
     """
 
     axis: Tensor  # (3, n, 1)
@@ -166,8 +166,8 @@ class _Joint(nn.Module):
     anchor: Tensor  # (3, n, 1), m, in the body
     rest: Tensor  # (n, 1)
     turn: Tensor  # (3, 3, n, 1)
-    cross: Tensor  # (3, 3, n, 1): turn K
-    square: Tensor  # (3, 3, n, 1): turn K^2
+    middle: Tensor  # (n, 9, 1): turn (I + K^2)
+    swing: Tensor  # (n, 9, 2): turn K and -turn K^2
 
     def __init__(
         self, model: mujoco.MjModel, joints: list[int], turns: list[np.ndarray]
@@ -182,6 +182,12 @@ class _Joint(nn.Module):
         rest = np.zeros(len(joints)) if self.kind == BALL else model.qpos0[self.qpos_at]
         crosses = [np.cross(np.eye(3), axis) for axis in axes]
         pairs = list(zip(turns, crosses, strict=True))
+        swings = [np.stack((r @ k, -r @ k @ k), -1) for r, k in pairs]
+        keep_constants(
+            self,
+            middle=np.reshape([r @ (np.eye(3) + k @ k) for r, k in pairs], (-1, 9, 1)),
+            swing=np.reshape(swings, (-1, 9, 2)),
+        )
         keep(
             self,
             axis=[r @ axis for r, axis in zip(turns, axes, strict=True)],
@@ -189,8 +195,6 @@ class _Joint(nn.Module):
             anchor=anchors,
             rest=rest,
             turn=turns,
-            cross=[r @ k for r, k in pairs],
-            square=[r @ k @ k for r, k in pairs],
         )
 
     def forward(self, motion: Motion, qpos: Tensor, qvel: Tensor) -> Motion:
@@ -212,8 +216,14 @@ class _Joint(nn.Module):
                 path = axis * q
                 velocity = velocity + cross(omega, path[..., moving]) + spin
                 return position + path, matmul(rotation, self.turn), omega, velocity
-            turn = torch.addcmul(self.turn, self.cross, q.sin())
-            turned = matmul(rotation, torch.addcmul(turn, self.square, 1.0 - q.cos()))
+            waves = torch.stack((q.sin(), q.cos()), 1)  # (n, 2, N)
+            if torch.compiler.is_compiling():  # which else finds sines for each entry
+                turn = torch.baddbmm(self.middle, self.swing, waves)
+            else:  # the same bits in any batch
+                sine, cosine = waves[:, :1], waves[:, 1:]
+                turn = torch.addcmul(self.middle, self.swing[..., :1], sine)
+                turn = torch.addcmul(turn, self.swing[..., 1:], cosine)
+            turned = matmul(rotation, turn.unflatten(1, (3, 3)).movedim(0, 2))
         if not self.is_at_origin:  # the body swings about the joint's anchor
             before = rotate_by(rotation, self.start)
             after = rotate_by(turned, self.anchor)

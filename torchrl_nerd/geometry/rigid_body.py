@@ -7,7 +7,7 @@ base frame, batched.
 Source: Featherstone, Rigid Body Dynamics Algorithms, chapters 5 and 6.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -37,11 +37,41 @@ class _Inertia(NamedTuple):
         return angular, self.mass * slide + cross(spin, self.first)
 
 
+FORCES = sum(
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+    for name in (
+        *("GRAVITY", "SPRING", "DAMPER", "EULERDAMP"),
+        *("LIMIT", "CONSTRAINT", "ACTUATION"),
+    )
+)
+"""Flags of MuJoCo that switch off forces which the equation of motion has."""
+
+
+def other_forces(model: mujoco.MjModel) -> dict[str, Any]:
+    """Forces of MuJoCo that `RigidBodyDynamics` leaves out, true where there are any."""
+    names = ("armature", "damping", "dampingpoly")
+    polynomials = model.jnt_stiffnesspoly, model.dof_dampingpoly
+    of_actuators = (getattr(model, f"actuator_{name}") for name in names)
+    return {
+        "dry friction": model.dof_frictionloss.any(),
+        "air or water": model.opt.density or model.opt.viscosity,
+        "equality constraints": model.neq,
+        "tendons": model.ntendon,
+        "gravity compensation": model.body_gravcomp.any(),
+        "actuators with damping or mass": any(x.any() for x in of_actuators),
+        "stiffness or damping that grows": any(x.any() for x in polynomials),
+        "forces switched off": model.opt.disableflags & FORCES,
+    }
+
+
 class RigidBodyDynamics(nn.Module):
     """Acceleration of a robot without contacts and limits; ``actuated``: driven dofs.
 
     It needs the points ``positions (2 J + 4 B, 3)``, m, in the frames of ``bodies``: the
     anchors, then the tips of all joint axes, then four points of each body with mass.
+
+    Raises:
+        ValueError: a moving body of inertia without mass.
     """
 
     mass: Tensor  # (B, 1), kg
@@ -61,7 +91,12 @@ class RigidBodyDynamics(nn.Module):
         where = {dof: at for at, dof in enumerate(actuated)}
         # of each dof its place among the torques, behind them where there is none
         self.torque_at = [where.get(dof, len(actuated)) for dof in range(model.nv)]
-        has_mass = (model.body_weldid != 0) & (model.body_mass > 0.0)
+        moves, has_mass = model.body_weldid != 0, model.body_mass > 0.0
+        if model.body_inertia[moves & ~has_mass].any():
+            raise ValueError(
+                "expected mass where there is inertia, got a moving body without mass"
+            )
+        has_mass &= moves
         found = np.flatnonzero(has_mass).tolist()
         self.bodies = axes.bodies + [body for body in found for _ in CORNERS]
         corners = (_four_points(model, body) for body in found)

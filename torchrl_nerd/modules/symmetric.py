@@ -14,6 +14,7 @@ the diagonal, and so a K-th of the products. Activation functions act on the par
 Ordonez-Apraez et al., https://arxiv.org/abs/2402.15552, on symmetries of robots.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -54,6 +55,18 @@ def walsh_matrix(signs: Tensor, dtype: torch.dtype) -> Tensor:
     return signs.to(dtype) * len(signs) ** -0.5
 
 
+def walsh_sums(parts: Sequence[Tensor]) -> list[Tensor]:
+    """The K sums of K parts with the signs of `walsh_signs`, in K log2(K) additions."""
+    sums, stride = list(parts), 1
+    while stride < len(sums):
+        for low in range(len(sums)):
+            if not low & stride:
+                a, b = sums[low], sums[low | stride]
+                sums[low], sums[low | stride] = a + b, a - b
+        stride *= 2
+    return sums
+
+
 def transform(x: Tensor, signs: Tensor) -> Tensor:
     """Parts to characters and back, ``(*batch, K, n)``."""
     first = x.movedim(-2, 0)  # (K, *batch, n), which is how blocks leave it in memory
@@ -80,6 +93,10 @@ class Activation(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """``(*batch, K, n)``: `transform`, the function, and `transform` once more."""
         first = x.movedim(-2, 0)  # (K, *batch, n)
+        if torch.compiler.is_compiling():  # one loop for all three
+            parts = walsh_sums([x * len(first) ** -0.5 for x in first.unbind()])
+            after = walsh_sums([self.function(x) for x in parts])
+            return torch.stack([x * len(first) ** -0.5 for x in after], -2)
         mixing = walsh_matrix(self.signs, x.dtype)
         parts = mixing @ first.flatten(1)  # (K, batch * n): fast for the function
         return (mixing @ self.function(parts)).view(first.shape).movedim(0, -2)

@@ -62,7 +62,9 @@ class TrainingRange(nn.Module):
     @property
     def is_fitted(self) -> bool:
         """Whether the model knows what it was trained on."""
-        return bool((self.feature_high < UNBOUNDED).all())
+        # in float32 what is unbounded is as large as a number can be
+        unbounded = min(UNBOUNDED, torch.finfo(self.feature_high.dtype).max)
+        return bool((self.feature_high < unbounded).all())
 
     @torch.no_grad()
     def fit(

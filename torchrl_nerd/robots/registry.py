@@ -37,6 +37,7 @@ TABLES: dict[str, dict[str, Any]] = {
 NOT_LOADED: list[str] = []
 """A sentence for each entry of ``NERD_ROBOTS`` that could not be loaded."""
 _LISTENERS: list[Callable[[str], object]] = []
+_LAST: dict[str, Robot] = {}  # of each scene: what it was last registered with
 
 
 def register(robot: Robot) -> None:
@@ -44,7 +45,7 @@ def register(robot: Robot) -> None:
 
     Nothing is built yet: a scene or task is, when its name is first asked for. Commands
     and worker processes find a robot whose module ``NERD_ROBOTS`` names. A module that is
-    loaded again replaces its robot, as a cell of a notebook does that runs again.
+    loaded again replaces its robot with all its names, as a cell of a notebook does.
 
     Raises:
         TypeError: no robot, or a field that holds something else than it should.
@@ -61,8 +62,12 @@ def register(robot: Robot) -> None:
             raise ValueError(
                 f"'{taken[0]}' is among the {field} of another robot: expected a new name"
             )
+    before = [_LAST[scene] for scene in robot.scenes if scene in _LAST]
     for field, table in TABLES.items():
+        for name in (name for old in before for name in getattr(old, field)):
+            table.pop(name, None)
         table.update(getattr(robot, field))
+    _LAST.update(dict.fromkeys(robot.scenes, robot))
     for listener in _LISTENERS:
         for task in robot.tasks:
             listener(task)

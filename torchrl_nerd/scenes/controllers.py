@@ -107,8 +107,9 @@ class ActuatorController:
 
     An action of -1 to 1 spans an actuator's control range (-1 to 1 where it has none).
     The ground truth gives ``ctrl`` to MuJoCo, which evaluates its own law at every substep.
-    The torque here is that of the step's start. With the lengths l = ``length`` q and
-    speeds v = ``moment`` qvel of actuators on joints and fixed tendons,
+    The torque here is that of the step's start, without ``actuatorgravcomp``. With the
+    lengths l = ``length`` q and speeds v = ``moment`` qvel of actuators on joints and fixed
+    tendons,
 
         force = clip((g0 + g1 l + g2 v) ctrl + b0 + b1 l + b2 v, force range)
         torque = clip(moment^T force, torque range)

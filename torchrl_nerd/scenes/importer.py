@@ -68,6 +68,10 @@ def read_mjcf(
         about = {name: getattr(usual, name) for name in CONTACT_FIELDS}
         spec.worldbody.add_geom(type=plane, size=(0.0, 0.0, 1.0), **about)
         model = spec.compile()
+        if not terrain_geoms(model):
+            raise ValueError(
+                f"expected shapes that can touch a plane in {path}, got none"
+            )
     timestep = model.opt.timestep
     if control_step is None:
         return model, max(1, round(CONTROL_STEP / timestep))

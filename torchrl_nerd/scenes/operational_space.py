@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_nerd.geometry.base import Base, BasePose, JointAxes
 from torchrl_nerd.geometry.constants import constant, take
 from torchrl_nerd.geometry.kinematics import PointKinematics
-from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics
+from torchrl_nerd.geometry.rigid_body import RigidBodyDynamics, other_forces
 from torchrl_nerd.geometry.serial_chain import SiteKinematics, bias_acceleration
 from torchrl_nerd.scenes.controllers import Row, driven_dofs
 from torchrl_nerd.settings import expect_at_least
@@ -94,6 +94,13 @@ class OperationalSpaceController:
         self.base_pose = BasePose(model, base)
 
     def _check(self, model: mujoco.MjModel) -> None:
+        if found := [
+            name for name, is_there in other_forces(model).items() if is_there
+        ]:
+            raise ValueError(
+                f"expected an arm whose forces the controller knows, got one with "
+                f"{', '.join(found)}"
+            )
         if len(self.scale) not in AXES:
             raise ValueError(f"expected 3 or 6 numbers as scale, got {len(self.scale)}")
         if self.center is not None and self.num_actions > 3:

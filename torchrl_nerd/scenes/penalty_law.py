@@ -118,7 +118,8 @@ def _expect_law(model: mujoco.MjModel, geoms: np.ndarray) -> None:
     if not len(geoms):
         return
     others = model.geom_priority[terrain_geoms(model)]
-    margin = model.geom_margin[geoms] + model.geom_gap[geoms]
+    both = np.append(geoms, terrain_geoms(model))
+    margin = model.geom_margin[both] + model.geom_gap[both]
     same = np.column_stack((model.geom_solref[geoms], model.geom_friction[geoms, 0]))
     bodies = model.geom_bodyid[geoms]
     first = same[[np.flatnonzero(bodies == body)[0] for body in bodies]]
@@ -138,7 +139,8 @@ def _expect_law(model: mujoco.MjModel, geoms: np.ndarray) -> None:
 
 def _is_soft(solimp: np.ndarray) -> bool:
     """Whether impedances are small and constant, so that MuJoCo's forces are the law's."""
-    return bool((solimp[:, :2] <= 10.0 * IMPEDANCE).all())
+    least, most = solimp[:, 0], solimp[:, 1]
+    return bool((most <= 10.0 * IMPEDANCE).all() and np.allclose(least, most))
 
 
 def limit_stiffness(

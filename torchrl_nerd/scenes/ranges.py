@@ -206,8 +206,10 @@ def _ground_below(model: mujoco.MjModel, place: tuple[float, float, float]) -> f
                 away = mujoco.mj_rayHfield(model, data, geom, start, down)
             else:
                 pose = data.geom_xpos[geom], data.geom_xmat[geom]
-                about = *pose, model.geom_size[geom], start, down, model.geom_type[geom]
-                away = mujoco.mju_rayGeom(*about)
+                kind = model.geom_type[geom]
+                # a plane has no end, whatever size it is drawn in
+                size = model.geom_size[geom] * (kind != mujoco.mjtGeom.mjGEOM_PLANE)
+                away = mujoco.mju_rayGeom(*pose, size, start, down, kind)
             found.append(away if away >= 0.0 else np.inf)
         if np.isfinite(nearest := min(found)):
             return height - float(nearest)

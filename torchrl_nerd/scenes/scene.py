@@ -31,6 +31,7 @@ from torchrl_nerd.scenes.support import check_supported, unit_gravity
 from torchrl_nerd.scenes.symmetries import Symmetries, find_symmetries
 from torchrl_nerd.scenes.terrain import Terrain, TerrainDistance
 from torchrl_nerd.scenes.variation import Ranges, Variation
+from torchrl_nerd.settings import expect_count
 
 RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 REFERENCE_RATIO = 4  # substeps of the reference solver in one of the scene's own
@@ -54,8 +55,7 @@ class Scene:
     variation: Variation | None = None  # what differs from robot to robot, see `vary`
 
     def __post_init__(self) -> None:
-        if self.substeps < 1:
-            raise ValueError(f"expected at least 1 substep, got {self.substeps}")
+        expect_count(1, substeps=self.substeps)
         check_supported(self.name, self.model)
 
     @classmethod
@@ -138,6 +138,7 @@ class Scene:
 
     def with_substeps(self, substeps: int, integrator: int | None = None) -> "Scene":
         """The same scene, its control step cut into another number of substeps."""
+        expect_count(1, substeps=substeps)
         model = copy.copy(self.model)
         model.opt.timestep = self.control_step / substeps
         if integrator is not None:
@@ -152,8 +153,8 @@ class Scene:
     @property
     def integrator(self) -> str:
         """Of its MuJoCo, as in MJCF: ``Euler``, ``RK4``, ``implicitfast``, ..."""
-        name = str(mujoco.mjtIntegrator(self.model.opt.integrator).name)
-        name = name.removeprefix("mjINT_")
+        kind = mujoco.mjtIntegrator(self.model.opt.integrator)
+        name = str(kind.name).removeprefix("mjINT_")
         return {"EULER": "Euler", "RK4": "RK4"}.get(name, name.lower())
 
     @cached_property
@@ -251,16 +252,15 @@ class Scene:
         return self._ground(qpos, terrain)[0]
 
     def place_on_terrain(self, state: dict[str, Tensor], gap: Tensor) -> None:
-        """Move floating bases, in place, to ``gap (num_envs,)`` m over the ground.
-
-        Along its normal at the lowest contact point.
-        """
+        """Move floating bases, in place, along the ground's normal to a ``gap (n,)``, m."""
         if self.base.is_floating and self.terrain is not None:
             qpos, q = state["qpos"], self.base.qpos_address
             gaps, normals = self._ground(qpos, state.get("terrain"))
             if self.base.others:  # the robot's own points count, not the props'
                 trees = self.model.body_treeid
                 own = trees[self.contacts.bodies] == trees[self.base.body]
+                if not own.any():
+                    return
                 gaps = torch.where(torch.from_numpy(own), gaps, torch.inf)
             lowest, point = gaps.min(-1)
             normal = normals[torch.arange(len(qpos)), point]  # (num_envs, 3), in B_t

@@ -139,6 +139,7 @@ def _moves_alike_everywhere(model: mujoco.MjModel, base: Base) -> bool:
     flight.opt.disableflags |= DISABLE.mjDSBL_CONTACT
     # forces decide; an iterative integrator is exact to its solver's tolerance alone
     flight.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    flight.opt.solver, flight.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, 100
     rng, yaw = np.random.default_rng(0), np.append(0.8, 0.6 * unit_gravity(model))
     q, v = base.qpos_address, base.dof_address
     data = mujoco.MjData(flight)

@@ -57,14 +57,19 @@ class Terrain:
 
     @classmethod
     def from_model(cls, model: mujoco.MjModel, geoms: list[int]) -> "Terrain":
-        """The ground of `terrain_geoms`; ValueError for two planes on one mocap body."""
+        """The ground of `terrain_geoms`.
+
+        Raises:
+            ValueError: a mocap body that carries more than one plane.
+        """
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         found = tuple(_read_surface(model, data, geom) for geom in geoms)
-        mocaps = [surface.mocap for surface in found if surface.mocap >= 0]
-        if len({*mocaps}) < len(mocaps):
+        carriers = [g for g in geoms if model.body_mocapid[model.geom_bodyid[g]] >= 0]
+        bodies = model.geom_bodyid[carriers]
+        if len({*bodies}) < len(carriers) or np.isin(model.body_parentid, bodies).any():
             raise ValueError(
-                "expected one plane on a mocap body of the ground, got more"
+                "expected one plane on a mocap body of the ground, got more on it"
             )
         return cls(found, np.hstack((data.mocap_pos, data.mocap_quat)))
 

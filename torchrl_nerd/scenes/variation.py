@@ -85,6 +85,12 @@ class Variation:
             load = "payload" + parameter.suffix
             if kind.startswith("payload_") and load not in ranges:
                 raise ValueError(f"expected '{load}' beside '{name}', got none")
+            moves = kind.startswith(("com_", "payload_"))
+            if moves and model.body_simple[parameter.indices].any():
+                raise ValueError(
+                    f"expected a body that MuJoCo takes for no simple one for '{name}': "
+                    'give it simple="false" in the file'
+                )
             if kind == "motor":
                 self._expect_motors(parameter)
 
@@ -189,7 +195,8 @@ class Variation:
         """Factor of every joint torque, ``(num_envs, num_actuated)``."""
         factor = np.ones((len(parameters), len(self.actuated)))
         for i, p in self._of_kind("motor"):
-            factor[:, np.isin(self.actuated, p.indices)] *= parameters[:, i : i + 1]
+            is_on = np.isin(self.actuated, p.indices) | (p.name == "motor")
+            factor[:, is_on] *= parameters[:, i : i + 1]
         return factor
 
     def delay(self, parameters: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ Source: Gymnasium 1.x, ``gymnasium/envs/mujoco/*_v5.py``.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 
 import torch
@@ -80,7 +81,6 @@ class LocomotionTask(Task):
         self.observation_size = model.nq + model.nv - self.numbers.hidden
         self._height_at = 2 if self.scene.base.is_floating else 1
         self._start = model.qpos0.tolist()
-        self._centre = BodyMotion(self.scene) if self.numbers.by_centre else None
 
     def build_scene(self) -> Scene:
         """The environment's robot and its ground."""
@@ -115,9 +115,13 @@ class LocomotionTask(Task):
         """Fallen, bool ``(*batch,)``; a cheetah and a swimmer never are."""
         return ~self._is_healthy(next_state)
 
+    @cached_property
+    def _centre(self) -> BodyMotion:
+        return BodyMotion(self.scene)
+
     def _place(self, state: State) -> Tensor:
         """Along the track, m, ``(*batch,)``."""
-        if self._centre is None:
+        if not self.numbers.by_centre:
             return state[QPOS][..., 0]
         motion = placed(self._centre, state[QPOS])
         return motion(state[QPOS], state[QVEL]).com[..., 0]

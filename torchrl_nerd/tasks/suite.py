@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from functools import cached_property
 from math import ceil
 
 import mujoco
@@ -15,7 +16,7 @@ from torchrl_nerd.keys import ACTION, QPOS, QVEL, SENSORDATA, TARGET
 from torchrl_nerd.locks import fork_safe_lock
 from torchrl_nerd.scenes import Scene, import_scene
 from torchrl_nerd.scenes.importer import load_suite, suite_name
-from torchrl_nerd.tasks.suite_formulas import FORMULAS
+from torchrl_nerd.tasks.suite_formulas import FORMULAS, Formula
 from torchrl_nerd.tasks.task import State, Task, own_actuators
 
 SEEDS = 2**32  # of NumPy's RandomState, which the suite draws from
@@ -60,13 +61,19 @@ class SuiteTask(Task):
         self.parameters = {TARGET: width} if width else {}
         self._sizes = (model.nq, model.nv, width)
         self._forces, self._targets = suite.forces, suite.targets
-        self._start, self._judge = _RowMemo(suite.start), _RowMemo(suite.judge)
-        formula = FORMULAS.get(suite.domain)
-        self._formula = None if formula is None else formula(self.scene, suite.task)
+        self._start = _RowMemo(suite.start, sum(self._sizes))
+        self._judge = _RowMemo(suite.judge, 2 + suite.observation_size)
+        self._names = suite.domain, suite.task
 
     def build_scene(self) -> Scene:
         """The suite's robot and its ground."""
         return import_scene(self.name)
+
+    @cached_property
+    def _formula(self) -> Formula | None:
+        """Of its domain, where there is one."""
+        domain, task = self._names
+        return FORMULAS[domain](self.scene, task) if domain in FORMULAS else None
 
     def initial_state(self, u: Tensor) -> dict[str, Tensor]:
         """By the suite's ``initialize_episode``, seeded with u."""
@@ -76,10 +83,10 @@ class SuiteTask(Task):
 
     def observation(self, state: State) -> Tensor:
         """The suite's, flattened in its order."""
-        knows_forces = not len(self._forces) or SENSORDATA in state.keys()
-        if self._formula is None or not knows_forces:
+        formula, knows_forces = self._formula, SENSORDATA in state.keys()
+        if formula is None or (formula.reads_forces and not knows_forces):
             return self._judged(state)[..., 2:]
-        return self._formula.observation(state[QPOS], state[QVEL], self._extra(state))
+        return formula.observation(state[QPOS], state[QVEL], self._extra(state))
 
     def reward(self, state: State, action: Tensor, next_state: State) -> Tensor:
         """The suite's, of the state that the step led to and the action."""
@@ -224,14 +231,16 @@ _ONE_AT_A_TIME = fork_safe_lock()
 class _RowMemo:
     """A slow function of NumPy rows; answers of the last call are known in the next."""
 
-    def __init__(self, function: Callable[[np.ndarray], np.ndarray]) -> None:
-        self.function = function
+    def __init__(
+        self, function: Callable[[np.ndarray], np.ndarray], width: int
+    ) -> None:
+        self.function, self.width = function, width  # numbers of an answer
         self._answers: dict[bytes, np.ndarray] = {}
 
     @uncompiled
     def __call__(self, rows: Tensor) -> Tensor:
         """Answers to ``rows (*batch, k)``, in float64."""
-        flat = rows.double().flatten(0, -2).cpu().numpy()
+        flat = rows.double().reshape(-1, rows.shape[-1]).cpu().numpy()
         with _ONE_AT_A_TIME:  # one `Physics`, written in and read
             known, self._answers = self._answers, {}
             keys = [row.tobytes() for row in flat]
@@ -240,4 +249,6 @@ class _RowMemo:
                     found = known[key] if key in known else self.function(row)
                     self._answers[key] = found
             answers = np.array([self._answers[key] for key in keys])
-        return torch.from_numpy(answers).to(rows.device).unflatten(0, rows.shape[:-1])
+        answers = answers.reshape(len(flat), self.width)  # of no rows too
+        found = torch.from_numpy(answers).to(rows.device)
+        return found.reshape(*rows.shape[:-1], self.width)

@@ -22,6 +22,7 @@ class Formula(ABC):
     """Observation and reward of one task, named as in its domain, such as ``"walk"``."""
 
     bodies: tuple[str, ...] = ()  # whose places and axes it reads
+    reads_forces: bool = False  # its observation, those of contact
 
     def __init__(self, scene: Scene, task: str) -> None:
         self.task = task
@@ -114,6 +115,7 @@ class Hopper(Formula):
     """A planar hopper stands, or hops."""
 
     bodies = ("torso", "foot")
+    reads_forces = True
 
     def __init__(self, scene: Scene, task: str) -> None:
         super().__init__(scene, task)

@@ -59,6 +59,9 @@ class Task(ABC):
                 f"in '{scene.name}'"
             )
         twin = copy.copy(self)
+        for name in [*vars(twin)]:  # what was made of the other scene
+            if isinstance(getattr(type(twin), name, None), cached_property):
+                del vars(twin)[name]
         vars(twin)["scene"] = scene  # in place of `build_scene`'s
         return twin
 

@@ -156,7 +156,7 @@ class FineTuner:
     def _descend(self) -> None:
         """The chosen weights, along the gradient of rollouts."""
         config, waited = self.config, 0
-        total = max(1, round(config.epochs * self.updates_per_epoch))
+        total = round(config.epochs * self.updates_per_epoch)
         generator = Generator().manual_seed(config.seed)
         batches: list[Tensor] = []
         with self._bar(total, self.updates_per_epoch) as bar:

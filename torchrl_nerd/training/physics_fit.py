@@ -23,6 +23,9 @@ RADII = (0.2, 0.1)  # of the first steps, in units of `SCALED` and `SHIFTED`
 CLOSE = 0.004  # the same of the last
 LOST = 1e3  # error of parameters with which a rollout is not finite
 SHORTEST = 0.05  # s of a flight that counts
+OBSERVABLE = (
+    1e-6  # least singular value of what flights show, as a share of the largest
+)
 CENTRE = ("centre_x", "centre_y", "centre_z")
 
 
@@ -103,5 +106,7 @@ def fit_flight(scene: Scene, recording: Recording) -> dict[str, float]:
             values.append(apart @ qpos[:, axis])
     if not rows:
         return {}
-    found = torch.linalg.lstsq(torch.cat(rows), torch.cat(values)[:, None]).solution
+    # a centre of mass that nothing shows, as where no body turns, stays at zero
+    how = {"rcond": OBSERVABLE, "driver": "gelsd"}
+    found = torch.linalg.lstsq(torch.cat(rows), torch.cat(values)[:, None], **how)[0]
     return dict(zip((*CENTRE, "gravity"), found[:, 0].tolist(), strict=True))

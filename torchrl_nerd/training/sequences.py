@@ -112,10 +112,8 @@ class Sequences:
         moved = torch.where(is_early, (change - length).clamp_min(0), change)
         return time_index - first + torch.where(is_mixed, moved, first)
 
-    def rollout(
-        self, batch_size: int, length: int, generator: Generator
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-        """``qpos``, ``qvel (batch, length + 1, ...)``, commands, ground, parameters.
+    def expect_rollouts(self, length: int) -> None:
+        """Refuse rollouts that no trajectory has.
 
         Raises:
             ValueError: longer than one robot of some trajectory stays.
@@ -125,12 +123,19 @@ class Sequences:
                 f"expected rollouts, history included, of at most {self.longest} steps "
                 f"with robots that change, got {length}"
             )
+
+    def rollout(
+        self, batch_size: int, length: int, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+        """``qpos``, ``qvel (batch, length + 1, ...)``, commands, ground, parameters."""
         trajectory, time_index = self.pick(batch_size, length, generator)
         if self.change is not None:
             time_index = self._of_one_robot(trajectory, time_index)
         batch = cast(TensorDict, self.data[trajectory, time_index])
         if self.symmetry is not None:  # samples are in no order: a part for each
-            isometries = self.symmetry.isometries
+            isometries = list(self.symmetry.isometries)
+            first = int(torch.randint(len(isometries), (), generator=generator))
+            isometries = isometries[first:] + isometries[:first]
             parts = zip(isometries, batch.chunk(len(isometries)), strict=False)
             copies = [isometry(part) for isometry, part in parts]
             batch = cast(TensorDict, torch.cat(copies))  # pyright: ignore

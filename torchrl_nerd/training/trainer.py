@@ -150,6 +150,8 @@ class Trainer:
         symmetry = symmetry and symmetry.to(self.device)
         shown = symmetry if self.config.use_symmetry else None
         self.sequences, self.resting = Sequences(model, data, shown), resting(data)
+        if self.config.rollout_steps:
+            self.sequences.expect_rollouts(self.config.rollout_states)
         seen = self.sequences.features, self.sequences.targets
         cover(model, data, seen, symmetry and symmetry.tokens.copies)
         if init_from is not None:

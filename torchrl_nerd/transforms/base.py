@@ -5,6 +5,7 @@ from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
@@ -17,6 +18,7 @@ from torchrl_nerd.scenes.scene import Scene
 class StateTransform(Transform):
     """`_call` at an env's reset and step, in a replay buffer, and alone."""
 
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
         """Write the outputs beside the inputs."""
         return self._call(tensordict)
@@ -48,6 +50,7 @@ class FeatureTransform(StateTransform):
         self.sizes, self.name = sizes, scene.name
         self.widths = {QPOS: scene.model.nq, QVEL: scene.model.nv}
 
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
         """Write the features, and under ``next`` those of the state there."""
         after = tensordict.get("next", None)

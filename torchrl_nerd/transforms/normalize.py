@@ -72,7 +72,8 @@ class Normalize(StateTransform):
     stored, an env on what it is given. `denormalize` is the inverse of one quantity.
 
     Raises:
-        ValueError: a key of ``in_keys_inv`` without statistics.
+        ValueError: a key of ``in_keys_inv`` without statistics, statistics of nothing; when
+            called, whole numbers.
 
     Examples:
         >>> x = torch.randn(100, 3).double() * 5.0 + 1000.0
@@ -90,13 +91,15 @@ class Normalize(StateTransform):
             raise ValueError(
                 f"expected in_keys_inv with statistics ({keys}), got {unknown}"
             )
+        if empty := [key for key, of_key in stats.items() if not of_key.count]:
+            raise ValueError(f"expected statistics of samples, got none of {empty}")
         super().__init__(keys, keys, in_keys_inv=back, out_keys_inv=back)
         self.names = {}
         for key, of_key in stats.items():
             parts = (key,) if isinstance(key, str) else key
-            name = "_".join(("key", *parts))  # pyright: ignore
+            name = "_".join(("key", *parts)).replace(".", "_")  # pyright: ignore
             if name in self.names.values():  # "a_b" beside ("a", "b")
-                name = f"key_{key!r}"
+                name = f"{name}_{len(self.names)}"
             self.names[key] = name
             self.register_buffer(f"{name}_mean", of_key.mean.clone())
             self.register_buffer(f"{name}_std", of_key.std.clone())
@@ -123,18 +126,31 @@ class Normalize(StateTransform):
         for key in self.in_keys:
             x = next_tensordict.get(key, None)
             if x is not None:
+                if not x.is_floating_point():
+                    raise ValueError(
+                        f"expected {key} of floating-point numbers, got {x.dtype}"
+                    )
                 next_tensordict.set(key, self.normalize(key, x))
         return next_tensordict
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Bounds of what is seen, normalised."""
+        return self._bounded(observation_spec, self.in_keys)
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Bounds of what an env is given, normalised."""
         found = cast(Composite, input_spec.clone())
-        for part in found.values():  # actions and states
-            for key in (x for x in self.in_keys_inv if x in part.keys(True)):
-                if isinstance(part[key], Bounded):
-                    space = cast(Any, part[key].space)
-                    space.low = self.normalize(key, space.low)
-                    space.high = self.normalize(key, space.high)
+        for name, part in [*found.items()]:  # actions and states
+            found[name] = self._bounded(part, self.in_keys_inv)
+        return found
+
+    def _bounded(self, spec: TensorSpec, keys: Sequence[NestedKey]) -> Composite:
+        found = cast(Composite, spec.clone())
+        for key in (x for x in keys if x in found.keys(True)):
+            if isinstance(found[key], Bounded):
+                space = cast(Any, found[key].space)
+                space.low = self.normalize(key, space.low)
+                space.high = self.normalize(key, space.high)
         return found
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:

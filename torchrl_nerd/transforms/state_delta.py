@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
@@ -115,6 +116,7 @@ class StateDelta(Transform):
         q = self.base.qpos_address + 3
         return qpos[..., q : q + 4]
 
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # pyright: ignore
         """Write the change between the state and the one under ``next``.
 

@@ -6,7 +6,7 @@ from math import isfinite
 
 import torch
 from tensordict import TensorDict
-from torch import Generator, Tensor
+from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
@@ -28,6 +28,7 @@ from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.robots import EvaluationProtocol, Source
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.seeds import fold_in
 
 DRIVEN = "driven"
 """The case of uniform random actions, beside the passive ones."""
@@ -70,7 +71,8 @@ class EvaluationSet:
     def perturbed(self, size: float, seed: int) -> TensorDict:
         """The initial states with ``size`` (m, rad) times a normal number added to each."""
         layout, start = self.scene.layout, self.start.clone()
-        shape, generator = (len(start), layout.nv), Generator().manual_seed(seed)
+        # numbers that neither the starts nor random actions have
+        shape, generator = (len(start), layout.nv), fold_in(seed, 2)
         noise = torch.randn(shape, dtype=torch.float64, generator=generator)  # (n, nv)
         start[QPOS] = integrate_pos(layout, start[QPOS], size * noise.to(start[QPOS]))
         return start

@@ -152,6 +152,7 @@ class Result:
     passes: bool
     tolerances: dict[str, float]  # limits of the dynamics under test
     seconds: float  # for both
+    skipped: str = ""  # why nothing was measured
 
 
 def run_cases(
@@ -165,10 +166,15 @@ def run_cases(
         if not case.supports(tested):
             continue
         began, found = time.monotonic(), []
+        skipped = ""
         for dynamics in (MujocoDynamics(tested.scene), tested):
             stream = Generator().manual_seed(crc32(case.name.encode(), seed))
             trial = Trial(dynamics, stream, scale)
-            found.append(list(case.run(trial)) if case.supports(dynamics) else [])
+            try:
+                found.append(list(case.run(trial)) if case.supports(dynamics) else [])
+            except ValueError as error:  # a robot that never rests, for one
+                found, skipped = [[], []], str(error)
+                break
         exact, mine = found
         yield Result(
             case=case.name,
@@ -179,6 +185,7 @@ def run_cases(
             passes=all(m.passes() for m in mine),
             tolerances={m.name: m.limit for m in mine if m.limit < inf},
             seconds=round(time.monotonic() - began, 1),
+            skipped=skipped,
         )
 
 
@@ -202,6 +209,11 @@ def as_table(results: list[Result], kind: str = "tested") -> str:
 def has_floating_base(scene: Scene) -> bool:
     """Whether the base moves freely."""
     return scene.base.is_floating
+
+
+def can_land(scene: Scene) -> bool:
+    """Whether the base moves freely over a ground."""
+    return scene.base.is_floating and scene.terrain is not None
 
 
 def largest(value: Tensor) -> float:

@@ -12,6 +12,7 @@ from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.evaluation.stability.case import (
     Metric,
     Trial,
+    can_land,
     hard_case,
     has_floating_base,
     largest,
@@ -200,7 +201,7 @@ def batching(trial: Trial) -> Iterator[Metric]:
 def gradients(trial: Trial) -> Iterator[Metric]:
     """Gradients equal finite differences and stay finite over 100 steps."""
     start = trial.starts(8)
-    if trial.scene.base.is_floating:  # on the ground, moving slowly
+    if can_land(trial.scene):  # on the ground, moving slowly
         lying = trial.settled(8)
         lying[QVEL] += SLOW * start[QVEL][: len(lying)]
         start = lying

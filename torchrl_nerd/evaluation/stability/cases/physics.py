@@ -14,6 +14,7 @@ from torchrl_nerd.evaluation.rollout_error import position_errors, rollout
 from torchrl_nerd.evaluation.stability.case import (
     Metric,
     Trial,
+    can_land,
     hard_case,
     has_floating_base,
     largest,
@@ -115,7 +116,7 @@ def momentum(trial: Trial) -> Iterator[Metric]:
         yield Metric(name, largest(norm(value - value[:, :1]).mean(0)), 0.02, 5e-4)
 
 
-@hard_case(has_floating_base)
+@hard_case(can_land)
 def drop(trial: Trial) -> Iterator[Metric]:
     """Dropped from up to 10 m it lands, does not penetrate and never rises higher."""
     z = trial.scene.base.qpos_address + 2
@@ -133,7 +134,7 @@ def drop(trial: Trial) -> Iterator[Metric]:
     yield Metric("final height error, m", end)
 
 
-@hard_case(has_floating_base)
+@hard_case(can_land)
 def resting(trial: Trial) -> Iterator[Metric]:
     """Started where MuJoCo came to rest it stays there, on the ground and not in it."""
     scene, start, kept = trial.scene, trial.settled(16), 100
@@ -149,7 +150,7 @@ def resting(trial: Trial) -> Iterator[Metric]:
     yield Metric("penetration, m", largest(depth), 0.02)
 
 
-@hard_case(has_floating_base)
+@hard_case(can_land)
 def sliding(trial: Trial) -> Iterator[Metric]:
     """Pushed along the ground at 1 m/s it stops."""
     start = trial.settled(16)
