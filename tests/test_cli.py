@@ -190,6 +190,12 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
     text = capsys.readouterr().out
     assert "use the data in datasets/cartpole" in text
     assert "resume the run in runs/cartpole" in text
+    for dry in ([], ["--dry-run"]):
+        assert "holds a run with config.seed 0" in refusal(
+            capsys, *learn, "--seed", "5", *dry
+        )
+        typo = ["--data", "datasets/cartpol", "--out", "runs/other"]
+        assert "a data set in datasets/cartpol" in refusal(capsys, *learn, *typo, *dry)
 
 
 @pytest.mark.parametrize("command", ["data", "train", "finetune"])
@@ -205,6 +211,13 @@ def test_a_dry_run_refuses_what_the_run_would(command, capsys):
         ("eval unicorn", "'unicorn'"),
         ("eval cartpole --model nowhere", "'nowhere'"),
         ("eval cube --data {log} --seed 3", "expected --seed without --data"),
+        ("eval cartpole --variants fast", "unknown variant 'fast'"),
+        ("eval cube --data nowhere.npz", "nowhere.npz"),
+        ("eval cube --data {log} --split tset", "'tset'"),
+        ("bench cartpole --models nowhere", "'nowhere'"),
+        ("transfer cartpole/swingup --dynamics nowhere", "'nowhere'"),
+        ("play cartpole/swingup --dynamics nowhere", "'nowhere'"),
+        ("finetune cube --from {log} --update head", "expected update 'physics'"),
         ("bench unicorn", "'unicorn'"),
         ("bench cartpole --steps 0", "expected steps of at least 1, got 0"),
         ("stability unicorn", "'unicorn'"),
@@ -495,7 +508,9 @@ def test_progress_is_shown_apart_from_the_table(short_rollouts, capsys):
     assert capsys.readouterr() == (shown.out, "")
 
 
-def test_a_scene_is_explained(scene, tmp_path, capsys):
+@pytest.mark.parametrize("name", slow_but(("ant", "cube", "anymal"), SCENES))
+def test_a_scene_is_explained(name, tmp_path, capsys):
+    scene = load_scene(name)
     path = tmp_path / "results.json"
     assert main(["explain", scene.name, "--json", str(path)]) == 0
     text, content = capsys.readouterr().out, read(path)

@@ -11,8 +11,9 @@ from torchrl_nerd.files import read_json
 TOOLS = Path(__file__).parent / "tools"
 
 
-# One of the data; fixed moments of a training are in training/test_resume.py.
-@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.slow)])
+# Fixed moments are in data/test_resume.py and training/test_resume.py.
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 100])
 def test_nothing_is_lost(kills, seed, tmp_path):
     command = [sys.executable, "kill_trials.py", "--kills", str(kills)]
     results = tmp_path / "kills.json"

@@ -96,9 +96,10 @@ def test_a_forked_process_has_threads_of_its_own():
 
 
 @pytest.mark.slow
-def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
+@pytest.mark.parametrize("name", ["double_pendulum-hybrid", "double_pendulum-mlp"])
+def test_a_compiled_step_in_parts_is_the_eager_one(name, generator, monkeypatch):
     monkeypatch.setattr(models, "MIN_WORK", 2)
-    model = from_pretrained("double_pendulum-hybrid")
+    model = from_pretrained(name)
     drive = random_drive(model.scene, ROWS, STEPS, generator)
     dynamics = NeRDDynamics(model, compile=True)
     assert dynamics.parts(ROWS) == 2
@@ -114,6 +115,16 @@ def test_a_compiled_step_in_parts_is_the_eager_one(generator, monkeypatch):
         ends = [each.step(each.reset().set("action", action)) for each in (eager, env)]
         torch.testing.assert_close(*ends, **CLOSE)
     assert not env.eager().dynamics.compile
+
+
+def test_a_model_without_a_history_steps_in_parts():
+    """A learned one as well; what has a history, or one of torch's threads, does not."""
+    mlp, transformer = (from_pretrained(name) for name in ("ant-mlp", "ant"))
+    assert mlp.compile_single_threaded and not transformer.compile_single_threaded
+    assert NeRDDynamics(mlp).parts(512) == 2 and NeRDDynamics(mlp).parts(64) == 1
+    assert NeRDDynamics(transformer).parts(512) == 1
+    torch.set_num_threads(1)
+    assert NeRDDynamics(mlp).parts(512) == 1
 
 
 def test_what_must_stay_whole_does(generator, monkeypatch):

@@ -79,3 +79,13 @@ def test_other_joints_are_refused():
       </body></worldbody></mujoco>""")
     with pytest.raises(ValueError, match="one to a body, for the equation of motion"):
         JointAxes.of(ball.model, ball.base)
+
+
+def test_inertia_without_mass_is_refused():
+    """MuJoCo compiles it where the body is welded to one with mass."""
+    shell = '<body><inertial pos="0 0 0" mass="0" diaginertia="0.5 0.5 0.5"/></body>'
+    text = BRANCHED.format(first="hinge").replace("</body>", f"{shell}</body>", 1)
+    scene = make_scene(text)
+    axes = JointAxes.of(scene.model, scene.base)
+    with pytest.raises(ValueError, match="expected mass where there is inertia"):
+        RigidBodyDynamics(scene.model, scene.base, axes, scene.actuated)

@@ -128,6 +128,20 @@ def test_a_history_is_restored_where_it_is_asked_for(network, tokens):
     torch.testing.assert_close(here[~rows], elsewhere[~rows])
 
 
+@pytest.mark.parametrize(
+    "network",
+    [
+        ("mlp", 8),
+        ("pairs", 2),
+        *(
+            pytest.param((name, 2), marks=pytest.mark.slow)
+            for name in CONFIGS
+            if name != "pairs"
+        ),
+    ],
+    indirect=True,
+    ids=str,
+)
 @torch.no_grad()
 def test_a_step_is_one_graph(network, tokens):
     traced = torch.compile(network.step, backend="eager", fullgraph=True)

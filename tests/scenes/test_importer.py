@@ -563,3 +563,20 @@ def test_a_path_means_the_file_that_is_there(tmp_path, monkeypatch):
     os.utime("robot.xml", ns=(0, 0))  # clocks of some file systems are coarse
     sizes.append(float(load_scene("robot.xml").model.geom_size[0, 0]))
     assert sizes == [0.1, 0.2, 0.3]
+
+
+def test_a_plane_that_nothing_can_touch_is_not_added(tmp_path):
+    path = write(tmp_path, BODY.replace("<geom", '<geom contype="0" conaffinity="0"'))
+    with pytest.raises(
+        ValueError, match="shapes that can touch a plane in .*robot.xml"
+    ):
+        Scene.from_mjcf(path, terrain="plane")
+
+
+def test_a_plane_has_no_end(tmp_path):
+    """A robot beside its drawn part starts over it, too."""
+    floor = '<geom type="plane" size="1 1 1" pos="0 0 3"/>'
+    ball = '<body pos="4 0 3.5"><freejoint/><geom size="0.1"/></body>'
+    scene = Scene.from_mjcf(write(tmp_path, floor + ball))
+    qpos = scene.sample_initial(20, torch.Generator().manual_seed(0))[0]["qpos"]
+    assert (qpos[:, 2] >= 3.1 - 1e-9).all()

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from helpers import make_scene
 from tensordict import TensorDict
 
 from torchrl_nerd import NeRDEnv, make_env
@@ -176,3 +177,49 @@ def test_a_model_of_seconds_steps_and_streams(path, tmp_path, short_rollouts, ca
         paths.append(torch.stack(passed))
     assert paths[0].isfinite().all()
     torch.testing.assert_close(*paths, rtol=1e-5, atol=1e-5)
+
+
+ARM = """<body name="arm"><joint name="a"/><geom size="0.05" pos="0.3 0 0"/>
+  <body pos="0.3 0 0"><joint name="b"/><geom size="0.05" pos="0.3 0 0"/></body></body>"""
+DRONE = (
+    """<body name="drone" pos="0 0 2"><freejoint name="d"/><geom size="0.1"/></body>"""
+)
+MOTORS = '<motor joint="a"/><motor joint="b"/><motor joint="d" gear="0 0 1 0 0 0"/>'
+
+
+def test_the_robot_is_the_tree_of_most_actuators(tmp_path):
+    """Not that of most driven dofs: a motor of a free joint counts once."""
+    for order in (ARM + DRONE, DRONE + ARM):
+        text = f"<mujoco><worldbody>{order}</worldbody>"
+        (tmp_path / "robots.xml").write_text(
+            f"{text}<actuator>{MOTORS}</actuator></mujoco>"
+        )
+        scene = load_scene(str(tmp_path / "robots.xml"))
+        assert scene.model.body(scene.base.body).name == "arm"
+
+
+def test_closed_loops_may_have_any_solver(tmp_path):
+    """Of which one that stops early depends on where the robot is, a little."""
+    legs = "".join(
+        f'''<body name="{x}" pos="{0.1 * i} 0 0"><joint axis="0 1 0" name="{x}"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3"/></body>'''
+        for i, x in enumerate("lr")
+    )
+    text = f"""<mujoco><option solver="PGS" iterations="3"/><worldbody><body name="t"
+      pos="0 0 1"><freejoint/><geom size="0.1"/>{legs}</body></worldbody><equality>
+      <connect body1="l" body2="r" anchor="0 0 -0.3"/></equality></mujoco>"""
+    (tmp_path / "loop.xml").write_text(text)
+    assert load_scene(str(tmp_path / "loop.xml")).base.is_floating
+
+
+def test_a_robot_that_touches_nothing_stays_where_it_is_put(generator):
+    """However its props touch the ground."""
+    robot = '<body pos="0 0 1"><freejoint/><geom size="0.1" contype="0"/></body>'
+    prop = '<body pos="1 0 1"><freejoint/><geom size="0.1"/></body>'
+    floor = '<geom type="plane" size="0 0 1" conaffinity="1"/>'
+    text = f"<mujoco><worldbody>{floor}{robot}{prop}</worldbody></mujoco>"
+    scene = make_scene(text.replace("contype", 'conaffinity="0" contype'))
+    state = {"qpos": torch.from_numpy(scene.model.qpos0).expand(2, -1).clone()}
+    before = state["qpos"].clone()
+    scene.place_on_terrain(state, torch.zeros(2).double())
+    assert torch.equal(state["qpos"], before)

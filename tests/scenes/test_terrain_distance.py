@@ -227,7 +227,8 @@ def test_a_floating_base_needs_ground_of_a_known_shape(kind):
 
 def test_a_mocap_body_with_more_than_a_plane_is_refused():
     plane = '<geom type="plane" size="0 0 1"/>'
-    for more in (plane, '<geom type="box" size="1 1 1"/>', "<body/>"):
+    arm = '<body><joint/><geom size="0.1" contype="0"/></body>'
+    for more in (plane, '<geom type="box" size="1 1 1"/>', arm):
         body = f'<body mocap="true">{plane}{more}</body>'
         xml = f"<mujoco><worldbody>{body}{ROBOT}</worldbody></mujoco>"
         with pytest.raises(ValueError, match="one plane on a mocap body"):

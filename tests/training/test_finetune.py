@@ -122,6 +122,13 @@ def test_it_stops_where_validation_stands_still_at_full_length(model, recording)
     assert done == pytest.approx(int(short) + 2) and done < run.updates_per_epoch
 
 
+def test_no_epoch_leaves_the_model_as_it_is(model, recording):
+    tuned = tuner(model, recording, epochs=0.0)
+    before, after = weights(model), weights(tuned.run())
+    assert all(torch.equal(before[k], after[k]) for k in before)
+    assert [point["epoch"] for point in tuned.curve] == [0.0]
+
+
 def test_runs_of_one_seed_are_the_same(model, recording):
     first, second = (weights(tuner(model, recording).run()) for _ in range(2))
     assert all(torch.equal(first[k], second[k]) for k in first)

@@ -34,7 +34,7 @@ class AnalyticStep(nn.Module, ABC):
     """
 
     kind: ClassVar[str] = "analytic"
-    compile_single_threaded: ClassVar[bool] = True
+    compile_single_threaded: bool = True
 
     def __init__(self, scene: Scene, config: StepConfig, num_defects: int) -> None:
         super().__init__()

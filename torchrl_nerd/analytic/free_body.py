@@ -8,8 +8,6 @@ Euler spring are stable at any stiffness. Every operation is differentiable, als
 physical parameters.
 """
 
-from typing import ClassVar
-
 import mujoco
 import numpy as np
 import torch
@@ -67,7 +65,7 @@ class FreeBodyPenaltyStep(AnalyticStep):
         ValueError: another kind of robot or contact.
     """
 
-    compile_single_threaded: ClassVar[bool] = False
+    compile_single_threaded: bool = False
     points: Tensor  # (P, 3), m, body frame
     inertia: Tensor  # (3,), kg m^2
     nominal: Tensor  # (7,): the scene's own parameters

@@ -47,6 +47,11 @@ class History:
         )
 
 
+def has_history(network: Any) -> bool:
+    """Whether a network remembers anything of an env."""
+    return bool(fields(network.empty_memory(1)))
+
+
 @dataclass
 class TokenWindow(History):
     """The last tokens of every env, left-aligned: an env's first is at index 0."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_nerd.geometry import surfaces
-from torchrl_nerd.geometry.base import keep_constants
+from torchrl_nerd.geometry.base import ancestors, keep_constants
 from torchrl_nerd.geometry.manifold import UNIT
 from torchrl_nerd.geometry.rotations import (
     quat_conjugate,
@@ -65,9 +65,11 @@ class Terrain:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         found = tuple(_read_surface(model, data, geom) for geom in geoms)
-        carriers = [g for g in geoms if model.body_mocapid[model.geom_bodyid[g]] >= 0]
-        bodies = model.geom_bodyid[carriers]
-        if len({*bodies}) < len(carriers) or np.isin(model.body_parentid, bodies).any():
+        owners = model.geom_bodyid[geoms]
+        planes = owners[[surface.mocap >= 0 for surface in found]]
+        carried = ancestors(model)[:, planes].any(1)  # (bodies,): moved with a plane
+        moves = model.body_dofnum[model.body_weldid] > 0
+        if carried[owners].sum() > len({*planes}) or (carried & moves).any():
             raise ValueError(
                 "expected one plane on a mocap body of the ground, got more on it"
             )

@@ -23,9 +23,7 @@ RADII = (0.2, 0.1)  # of the first steps, in units of `SCALED` and `SHIFTED`
 CLOSE = 0.004  # the same of the last
 LOST = 1e3  # error of parameters with which a rollout is not finite
 SHORTEST = 0.05  # s of a flight that counts
-OBSERVABLE = (
-    1e-6  # least singular value of what flights show, as a share of the largest
-)
+OBSERVABLE = 1e-6  # least singular value that flights show, a share of the largest
 CENTRE = ("centre_x", "centre_y", "centre_z")
 
 

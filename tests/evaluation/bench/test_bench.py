@@ -104,7 +104,7 @@ def test_driven_beside_passive_where_there_are_actuators(name):
     assert extra == [DRIVEN] * (has_motors and not protocol.random_actions)
 
 
-@pytest.mark.parametrize("name", slow_but(QUICK, PRESETS))
+@pytest.mark.parametrize("name", slow_but(QUICK[1:], PRESETS))
 def test_a_whole_benchmark(name, tmp_path, monkeypatch):
     monkeypatch.setattr(rates, "SAMPLE_SECONDS", 0.01)  # speeds need not be exact here
     scene = load_scene(name)
