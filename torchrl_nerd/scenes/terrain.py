@@ -69,7 +69,7 @@ class Terrain:
         planes = owners[[surface.mocap >= 0 for surface in found]]
         carried = ancestors(model)[:, planes].any(1)  # (bodies,): moved with a plane
         moves = model.body_dofnum[model.body_weldid] > 0
-        if carried[owners].sum() > len({*planes}) or (carried & moves).any():
+        if carried[owners].sum() > len({*planes}) or np.any(carried & moves):
             raise ValueError(
                 "expected one plane on a mocap body of the ground, got more on it"
             )
