@@ -48,7 +48,7 @@ class History:
 
 
 def has_history(network: Any) -> bool:
-    """Whether a network remembers anything of an env."""
+    """Whether a network has a history of an env."""
     return bool(fields(network.empty_memory(1)))
 
 
