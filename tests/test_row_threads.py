@@ -3,22 +3,20 @@
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from itertools import count
 
 import pytest
 import torch
 from dynamics_helpers import HAS_COMPILER, random_actions, random_drive, roll
-from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_nerd import NeRDEnv, from_pretrained
-from torchrl_nerd.analytic import make_step
 from torchrl_nerd.compiled import WARM, RowThreads, parts_of
-from torchrl_nerd.configs import NO_PREDICTIONS
 from torchrl_nerd.dynamics import NeRDDynamics, models
-from torchrl_nerd.modules.hybrid import HybridNeRD
+from torchrl_nerd.modules.history import WindowNetwork
+from torchrl_nerd.modules.networks import GRUConfig, MLPConfig
 from torchrl_nerd.modules.transformer import TransformerConfig
-from torchrl_nerd.robots import load_scene
 
 TASK, ROWS, STEPS = "double_pendulum/passive", 6, 4
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
@@ -96,7 +94,9 @@ def test_a_forked_process_has_threads_of_its_own():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["double_pendulum-hybrid", "double_pendulum-mlp"])
+@pytest.mark.parametrize(
+    "name", ["double_pendulum-hybrid", "double_pendulum-mlp", "double_pendulum"]
+)
 def test_a_compiled_step_in_parts_is_the_eager_one(name, generator, monkeypatch):
     monkeypatch.setattr(models, "MIN_WORK", 2)
     model = from_pretrained(name)
@@ -117,35 +117,52 @@ def test_a_compiled_step_in_parts_is_the_eager_one(name, generator, monkeypatch)
     assert not env.eager().dynamics.compile
 
 
-def test_a_model_without_a_history_steps_in_parts():
-    """A learned one as well; what has a history, or one of torch's threads, does not."""
-    mlp, transformer = (from_pretrained(name) for name in ("ant-mlp", "ant"))
-    assert mlp.compile_single_threaded and not transformer.compile_single_threaded
-    assert NeRDDynamics(mlp).parts(512) == 2 and NeRDDynamics(mlp).parts(64) == 1
-    assert NeRDDynamics(transformer).parts(512) == 1
-    torch.set_num_threads(1)
-    assert NeRDDynamics(mlp).parts(512) == 1
+def test_learned_models_step_in_parts():
+    """Where there are enough envs, and threads."""
+    for name in ("ant-mlp", "ant"):
+        torch.set_num_threads(2)
+        dynamics = NeRDDynamics(from_pretrained(name))
+        assert dynamics.is_single_threaded
+        assert dynamics.parts(512) == 2 and dynamics.parts(64) == 1
+        torch.set_num_threads(1)
+        assert dynamics.parts(512) == 1
 
 
 def test_what_must_stay_whole_does(generator, monkeypatch):
-    """Gradients, a history, one thread."""
+    """Gradients, and one thread."""
     monkeypatch.setattr(models, "MIN_WORK", 2)
     model = from_pretrained("double_pendulum-hybrid")
     assert NeRDDynamics(model, differentiable=True).parts(ROWS) == 1
-    assert NeRDDynamics(from_pretrained("cartpole")).parts(ROWS) == 1
     torch.set_num_threads(1)
     assert NeRDDynamics(model).parts(ROWS) == 1
 
 
-@pytest.mark.parametrize("inference", ["streaming", "window"])
-def test_a_history_is_not_cut_in_parts(inference, generator):
-    """A hybrid with a transformer, and one that recomputes a window of tokens."""
-    scene = load_scene("double_pendulum")
-    step = make_step(scene)
-    network = TransformerConfig(1, 16, 2, band=4)
-    model = HybridNeRD(scene, step, NO_PREDICTIONS, network)
-    dynamics = NeRDDynamics(model, inference, compile=True)
-    start, _ = scene.sample_initial(4 * models.MIN_WORK, generator)
-    state = TensorDict(start, [len(start["qpos"])]).select("qpos", "qvel")
-    dynamics.reset(state)
-    assert dynamics.is_single_threaded and dynamics.parts(len(state)) == 1
+NETWORKS = {
+    "mlp": MLPConfig(1, 16),
+    "gru": GRUConfig(1, 16),
+    "transformer": TransformerConfig(2, 16, 2, band=4),
+    "pairs": TransformerConfig(2, 16, 2, band=4, pairs=True),
+}
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("is_window", [False, True])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_history_in_parts_is_the_whole_history(name, is_window, generator):
+    """Through resets of some envs, and beyond the end of the ring."""
+    network = NETWORKS[name].build(5, 3)
+    network = WindowNetwork(network, 3, 5) if is_window else network
+    whole, cut = (network.empty_memory(ROWS) for _ in range(2))
+    for step in range(7):
+        token = torch.randn(ROWS, 5, generator=generator)
+        expected = network.step(token, whole)
+        parts = RowThreads(lambda x, memory: (network.step(x, memory),))
+        (found,) = parts(2, token, cut)
+        torch.testing.assert_close(found, expected, **CLOSE)
+        if step % 3 == 1:
+            is_reset = torch.rand(ROWS, generator=generator) < 0.5
+            whole.clear(is_reset)
+            cut.clear(is_reset)
+    for field in fields(whole):
+        same = (getattr(x, field.name) for x in (whole, cut))
+        torch.testing.assert_close(*same, **CLOSE)

@@ -122,8 +122,9 @@ class RowThreads(Generic[Result]):
 
     For functions in which rows are independent, and which release Python's lock for most
     of the time, as compiled code does that is wrapped in C++. Tensors among its positional
-    arguments, and in the tuple that it returns, have the rows as their first dimension; all
-    else goes to every part.
+    arguments, and in the tuple that it returns, have the rows as their first dimension.
+    What has a ``chunk`` and a ``join`` as a `History` does is cut as well; all else goes to
+    every part.
     """
 
     def __init__(self, function: Callable[..., Result]) -> None:
@@ -132,7 +133,7 @@ class RowThreads(Generic[Result]):
 
     def __call__(self, parts: int, *args: Any) -> Result:
         """What ``function`` gives, in so many parts; raises what it raises."""
-        split = [x.chunk(parts) if isinstance(x, Tensor) else [x] * parts for x in args]
+        split = [x.chunk(parts) if hasattr(x, "chunk") else [x] * parts for x in args]
         pool, mode = _pool(os.getpid(), parts), torch.is_inference_mode_enabled()
         futures, rows = [], next(len(x[0]) for x in split if isinstance(x[0], Tensor))
         calls = self._known[rows] = self._known.get(rows, 0) + 1
@@ -141,6 +142,9 @@ class RowThreads(Generic[Result]):
             if calls <= WARM:  # what compiles does so once
                 futures[-1].result()
         columns = zip(*(cast(tuple, x.result()) for x in futures), strict=True)
+        for whole, pieces in zip(args, split, strict=True):
+            if hasattr(whole, "join"):
+                whole.join(pieces)
         joined = (torch.cat(x) if isinstance(x[0], Tensor) else x[0] for x in columns)
         return cast(Result, tuple(joined))
 

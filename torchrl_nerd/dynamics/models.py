@@ -1,7 +1,6 @@
 """Dynamics that torch computes: learned, hybrid and analytic models as `Dynamics`."""
 
 import copy
-from dataclasses import fields
 from typing import Any, Literal, get_args
 
 import torch
@@ -83,9 +82,7 @@ class TorchDynamics(Dynamics):
 
     def parts(self, num_envs: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
-        # the rows of a history are not shared out
-        has_history = self._memory is not None and bool(fields(self._memory))
-        is_whole = self.differentiable or has_history or self._compiled.is_eager
+        is_whole = self.differentiable or self._compiled.is_eager
         if is_whole or not self.is_single_threaded:
             return 1
         return parts_of(num_envs, max(1, MIN_WORK // self.scene.layout.nv))

@@ -40,16 +40,20 @@ class History:
             old, new = (getattr(x, field.name) for x in (self, past))
             setattr(self, field.name, replaced(old, rows, new))
 
+    def chunk(self, parts: int) -> list[Any]:
+        """Histories of so many equal parts of the envs, views of this one."""
+        names = [field.name for field in fields(self)]
+        split = [getattr(self, name).chunk(parts) for name in names]
+        return [type(self)(*(each[i] for each in split)) for i in range(parts)]
+
+    def join(self, parts: list[Any]) -> None:
+        """Take from the parts what is no view of this one; by default nothing."""
+
     def __copy__(self) -> Any:
         """Apart from the original, which is written to in place."""
         return type(self)(
             *(getattr(self, field.name).clone() for field in fields(self))
         )
-
-
-def has_history(network: Any) -> bool:
-    """Whether a network has a history of an env."""
-    return bool(fields(network.empty_memory(1)))
 
 
 @dataclass

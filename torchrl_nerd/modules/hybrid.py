@@ -53,7 +53,6 @@ class HybridNeRD(NeRD):
             )
         self._num_defects = step.num_defects  # the base class asks for `token_size`
         super().__init__(scene, features, network, stats)
-        self.compile_single_threaded = True  # the step is
         self.analytic_step = step
         self.is_gated = scene.variation is None if is_gated is None else is_gated
         last = [m for m in self.network.head.modules() if isinstance(m, nn.Linear)][-1]

@@ -19,7 +19,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_nerd.configs import FeatureConfig
-from torchrl_nerd.modules.history import has_history
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.modules.training_range import OODScore, Sleep, TrainingRange
 from torchrl_nerd.scenes.scene import Scene
@@ -57,8 +56,7 @@ class NeRD(nn.Module):
 
     kind: ClassVar[str] = "learned"
     network: Any  # has `empty_memory(rows)` and `step(token, memory)`
-    # a compiled step is best in parts, a thread each; a history has no parts
-    compile_single_threaded: bool
+    compile_single_threaded: bool = True  # in parts, a thread each
 
     def __init__(
         self,
@@ -81,7 +79,6 @@ class NeRD(nn.Module):
         self.training_range = TrainingRange(scene, num_features, num_outputs)
         self.ood, self.sleep = OODScore(num_features), Sleep(scene)
         self.network = network.build(self.token_size, num_outputs)
-        self.compile_single_threaded = not has_history(self.network)
 
     @property
     def token_size(self) -> int:

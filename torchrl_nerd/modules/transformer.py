@@ -84,6 +84,20 @@ class KeyValueCache(History):
         self.age.copy_(torch.where(rows, past.age, self.age))
         self.last = replaced(self.last, rows, past.last)
 
+    def chunk(self, parts: int) -> list["KeyValueCache"]:
+        """See `History.chunk`: each has a slot of its own, which its step moves on."""
+        rows = [x.chunk(parts) for x in (*self.keys, *self.values, self.age, self.last)]
+        count, found = len(self.keys), []
+        for part in zip(*rows, strict=True):
+            *rings, age, last = part
+            keys, values = rings[:count], rings[count:]
+            found.append(KeyValueCache(keys, values, age, self.slot.clone(), last))
+        return found
+
+    def join(self, parts: list["KeyValueCache"]) -> None:
+        """See `History.join`: the slot is the same in all of them."""
+        self.slot.copy_(parts[0].slot)
+
     def __copy__(self) -> "KeyValueCache":
         """See `History.__copy__`."""
         keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
