@@ -25,11 +25,14 @@ class Bench(BenchConfig, MeasuringCommand):
     scene: Positional[SceneName]
 
     def inputs(self) -> Scene:
-        """The robot and its surroundings; bad input, a model's name too, is refused."""
+        """The robot and its surroundings."""
         self.check()
-        scene = load_scene(self.scene)
-        models(scene, self.models)
-        return scene
+        return load_scene(self.scene)
+
+    def plan(self) -> list[str]:
+        """Nothing to say; models that are none are refused, as `bench` does at once."""
+        models(self.inputs(), self.models)
+        return []
 
     def run(self) -> dict[str, Any]:
         """Print the tables and return their numbers."""

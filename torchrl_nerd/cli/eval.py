@@ -92,7 +92,7 @@ class Eval(MeasuringCommand):
     own parameters."""
 
     def inputs(self) -> tuple[Scene, dict[str, Sequence[float]]]:
-        """The robot and what of it varies; bad input, its model included, is refused."""
+        """The robot and what of it varies; bad input is refused."""
         if self.data is not None:
             for name in SIMULATED:
                 if getattr(self, name) != getattr(type(self), name):
@@ -104,9 +104,7 @@ class Eval(MeasuringCommand):
             raise ValueError("expected --data with --baselines, --split or --states")
         expect_at_least(2, num_trajectories=self.num_trajectories)
         expect_at_least(0, history=self.history)
-        scene, ranges = load_scene(self.scene), varied_ranges(self.scene, self.vary)
-        self.models(scene.vary(ranges) if ranges else scene, "cpu")
-        return scene, ranges
+        return load_scene(self.scene), varied_ranges(self.scene, self.vary)
 
     def models(self, scene: Scene, device: str) -> list[Candidate]:
         """Those asked for, with their variants; a name that is none is refused."""
@@ -127,9 +125,10 @@ class Eval(MeasuringCommand):
         return protocol, model, recording, recording.starts(self.states, chosen)
 
     def plan(self) -> list[str]:
-        """How many windows of a log would be measured."""
-        scene, _ = self.inputs()
+        """How many windows of a log would be measured; bad models are refused."""
+        scene, ranges = self.inputs()
         if self.data is None:
+            self.models(scene.vary(ranges) if ranges else scene, "cpu")
             return []
         *_, starts = self.recorded(self.data, scene)
         return [f"measure {len(starts)} windows of {self.states} states"]
@@ -144,6 +143,7 @@ class Eval(MeasuringCommand):
             cases = {k: source.vary(ranges) for k, source in protocol.cases.items()}
             scene = scene.vary(ranges)
             protocol = replace(protocol, cases=cases, published={})
+        learned = self.models(scene, self.device)  # refuses bad ones before any work
         solver_name = mujoco_name(self.ground_truth(scene).scene)
         solver = "the reference solver" if self.reference else "the scene's own solver"
         print(
@@ -161,7 +161,7 @@ class Eval(MeasuringCommand):
             candidates.append(
                 Candidate(f"{solver_name}, nominal", "simulator", self.nominal)
             )
-        candidates += self.models(scene, self.device)
+        candidates += learned
         parts = self.measure(protocol, candidates)
         rows = [row for part in parts for row in part]
         print(f"\n{summary_table(scene, rows)}\n")

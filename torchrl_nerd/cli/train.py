@@ -116,7 +116,7 @@ class Train(SceneOptions, DeviceCommand):
         return make_model(scene, self.config, symmetry=symmetry)
 
     def is_to_draw(self, folders: tuple[Path, ...]) -> bool:
-        """Whether data are drawn: a folder that was named holds some already."""
+        """Whether data are drawn, or finished; never to a folder that was named in vain."""
         is_named = self.data and not (folders[0] / CARD).exists()
         return not is_named and _is_missing(folders, preset_of(self.scene).data)
 

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from torchrl_nerd.geometry.manifold import JointLayout
 from torchrl_nerd.geometry.rotations import quat_normalize, random_tilt, rotate
 from torchrl_nerd.scenes.controllers import Row
+from torchrl_nerd.settings import expect_share
 
 GroundSampler = Callable[[Tensor, Generator], Tensor]
 """``(qpos (n, nq), generator) -> terrain (n, terrain.size)``."""
@@ -85,9 +86,8 @@ class Sampling:
 
     def __post_init__(self) -> None:
         least, times = self.min_torque_scale, self.correlation_time
-        for name in ("zero_torque_fraction", "low_torque_fraction"):
-            if not 0.0 <= (value := getattr(self, name)) <= 1.0:
-                raise ValueError(f"expected {name} from 0 to 1, got {value}")
+        fractions = "zero_torque_fraction", "low_torque_fraction"
+        expect_share(**{name: getattr(self, name) for name in fractions})
         if least is not None and not 0.0 < least <= 1.0:
             raise ValueError(
                 f"expected a min_torque_scale above 0 and up to 1, got {least}"

@@ -67,9 +67,7 @@ class Terrain:
         found = tuple(_read_surface(model, data, geom) for geom in geoms)
         owners = model.geom_bodyid[geoms]
         planes = owners[[surface.mocap >= 0 for surface in found]]
-        carried = np.any(
-            ancestors(model)[:, planes], 1
-        )  # (bodies,): moved with a plane
+        carried = np.any(ancestors(model)[:, planes], 1)  # (bodies,): with a plane
         moves = model.body_dofnum[model.body_weldid] > 0
         if carried[owners].sum() > len({*planes}) or np.any(carried & moves):
             raise ValueError(
