@@ -66,12 +66,11 @@ class KeyValueCache(History):
 
     def clear(self, rows: Tensor) -> None:
         """See `History.clear`."""
+        # the rings stay as they are: nobody sees what is older than the age, and emptying
+        # them at every reset of some env took longer than a step of all
         self.age.masked_fill_(rows, 0)
         self.slot.masked_fill_(rows.all(), 0)  # as in a new one
         self.last = replaced(self.last, rows, 0.0)
-        # whatever stood there, a masked NaN would still spread
-        for ring in (self.keys, self.values):
-            ring[:] = [replaced(layer, rows, 0.0) for layer in ring]
 
     def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
         """See `History.restore`: its rings turned to where the oldest token lies now."""
@@ -107,11 +106,14 @@ class KeyValueCache(History):
     def write(self, layer: int, key: Tensor, value: Tensor) -> Tensor:
         """Store one token ``(rows, heads, head width)``; with gradients, out of place.
 
+        What is not finite is stored as zero: times a weight of zero it would be NaN, also
+        in the env's next episode. The token's own output is not finite either way.
         Returns how long ago the token of every slot was, ``(band,)``.
         """
         size, device = self.keys[layer].shape[2], key.device
         slots = torch.arange(size, device=device)
-        for past, new in ((self.keys, key), (self.values, value)):
+        for past, x in ((self.keys, key), (self.values, value)):
+            new = torch.where(x.isfinite(), x, 0.0)
             if torch.is_grad_enabled():
                 later = (slots[1:] + self.slot) % size
                 kept = past[layer].index_select(2, later)
@@ -181,8 +183,8 @@ class Attention(nn.Module):
         else:
             # four times as fast as keys @ query on CPUs
             scores = (query[:, :, None] @ keys.mT)[:, :, 0]
-        bias = torch.where(is_seen[:, None], self.offset_bias[:, offset], MASKED)
-        weights = softmax(scores * self.scale + bias)
+        scores = scores * self.scale + self.offset_bias[:, offset]
+        weights = softmax(torch.where(is_seen[:, None], scores, MASKED))
         if is_narrow:
             mixed = (weights[..., None] * values).sum(-2)
         else:
