@@ -190,21 +190,30 @@ def beyond(trial: dict[str, Any]) -> Iterator[list[str]]:
 
 
 def env_table(folder: Path = RESULTS) -> str:
-    """One row per task: microseconds of an action of one env, seconds to compile."""
-    record = one("compiled_env", folder)
+    """One row per task and dynamics: control steps per second, seconds to compile."""
+    record = one("env_rate", folder)
     if record is None:
         return ""
-    names = {
-        "eager_us": "learned, eager (us)",
-        "compiled_us": "learned, compiled (us)",
-        "mujoco_us": "MuJoCo (us)",
-        "cold_s": "first compiled step (s)",
-        "warm_s": "with torch's cache (s)",
-    }
     tasks = record["results"]["tasks"]
-    table = [["task", *names.values()]]
-    for task, row in tasks.items():
-        table.append([task, *(f"{row[key]:.0f}" for key in names)])
+    batches = sorted(
+        {x["num_envs"] for found in tasks.values() for x in found["rates"]}
+    )
+    table = [["task", "dynamics", *(f"{batch} envs" for batch in batches)]]
+    table[0] += ["first compiled step (s)", "with torch's cache (s)"]
+    for task, found in tasks.items():
+        first = {row["dynamics"]: row for row in found["first_steps"]}
+        ways = dict.fromkeys((x["dynamics"], x["compiled"]) for x in found["rates"])
+        for name, compiled in ways:
+            speeds = [
+                rate(x["steps_per_s"])
+                for x in found["rates"]
+                if (x["dynamics"], x["compiled"]) == (name, compiled)
+            ]
+            times = ["", ""]
+            if compiled:
+                times = [f"{first[name][key]:.0f}" for key in ("cold_s", "warm_s")]
+            way = f"{name}, compiled" if compiled else name
+            table.append([task, way, *speeds, *times])
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
@@ -458,7 +467,7 @@ def policy_curves_table(folder: Path = RESULTS) -> str:
 def time_to_policy_table(folder: Path = RESULTS) -> str:
     """What PPO took in each dynamics until its policy had earned enough in MuJoCo."""
     table = [["task", "learned in", "return wanted", "minutes to it", "minutes in all"]]
-    table[0].append("last return")
+    table[0] += ["last return", "promised"]
     records = read("time_to_policy", folder).values()
     for record in records:
         found = record["results"]
@@ -466,8 +475,10 @@ def time_to_policy_table(folder: Path = RESULTS) -> str:
             taken = found["seconds"][name]
             to_it = "not reached" if taken is None else f"{taken / 60:.1f}"
             about = found["configuration"]["task"], name, f"{found['wanted']:,.0f}"
-            last = f"{curve[-1]['seconds'] / 60:.1f}", f"{curve[-1]['return']:,.0f}"
-            table.append([*about, to_it, *last])
+            last = curve[-1]
+            returns = (last.get(key) for key in ("return", "promised"))
+            shown = ("not measured" if x is None else f"{x:,.0f}" for x in returns)
+            table.append([*about, to_it, f"{last['seconds'] / 60:.1f}", *shown])
     return with_sources(table, records)
 
 
@@ -624,7 +635,7 @@ TABLES = {
     "eval": eval_tables,
     "bench": bench_tables,
     "stability": stability_tables,
-    "compiled_env": env_table,
+    "env_rate": env_table,
     "kinematics_libraries": kinematics_table,
     "transfer": transfer_table,
     "state_dtype": state_dtype_table,
@@ -645,7 +656,7 @@ TABLES = {
     "symmetric_layers": symmetric_layers_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
-COMMANDS = {"compiled_env": MEASURED, "kinematics_libraries": MEASURED}
+COMMANDS = {"env_rate": MEASURED, "kinematics_libraries": MEASURED}
 COMMANDS |= {"state_dtype": MEASURED, "gpu_rates": "make gpu", "gpu_errors": "make gpu"}
 COMMANDS |= {"hidden_parameters": "python -m experiments.hidden_parameters"}
 ROBOTS = "python experiments/robots_that_load.py --json results/robots_that_load.json"

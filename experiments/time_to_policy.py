@@ -3,8 +3,9 @@
     python experiments/time_to_policy.py ant/run --json results/time_to_policy_ant_run.json
 
 The same PPO, with the same seed, learns in each dynamics alone. On the way its policy plays
-whole episodes in MuJoCo and is saved. Time is the processor's, of one thread: compilation
-counts, MuJoCo's episodes of the curve do not, and nor does what a model took to learn.
+whole episodes in MuJoCo and is saved; from the same starts it plays in the dynamics that it
+learned in, which promised so much. Time is the processor's, of one thread: compilation
+counts, the curve's episodes do not, and nor does what a model took to learn.
 Dynamics are those of `make_env`, and `mujoco-N` is MuJoCo with N substeps.
 """
 
@@ -50,7 +51,7 @@ class Config:
     horizon: int | None = None
     minibatch: int | None = None
     lr: float | None = None
-    episodes: int = 128  # of a point, in MuJoCo
+    episodes: int = 128  # of a point
     seed: int = 0
     out: Path = Path("runs/time_to_policy")
     json: Path | None = None
@@ -79,8 +80,10 @@ def json_of(cfg: Config) -> dict[str, Any]:
     return {name: getattr(cfg, name) for name in names} | {"ppo": settings}
 
 
-def env_of(name: str, task: str, num_envs: int, seed: int) -> SceneEnv:
-    """Of a dynamics; steps of models are compiled."""
+def env_of(
+    name: str, task: str, num_envs: int, seed: int, compile: bool = False
+) -> SceneEnv:
+    """Of a dynamics; ``compile``: where it is a model."""
     if name.startswith(FEW):
         own = make_task(task)
         count = name.removeprefix(FEW)
@@ -88,7 +91,7 @@ def env_of(name: str, task: str, num_envs: int, seed: int) -> SceneEnv:
             raise ValueError(f"expected {FEW} and a number of substeps, got '{name}'")
         few = own.scene.with_substeps(int(count))
         return make_env(own.with_scene(few), "mujoco", num_envs, seed)
-    return make_env(task, name, num_envs, seed, compile=name not in ENGINES)
+    return make_env(task, name, num_envs, seed, compile=compile and name not in ENGINES)
 
 
 def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
@@ -102,19 +105,25 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
     use_one_thread()
     torch.manual_seed(cfg.seed)
     how, clock, curve = cfg.ppo, Clock(), []
-    env = env_of(name, cfg.task, how.num_envs, cfg.seed)
+    env = env_of(name, cfg.task, how.num_envs, cfg.seed, compile=True)
     env = stack_frames(env, how.frame_stack)
     learner = Learner(how, env)
     for point in range(cfg.points + 1):
         if point:
             learner.learn(env, 1.0 / cfg.points)
         clock.note("learning")
-        judge = make_env(cfg.task, "mujoco", cfg.episodes, cfg.seed + 100)
-        reached = float(policy_returns(judge, learner.actor).mean())
+        reached, promised = (
+            float(policy_returns(judge, learner.actor).mean())
+            for judge in (
+                env_of(x, cfg.task, cfg.episodes, cfg.seed + 100)
+                for x in ("mujoco", name)
+            )
+        )
         about = {"learned_in": name, "task": cfg.task, "return": reached}
         save_policy(learner.policy, cfg.folder / name / f"{point}", about)
         frames = learner.done * learner.batch
-        curve.append({"frames": frames, "seconds": clock.spent(), "return": reached})
+        curve.append({"frames": frames, "seconds": clock.spent()})
+        curve[-1] |= {"return": reached, "promised": promised}
         print(f"{name}: {curve[-1]}", flush=True)
         clock.note("watching")
     write_json(kept, {"configuration": same, "curve": curve})

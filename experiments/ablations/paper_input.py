@@ -17,6 +17,7 @@ from torchrl_nerd.scenes.contact_points import (
     MIN_MARGIN,
     shape_points,
 )
+from torchrl_nerd.scenes.support import unit_gravity
 
 PUBLISHED = {
     "cartpole": 6,
@@ -74,7 +75,7 @@ class PaperInput(nn.Module):
         self.register_buffer("margins", margins, persistent=False)
         self.count = len(bodies) if scene.terrain is not None else 0
         self.frame = BaseFrame(scene)
-        down = torch.tensor(scene.gravity_direction, dtype=torch.float64)
+        down = torch.from_numpy(unit_gravity(scene.model))
         self.register_buffer("down", down, persistent=False)
         if self.count:
             self.kinematics = PointKinematics(model, scene.base, bodies, positions)

@@ -97,6 +97,12 @@ def test_both_scripts_with_tables_and_a_picture(tmp_path):
         assert all(math.isfinite(p["return"]) for p in points)
         times = [p["seconds"] for p in points]
         assert times == sorted(times)
+    both = {
+        name: [(p["return"], p["promised"]) for p in points]
+        for name, points in found["curves"].items()
+    }
+    assert all(a == b for a, b in both["mujoco"])  # the same starts
+    assert all(a != b for a, b in both["cartpole-mlp"])
     began = time.monotonic()
     again = {name: time_to_policy.learn_in(name, how) for name in dynamics}
     assert again == found["curves"] and time.monotonic() - began < 1.0

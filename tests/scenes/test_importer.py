@@ -464,6 +464,12 @@ def test_a_control_step_is_a_length_of_time(control_step, tmp_path):
         ({"zero_torque_fraction": 1.1}, "zero_torque_fraction from 0 to 1, got 1.1"),
         ({"low_torque_fraction": -0.1}, "low_torque_fraction from 0 to 1, got -0.1"),
         ({"low_torque_fraction": float("nan")}, "from 0 to 1, got nan"),
+        ({"qpos_low": (0.0, 0.0, 0.0)}, "qpos_low of length 1, got 3"),
+        ({"qvel_high": ()}, "qvel_high of length 1, got 0"),
+        ({"torque": (1.0, 1.0)}, "torque of length 0, got 2"),
+        ({"qpos_low": (9.0,)}, "qpos_low up to qpos_high, got 9.0 and"),
+        ({"qvel_high": (float("nan"),)}, "qvel_low up to qvel_high, got .* and nan"),
+        ({"max_contact_points": 0}, "max_contact_points.* at least 1, got 0"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(ranges, why, tmp_path):

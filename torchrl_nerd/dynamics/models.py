@@ -54,7 +54,7 @@ SINGLE_THREADED = {
     },
 }
 # envs times dofs of a part: handing over less takes longer than it saves
-MIN_WORK = 2048
+MIN_WORK = 1536
 
 
 class TorchDynamics(Dynamics):

@@ -101,6 +101,24 @@ class Sampling:
                 "follow the state"
             )
 
+    def expect_sizes(self, layout: JointLayout, num_actuated: int) -> None:
+        """Raise a ValueError where a range is not one number for each entry, in order."""
+        free_q, free_v = (7, 6) if self.base is not None else (0, 0)
+        sizes = {"torque": num_actuated}
+        if self.starts is None:
+            sizes |= dict.fromkeys(("qpos_low", "qpos_high"), layout.nq - free_q)
+            sizes |= dict.fromkeys(("qvel_low", "qvel_high"), layout.nv - free_v)
+        for name, size in sizes.items():
+            if (count := len(getattr(self, name))) != size:
+                raise ValueError(f"expected {name} of length {size}, got {count}")
+        for name in ("qpos", "qvel"):
+            ends = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
+            for low, high in zip(*ends, strict=True):
+                if not low <= high:
+                    raise ValueError(
+                        f"expected {name}_low up to {name}_high, got {low} and {high}"
+                    )
+
     @property
     def commands(self) -> tuple[Tensor, Tensor]:
         """Middle and half width ``(m,)`` of what is drawn: torques, or servos' controls."""

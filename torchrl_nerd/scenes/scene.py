@@ -27,7 +27,7 @@ from torchrl_nerd.scenes.fingerprint import fingerprint, robot_fingerprint
 from torchrl_nerd.scenes.penetration import deepest_contacts
 from torchrl_nerd.scenes.ranges import default_sampling
 from torchrl_nerd.scenes.sampling import Sampling, draw_initial
-from torchrl_nerd.scenes.support import check_supported, unit_gravity
+from torchrl_nerd.scenes.support import check_supported
 from torchrl_nerd.scenes.symmetries import Symmetries, find_symmetries
 from torchrl_nerd.scenes.terrain import Terrain, TerrainDistance
 from torchrl_nerd.scenes.variation import Ranges, Variation
@@ -42,7 +42,8 @@ class Scene:
     """Everything that all dynamics share about a robot and its surroundings.
 
     Raises:
-        ValueError: the model has something no NeRD can be built for (named).
+        ValueError: the model has something no NeRD can be built for (named), a range of
+            the ``sampling`` has another length, or its ends are in the wrong order.
     """
 
     name: str  # in the registry
@@ -55,8 +56,10 @@ class Scene:
     variation: Variation | None = None  # what differs from robot to robot, see `vary`
 
     def __post_init__(self) -> None:
-        expect_count(1, substeps=self.substeps)
+        most = self.max_contact_points
+        expect_count(1, substeps=self.substeps, max_contact_points=most)
         check_supported(self.name, self.model)
+        self.sampling.expect_sizes(self.layout, len(self.actuated))
 
     @classmethod
     def from_mjcf(
@@ -147,14 +150,14 @@ class Scene:
 
     def vary(self, ranges: Ranges) -> "Scene":
         """The same with such as ``{"mass:pole": (0.3, 3.0)}``, see `Variation`."""
-        varied = Variation(self.model, self.actuated, ranges) if ranges else None
-        return replace(self, variation=varied)
+        given = self.model, self.actuated, ranges
+        return replace(self, variation=Variation(*given) if ranges else None)
 
     @property
     def integrator(self) -> str:
         """Of its MuJoCo, as in MJCF: ``Euler``, ``RK4``, ``implicitfast``, ..."""
-        kind = mujoco.mjtIntegrator(self.model.opt.integrator)
-        name = str(kind.name).removeprefix("mjINT_")
+        kind = str(mujoco.mjtIntegrator(self.model.opt.integrator).name)
+        name = kind.removeprefix("mjINT_")
         return {"EULER": "Euler", "RK4": "RK4"}.get(name, name.lower())
 
     @cached_property
@@ -179,11 +182,6 @@ class Scene:
     def fixed_base_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """World position ``(3,)`` and rotation ``(3, 3)`` of a fixed base."""
         return root_pose(self.model, self.base.body)
-
-    @cached_property
-    def gravity_direction(self) -> tuple[float, float, float]:
-        """Unit vector of gravity in the world; where there is none, against z."""
-        return tuple(unit_gravity(self.model).tolist())  # pyright: ignore
 
     @cached_property
     def actuated(self) -> list[int]:

@@ -32,6 +32,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.support import unit_gravity
 from torchrl_nerd.scenes.terrain import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
 from torchrl_nerd.transforms.predicted_contact import (
@@ -79,7 +80,7 @@ class ContactFeatures(FeatureTransform):
                 in_keys.append(TERRAIN)
             if features.predicted_force:
                 sizes[CONTACT_FORCE] = scene.layout.nv
-            plane, down = terrain.fixed_plane, scene.gravity_direction
+            plane, down = terrain.fixed_plane, unit_gravity(scene.model)
             is_level = plane is not None and abs(float(plane[:3] @ down)) > 1.0 - 1e-12
             if plane is None or (scene.base.is_floating and not is_level):
                 sizes[CONTACT_NORMAL] = 3 * count

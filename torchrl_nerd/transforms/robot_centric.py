@@ -26,6 +26,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes.commands import num_ctrl
 from torchrl_nerd.scenes.penalty_law import limit_forces, limit_stiffness
 from torchrl_nerd.scenes.scene import Scene
+from torchrl_nerd.scenes.support import unit_gravity
 from torchrl_nerd.transforms.base import FeatureTransform
 
 LIMIT_STEPS = 1.5  # control steps at top speed from which on a limit is a feature
@@ -80,7 +81,7 @@ class RobotCentric(FeatureTransform):
         self.base, self.trees = scene.base, trees
         self.seen, self.free = seen, [i for i, moves in enumerate(free) if moves]
         self.joints = joints
-        self.down = scene.gravity_direction
+        self.down = tuple(unit_gravity(scene.model).tolist())
 
     def state_features(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """``robot_state`` in the dtype of the inputs, ``(*batch, D)``."""
