@@ -128,6 +128,14 @@ def test_learned_models_step_in_parts():
         assert dynamics.parts(512) == 1
 
 
+def test_what_is_kept_of_the_past_is_work():
+    """Of two networks of one robot, that with a band of 64 and that with one of 10."""
+    torch.set_num_threads(2)
+    names = "cartpole-adaptive", "cartpole"
+    parts = [NeRDDynamics(from_pretrained(name)).parts(512) for name in names]
+    assert parts == [2, 1]
+
+
 def test_what_must_stay_whole_does(generator, monkeypatch):
     """Gradients, and one thread."""
     monkeypatch.setattr(models, "MIN_WORK", 2)

@@ -12,7 +12,7 @@ from torchrl_nerd.compiled import Compiled, RowThreads, parts_of, unaffected
 from torchrl_nerd.dynamics.base import Dynamics, check_step
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
-from torchrl_nerd.modules.history import WindowNetwork
+from torchrl_nerd.modules.history import History, WindowNetwork
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes.commands import drive_of
 from torchrl_nerd.scenes.variation import ranges_of
@@ -53,8 +53,9 @@ SINGLE_THREADED = {
         "guard_filter_fn": _keep_tensor_guards,
     },
 }
-# envs times dofs of a part: handing over less takes longer than it saves
-MIN_WORK = 1536
+# Envs of a part, times dofs and what is kept of an env's past: handing over less takes
+# longer than it saves.
+MIN_WORK, NUMBERS_PER_DOF = 1536, 4096
 
 
 class TorchDynamics(Dynamics):
@@ -79,13 +80,14 @@ class TorchDynamics(Dynamics):
         self.state_dtype = next((x.dtype for x in numbers), torch.float64)
         self._compiled = Compiled(self._predict, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
+        self._row_work = self.scene.layout.nv
 
     def parts(self, num_envs: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
         is_whole = self.differentiable or self._compiled.is_eager
         if is_whole or not self.is_single_threaded:
             return 1
-        return parts_of(num_envs, max(1, MIN_WORK // self.scene.layout.nv))
+        return parts_of(num_envs, max(1, MIN_WORK // self._row_work))
 
     def history(self) -> Any:
         """See `Dynamics.history`."""
@@ -202,6 +204,9 @@ class NeRDDynamics(TorchDynamics):
             self.network = WindowNetwork(model.network, window, model.token_size)
         self._num_envs = 0  # in the memory
         super().__init__(model, compile, differentiable)
+        if isinstance(memory := self.network.empty_memory(1), History):
+            kept = sum(x.numel() for x in memory.tensors())
+            self._row_work += kept // NUMBERS_PER_DOF
 
     @unaffected
     def reset(self, state: TensorDictBase, is_reset: Tensor | None = None) -> None:

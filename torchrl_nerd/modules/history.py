@@ -40,10 +40,13 @@ class History:
             old, new = (getattr(x, field.name) for x in (self, past))
             setattr(self, field.name, replaced(old, rows, new))
 
+    def tensors(self) -> list[Tensor]:
+        """All that is kept of every env, ``(rows, ...)`` each."""
+        return [getattr(self, field.name) for field in fields(self)]
+
     def chunk(self, parts: int) -> list[Any]:
         """Histories of so many equal parts of the envs, views of this one."""
-        names = [field.name for field in fields(self)]
-        split = [getattr(self, name).chunk(parts) for name in names]
+        split = [x.chunk(parts) for x in self.tensors()]
         return [type(self)(*(each[i] for each in split)) for i in range(parts)]
 
     def join(self, parts: list[Any]) -> None:
@@ -51,9 +54,7 @@ class History:
 
     def __copy__(self) -> Any:
         """Apart from the original, which is written to in place."""
-        return type(self)(
-            *(getattr(self, field.name).clone() for field in fields(self))
-        )
+        return type(self)(*(x.clone() for x in self.tensors()))
 
 
 @dataclass

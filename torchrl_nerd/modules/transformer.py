@@ -83,9 +83,13 @@ class KeyValueCache(History):
         self.age.copy_(torch.where(rows, past.age, self.age))
         self.last = replaced(self.last, rows, past.last)
 
+    def tensors(self) -> list[Tensor]:
+        """See `History.tensors`."""
+        return [*self.keys, *self.values, self.age, self.last]
+
     def chunk(self, parts: int) -> list["KeyValueCache"]:
         """See `History.chunk`: each has a slot of its own, which its step moves on."""
-        rows = [x.chunk(parts) for x in (*self.keys, *self.values, self.age, self.last)]
+        rows = [x.chunk(parts) for x in self.tensors()]
         count, found = len(self.keys), []
         for part in zip(*rows, strict=True):
             *rings, age, last = part
