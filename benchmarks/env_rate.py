@@ -3,9 +3,8 @@
     python benchmarks/env_rate.py --tasks ant/run franka/reach --num-envs 512 2048
 
 Control steps per second on all cores, with TorchRL's bookkeeping, rewards and resets; the
-errors are those of `nerd bench`. All candidates of a batch take turns. Actions are random
-and held, from the starts of episodes on, so robots that fall spend some steps in the air.
-Seconds of the first compiled step, reset included, are those of new processes: a cold one,
+errors are those of `nerd bench`. All candidates of a batch take turns. Actions are drawn
+anew for every step, as those of a policy that has not learned are. Seconds of the first compiled step, reset included, are those of new processes: a cold one,
 and a warm one that finds its code in torch's cache.
 """
 
@@ -15,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -39,7 +39,7 @@ began = time.perf_counter()
 env.rollout(3)
 print(time.perf_counter() - began)
 """
-MUJOCO = "mujoco"
+MUJOCO, ACTIONS = "mujoco", 64
 
 
 @dataclass
@@ -56,23 +56,23 @@ class Options:
 
 
 class Stepper:
-    """Steps an env on and on, by an action that is held.
+    """Steps an env on and on, by random actions that come round again.
 
     Args:
         env: what to step.
-        seed: of the action.
+        seed: of the actions.
     """
 
     def __init__(self, env: SceneEnv, seed: int) -> None:
         self.env, self.now = env, env.reset()
         torch.manual_seed(seed)
-        self.action = env.action_spec.rand()
+        self.actions = cycle([env.action_spec.rand() for _ in range(ACTIONS)])
 
     @torch.no_grad()
     def __call__(self, steps: int) -> None:
         """So many actions of every env, resets where episodes end."""
         for _ in range(steps):
-            self.now.set("action", self.action)
+            self.now.set("action", next(self.actions))
             _, self.now = self.env.step_and_maybe_reset(self.now)
 
 

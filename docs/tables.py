@@ -116,8 +116,8 @@ def bench_tables(folder: Path = RESULTS) -> str:
 
 
 def gallery_table(folder: Path = RESULTS) -> str:
-    """Shipped models: the first error of their longest test, and their rate."""
-    table = [["model", "kind", "quantity, steps", "mean error", "steps/s"]]
+    """Shipped models: the first error of their longest test, and their rates."""
+    table = [["model", "kind", "quantity, steps", "mean error", "steps/s", "compiled"]]
     kinds = "learned", "hybrid", "analytic"
     records, rated = read("eval", folder), read("bench", folder)
     for robot, record in records.items():
@@ -131,10 +131,10 @@ def gallery_table(folder: Path = RESULTS) -> str:
             if entry["kind"] not in kinds or entry["steps"] != steps:
                 continue
             name = entry["name"].replace("analytic", f"analytic, {robot}")
-            speed = rates.get(entry["name"])
             mean = f"{number(entry['mean'])} {entry['unit']}"
             line = [name, entry["kind"], f"{first[1]}, {steps}", mean]
-            table.append([*line, "-" if speed is None else f"{speed:,.0f}"])
+            both = (rates.get(entry["name"] + way) for way in ("", ", compiled"))
+            table.append([*line, *("-" if x is None else f"{x:,.0f}" for x in both)])
     return rows(table) if records else ""
 
 
