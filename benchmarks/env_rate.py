@@ -4,8 +4,9 @@
 
 Control steps per second on all cores, with TorchRL's bookkeeping, rewards and resets; the
 errors are those of `nerd bench`. All candidates of a batch take turns. Actions are drawn
-anew for every step, as those of a policy that has not learned are. Seconds of the first compiled step, reset included, are those of new processes: a cold one,
-and a warm one that finds its code in torch's cache.
+anew for every step, as those of a policy that has not learned are. Seconds of the first
+compiled step, reset included, are those of new processes: a cold one, and a warm one that
+finds its code in torch's cache.
 """
 
 import os
