@@ -3,19 +3,20 @@
     python benchmarks/env_rate.py --tasks ant/run franka/reach --num-envs 512 2048
 
 Control steps per second on all cores, with TorchRL's bookkeeping, rewards and resets; the
-errors are those of `nerd bench`. All candidates of a batch take turns. Actions are drawn
-anew for every step, as those of a policy that has not learned are. Seconds of the first
-compiled step, reset included, are those of new processes: a cold one, and a warm one that
-finds its code in torch's cache.
+errors are those of `nerd bench`. Actions are drawn anew for every step, as those of a
+policy that has not learned are. Each candidate is alone in a process of its own, as it is
+where somebody uses it. They take turns. The first round begins with an empty cache of
+torch, the others with a full one.
 """
 
 import os
-import subprocess
-import sys
 import tempfile
+import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import cycle
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -31,16 +32,7 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.robots import TASKS, make_task
 from torchrl_nerd.settings import expect_at_least
 
-FIRST_STEP = """
-import sys, time
-from torchrl_nerd import make_env
-task, dynamics, num_envs = sys.argv[1:]
-env = make_env(task, dynamics, num_envs=int(num_envs), seed=0, compile=True)
-began = time.perf_counter()
-env.rollout(3)
-print(time.perf_counter() - began)
-"""
-MUJOCO, ACTIONS = "mujoco", 64
+MUJOCO, ACTIONS, SAMPLES = "mujoco", 64, 7
 
 
 @dataclass
@@ -50,10 +42,21 @@ class Options:
     tasks: tuple[str, ...] = ()
     """The first of every robot that has a shipped model where none is given."""
     num_envs: tuple[int, ...] = (512, 2048)
-    rounds: int = 7
+    rounds: int = 3
+    """Processes of each candidate, at least two: the first has nothing compiled."""
     seed: int = 0
     json: Path | None = None
     """Write the results to this file."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What is timed in a process of its own."""
+
+    task: str
+    dynamics: str
+    compiled: bool
+    num_envs: int
 
 
 class Stepper:
@@ -77,69 +80,66 @@ class Stepper:
             _, self.now = self.env.step_and_maybe_reset(self.now)
 
 
+def timed(one: Candidate, seed: int) -> tuple[float, float]:
+    """Seconds of the first steps, which compile, and control steps per second after."""
+    env = make_env(one.task, one.dynamics, one.num_envs, seed, compile=one.compiled)
+    began = time.perf_counter()
+    env.rollout(3, break_when_any_done=False)
+    first = time.perf_counter() - began
+    run = Stepper(env, seed)
+    run(ACTIONS)  # resets of a few envs compile as well
+    runner = Runner(run)
+    rate = median(runner.steps_per_s() for _ in range(SAMPLES))
+    return first, one.num_envs * rate
+
+
+def candidates(task: str, batches: tuple[int, ...]) -> Iterator[Candidate]:
+    """The network that ``"nerd"`` is there, the MLP of that robot, and MuJoCo."""
+    for num_envs in batches:
+        for name in learned(task):
+            yield Candidate(task, name, False, num_envs)
+            yield Candidate(task, name, True, num_envs)
+        yield Candidate(task, MUJOCO, False, num_envs)
+
+
 def learned(task: str) -> list[str]:
-    """The network that ``"nerd"`` is there, and the MLP of that robot."""
+    """Shipped models of a task's robot that are timed."""
     name = model_name("nerd", make_task(task).scene)
     return [x for x in (name, f"{name}-mlp") if x in shipped_models()]
 
 
-def rates(task: str, num_envs: int, options: Options) -> Iterator[dict[str, Any]]:
-    """Control steps per second of every candidate with one batch: medians of rounds."""
-    ways = [(x, compiled) for x in learned(task) for compiled in (False, True)]
-    ways.append((MUJOCO, False))
-    runners = []
-    for dynamics, compiled in ways:
-        env = make_env(task, dynamics, num_envs, options.seed, compile=compiled)
-        run = Stepper(env, options.seed)
-        run(8)  # compiles: a step, a reset, and both once more where sizes vary
-        runners.append(Runner(run))
-    samples = [[x.steps_per_s() for x in runners] for _ in range(options.rounds)]
-    for (name, compiled), *found in zip(ways, *samples, strict=True):
-        rate = num_envs * median(found)
-        asked = {"dynamics": name, "compiled": compiled, "num_envs": num_envs}
-        yield asked | {"steps_per_s": rate}
-
-
-def first_steps(task: str, dynamics: str, num_envs: int, cache: str) -> dict[str, Any]:
-    """Seconds of the first compiled step: of all envs, with a cache empty and filled."""
-    found: dict[str, Any] = {"dynamics": dynamics}
-    for name in ("cold_s", "warm_s"):
-        done = subprocess.run(
-            [sys.executable, "-c", FIRST_STEP, task, dynamics, str(num_envs)],
-            env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": cache},
-            stdout=subprocess.PIPE,
-            check=True,
-        )
-        found[name] = float(done.stdout)
-    return found
-
-
-def measure(task: str, options: Options) -> dict[str, Any]:
-    """All of one task, printed; what was compiled for a first step serves the others."""
-    first, table = [], []
-    for dynamics in learned(task):
-        with tempfile.TemporaryDirectory() as cache:
-            row = first_steps(task, dynamics, options.num_envs[0], cache)
-        first.append(row)
-        times = f"cold {row['cold_s']:.1f} s, with torch's cache {row['warm_s']:.1f} s"
-        print(f"{task:<24}{dynamics:<22}first compiled step: {times}", flush=True)
-    for num_envs in options.num_envs:
-        for row in rates(task, num_envs, options):
-            table.append(row)
-            way = "compiled" if row["compiled"] else ""
-            rate = f"{num_envs:>6} envs{row['steps_per_s']:>10,.0f} steps/s"
-            print(f"{task:<24}{row['dynamics']:<22}{way:<9}{rate}", flush=True)
-    return {"first_steps": first, "rates": table}
+def measure(task: str, options: Options) -> list[dict[str, Any]]:
+    """A row of each candidate, printed; rates are medians of the rounds."""
+    ways = list(candidates(task, options.num_envs))
+    spawn = get_context("spawn")
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
+        with ProcessPoolExecutor(1, spawn, max_tasks_per_child=1) as alone:
+            rounds = [
+                [alone.submit(timed, way, options.seed).result() for way in ways]
+                for _ in range(options.rounds)
+            ]
+    table = []
+    for way, *found in zip(ways, *rounds, strict=True):
+        (cold, _), *warm = found
+        row: dict[str, Any] = vars(way) | {"steps_per_s": median(x for _, x in found)}
+        row |= {"cold_s": cold, "warm_s": median(x for x, _ in warm)}
+        table.append(row)
+        name = f"{way.dynamics}, compiled" if way.compiled else way.dynamics
+        rate = f"{way.num_envs:>6} envs{row['steps_per_s']:>10,.0f} steps/s"
+        times = f"first {row['cold_s']:6.1f} s, cached {row['warm_s']:5.1f} s"
+        print(f"{task:<22}{name:<32}{rate}  {times}", flush=True)
+    return table
 
 
 def main(options: Options) -> None:
     """Print the rows of every task.
 
     Raises:
-        ValueError: no rounds, or a batch of no envs.
+        ValueError: fewer than two rounds, or a batch of no envs.
     """
-    batches = {f"num_envs {x}": x for x in options.num_envs}
-    expect_at_least(1, rounds=options.rounds, **batches)
+    expect_at_least(1, **{f"num_envs {x}": x for x in options.num_envs})
+    expect_at_least(2, rounds=options.rounds)
     tasks = options.tasks
     if not tasks:
         of_robot = {make_task(x).scene.name: x for x in reversed(TASKS) if learned(x)}

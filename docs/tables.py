@@ -195,25 +195,18 @@ def env_table(folder: Path = RESULTS) -> str:
     if record is None:
         return ""
     tasks = record["results"]["tasks"]
-    batches = sorted(
-        {x["num_envs"] for found in tasks.values() for x in found["rates"]}
-    )
+    batches = sorted({row["num_envs"] for found in tasks.values() for row in found})
     table = [["task", "dynamics", *(f"{batch} envs" for batch in batches)]]
     table[0] += ["first compiled step (s)", "with torch's cache (s)"]
     for task, found in tasks.items():
-        first = {row["dynamics"]: row for row in found["first_steps"]}
-        ways = dict.fromkeys((x["dynamics"], x["compiled"]) for x in found["rates"])
-        for name, compiled in ways:
-            speeds = [
-                rate(x["steps_per_s"])
-                for x in found["rates"]
-                if (x["dynamics"], x["compiled"]) == (name, compiled)
-            ]
-            times = ["", ""]
-            if compiled:
-                times = [f"{first[name][key]:.0f}" for key in ("cold_s", "warm_s")]
-            way = f"{name}, compiled" if compiled else name
-            table.append([task, way, *speeds, *times])
+        for way in dict.fromkeys((row["dynamics"], row["compiled"]) for row in found):
+            same = [x for x in found if (x["dynamics"], x["compiled"]) == way]
+            speeds = [rate(row["steps_per_s"]) for row in same]
+            name, compiled = way
+            keys = ("cold_s", "warm_s") if compiled else ()
+            times = [f"{same[0][key]:.0f}" for key in keys] or ["", ""]
+            shown = f"{name}, compiled" if compiled else name
+            table.append([task, shown, *speeds, *times])
     return f"{rows(table)}\n\n{made_by(record)}"
 
 
