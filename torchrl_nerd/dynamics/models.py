@@ -78,7 +78,7 @@ class TorchDynamics(Dynamics):
             self.compile_options = {"dynamic": False}
         numbers = (x for x in model.buffers() if x.is_floating_point())
         self.state_dtype = next((x.dtype for x in numbers), torch.float64)
-        self._compiled = Compiled(self._predict, **self.compile_options)
+        self._compiled = Compiled(self._predict_as_read, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
         self._row_work = self.scene.layout.nv
 
@@ -129,7 +129,6 @@ class TorchDynamics(Dynamics):
             )
         there, here = state[QPOS].device, self.device
         qpos, qvel = (state[key].to(here, self.state_dtype) for key in (QPOS, QVEL))
-        qpos = normalize_pos(self.scene.layout, qpos)
         ground = None if terrain is None else terrain.to(qpos)
         self._prepare(len(qpos))
         told = None if self.scene.servos is None or ctrl is None else ctrl.to(qpos)
@@ -157,9 +156,13 @@ class TorchDynamics(Dynamics):
     def _run(self, given: tuple) -> Prediction:
         """`_predict`, eager or compiled, of all envs at once or in parts."""
         if not self.compile:
-            return self._predict(*given)
+            return self._predict_as_read(*given)
         parts = 1 if torch.compiler.is_compiling() else self.parts(len(given[0]))
         return self._in_parts(parts, *given) if parts > 1 else self._compiled(*given)
+
+    def _predict_as_read(self, qpos: Tensor, *given: Any) -> Prediction:
+        """`_predict` with quaternions as MuJoCo reads them, of length one."""
+        return self._predict(normalize_pos(self.scene.layout, qpos), *given)
 
     def _predict(self, *args: Any, **kwargs: Any) -> Prediction:
         """From qpos, qvel, drive, terrain, memory (advanced) and ``is_scored``."""
