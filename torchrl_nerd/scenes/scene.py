@@ -150,14 +150,14 @@ class Scene:
 
     def vary(self, ranges: Ranges) -> "Scene":
         """The same with such as ``{"mass:pole": (0.3, 3.0)}``, see `Variation`."""
-        given = self.model, self.actuated, ranges
-        return replace(self, variation=Variation(*given) if ranges else None)
+        varied = Variation(self.model, self.actuated, ranges) if ranges else None
+        return replace(self, variation=varied)
 
     @property
     def integrator(self) -> str:
         """Of its MuJoCo, as in MJCF: ``Euler``, ``RK4``, ``implicitfast``, ..."""
-        kind = str(mujoco.mjtIntegrator(self.model.opt.integrator).name)
-        name = kind.removeprefix("mjINT_")
+        kind = mujoco.mjtIntegrator(self.model.opt.integrator)
+        name = str(kind.name).removeprefix("mjINT_")
         return {"EULER": "Euler", "RK4": "RK4"}.get(name, name.lower())
 
     @cached_property
