@@ -80,8 +80,12 @@ class Stepper:
             _, self.now = self.env.step_and_maybe_reset(self.now)
 
 
-def timed(one: Candidate, seed: int) -> tuple[float, float]:
-    """Seconds of the first steps, which compile, and control steps per second after."""
+def timed(one: Candidate, seed: int, cache: str) -> tuple[float, float]:
+    """Seconds of the first steps, which compile, and control steps per second after.
+
+    For a process of its own: from here on torch's ``cache`` is in that folder.
+    """
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
     env = make_env(one.task, one.dynamics, one.num_envs, seed, compile=one.compiled)
     began = time.perf_counter()
     env.rollout(3, break_when_any_done=False)
@@ -113,10 +117,9 @@ def measure(task: str, options: Options) -> list[dict[str, Any]]:
     ways = list(candidates(task, options.num_envs))
     spawn = get_context("spawn")
     with tempfile.TemporaryDirectory() as cache:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
         with ProcessPoolExecutor(1, spawn, max_tasks_per_child=1) as alone:
             rounds = [
-                [alone.submit(timed, way, options.seed).result() for way in ways]
+                [alone.submit(timed, way, options.seed, cache).result() for way in ways]
                 for _ in range(options.rounds)
             ]
     table = []

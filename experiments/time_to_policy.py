@@ -112,13 +112,11 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
         if point:
             learner.learn(env, 1.0 / cfg.points)
         clock.note("learning")
-        reached, promised = (
-            float(policy_returns(judge, learner.actor).mean())
-            for judge in (
-                env_of(x, cfg.task, cfg.episodes, cfg.seed + 100)
-                for x in ("mujoco", name)
-            )
-        )
+        returns = {}
+        for judge in dict.fromkeys(("mujoco", name)):
+            tried = env_of(judge, cfg.task, cfg.episodes, cfg.seed + 100)
+            returns[judge] = float(policy_returns(tried, learner.actor).mean())
+        reached, promised = returns["mujoco"], returns[name]
         about = {"learned_in": name, "task": cfg.task, "return": reached}
         save_policy(learner.policy, cfg.folder / name / f"{point}", about)
         frames = learner.done * learner.batch

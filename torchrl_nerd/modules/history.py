@@ -23,7 +23,7 @@ def replaced(old: Tensor, rows: Tensor, new: Tensor | float) -> Tensor:
 
 @dataclass
 class History:
-    """Tensors of a network's past, a row for each env; all zero: an empty history.
+    """Tensors of a network's past, a row for each env; a new one, all zero, is empty.
 
     A subclass names them; a network without a history needs none.
     """
