@@ -32,7 +32,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import env_keys, stream_offsets, uniforms
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.networks import NETWORKS
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import SCENES, TASKS, load_scene, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.samples import cover, data_stats
@@ -143,7 +143,7 @@ def random_model(
     features: FeatureConfig = NO_PREDICTIONS,
 ) -> NeRD:
     """A learned model of the right scale that has learned nothing."""
-    model = NeRD(scene, features, NETWORKS[network], scene_stats(scene, features))
+    model = NeRD(scene, features, network_config(network), scene_stats(scene, features))
     cover(model, little_data(scene))
     enliven(model.network, generator)
     return model
@@ -168,7 +168,7 @@ def hybrid_model(
     Its network is in float64: contacts may magnify float32's rounding a thousand times.
     """
     stats = scene_stats(scene, features)
-    hybrid = analytic_step(scene, step), features, NETWORKS[network], stats
+    hybrid = analytic_step(scene, step), features, network_config(network), stats
     model = HybridNeRD(scene, *hybrid)
     cover(model, little_data(scene))
     enliven(model.network, generator)

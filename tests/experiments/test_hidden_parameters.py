@@ -12,10 +12,17 @@ from hidden_parameters.motions import draw_parameters, motions
 from hidden_parameters.policies import Options as PolicyOptions
 from hidden_parameters.policies import by_part
 from hidden_parameters.policies import main as learn_policies
+from hidden_parameters.told import main as tell
+from tensordict import TensorDict
 
-from torchrl_nerd.checkpoint import make_card, save_checkpoint
+from torchrl_nerd.checkpoint import (
+    from_pretrained,
+    load_checkpoint,
+    make_card,
+    save_checkpoint,
+)
 from torchrl_nerd.configs import FeatureConfig
-from torchrl_nerd.dynamics import MujocoDynamics
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.robots import load_scene, preset_of
 
 ROWS = 6
@@ -45,6 +52,31 @@ def test_mujocos_own_fit_finds_them_too(generator):
     data = motions(SCENE, [own], [30], generator)
     found = SCENE.variation.shares(identify_by_mujoco(SCENE, data))
     assert (found - SCENE.variation.shares(own)).abs().median() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["franka-mlp", "ant"])
+def test_a_told_model_begins_as_the_one_that_is_not(name, tmp_path, generator):
+    """Its symmetric layers too; only then does training let it heed what it is told."""
+    tell(name, tmp_path)
+    start = from_pretrained(name, load_scene(name.partition("-")[0]))
+    model = load_checkpoint(tmp_path)
+    scene = model.scene
+    state = TensorDict(scene.sample_initial(ROWS, generator)[0], [ROWS])
+    torque = torch.randn(ROWS, len(scene.actuated), dtype=torch.float64)
+    told = state.clone().set("parameters", scene.variation.draw(ROWS, generator))
+    expected = first(start, state, torque)
+    torch.testing.assert_close(first(model, told, torque), expected, rtol=0, atol=1e-4)
+    other = told.clone().set("parameters", scene.variation.draw(ROWS, generator))
+    with torch.no_grad():
+        model.network.embed.weight.add_(0.1)
+    assert not first(model, told, torque).equal(first(model, other, torque))
+
+
+def first(model, state, torque):
+    """Velocities after one step."""
+    dynamics = NeRDDynamics(model)
+    dynamics.reset(state)
+    return dynamics.step(state, torque)["qvel"]
 
 
 def test_a_parameter_changes_where_it_should(generator):

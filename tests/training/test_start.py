@@ -16,6 +16,7 @@ from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NETWORKS
 from torchrl_nerd.robots import load_scene
+from torchrl_nerd.training import start
 from torchrl_nerd.training import trainer as module
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.start import begin_from, fingerprint
@@ -122,6 +123,28 @@ def test_other_networks_and_kinds_are_refused(generator):
     name = next(name for name, config in NETWORKS.items() if config == hybrid.config)
     with pytest.raises(ValueError, match="expected a learned model.*got a hybrid one"):
         begin_from(hybrid, CARTPOLE, replace(CONFIG, network=name))
+
+
+@pytest.mark.parametrize("name", ["cartpole", "ant"])
+def test_a_longer_band_begins_where_the_shorter_one_is(name, generator, monkeypatch):
+    """Shut out, new tokens change nothing; else they count for little."""
+    scene = load_scene(name)
+    initial = random_model(scene, generator, "transformer-2x64@4")
+    drive = random_drive(scene, 4, 12, generator)
+    expected, config = (
+        path(initial, drive),
+        replace(CONFIG, network="transformer-2x64@9"),
+    )
+    apart = []
+    for far in (start.FAR, float("-inf")):
+        monkeypatch.setattr(start, "FAR", far)
+        model = begin_from(initial, scene, config)
+        model.training_range.load_state_dict(initial.training_range.state_dict())
+        assert model.config.band == 9 and initial.config.band == 4
+        apart.append((path(model, drive) - expected).abs().amax((1, 2)))
+    assert (apart[0][4:] > apart[1][4:]).all() and (apart[1] < 1e-4).all()
+    with pytest.raises(ValueError, match="from, transformer-2x64@9, got .*2x64@4"):
+        begin_from(model, scene, replace(CONFIG, network="transformer-2x64@4"))
 
 
 def test_symmetry_needs_statistics_that_copies_share(generator):

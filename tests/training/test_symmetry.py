@@ -10,11 +10,18 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from torchrl_nerd.configs import NO_PREDICTIONS, TrainConfig
+from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig, TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
-from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
+from torchrl_nerd.keys import (
+    JOINT_TORQUE,
+    NEXT_QPOS,
+    NEXT_QVEL,
+    PARAMETERS,
+    QPOS,
+    QVEL,
+)
 from torchrl_nerd.modules.nerd import TARGET, TOKEN, NeRD, SceneFeatures
 from torchrl_nerd.modules.networks import NETWORKS, MLPConfig
 from torchrl_nerd.robots import load_scene, make_task
@@ -124,6 +131,32 @@ def test_a_robot_that_touches_itself_may_have_a_mirror(first, order, tmp_path):
     scene = quadruped(tmp_path, **first)
     assert own_contacts(scene.model)
     assert len(find_isometries(scene)) == order
+
+
+@pytest.mark.parametrize(
+    ("more", "order"),
+    [({}, 8), ({"damping:hip_1": (0.0, 5.0)}, 2), ({"slope:y": (0.0, 0.1)}, 4)],
+    ids=["whole robot", "one leg", "slope"],
+)
+def test_varied_robots_keep_the_isometries_that_all_of_them_have(
+    more, order, generator
+):
+    scene = load_scene("ant").vary({"payload:torso": (0.0, 20.0), "motor": (0.6, 1.2)})
+    scene = scene.vary(scene.variation.ranges | more)
+    symmetry = Symmetry(scene, FeatureConfig(parameters=True))
+    assert len(symmetry.isometries) == order
+    data = simulate(scene, 20, 6, generator)
+    data = data[is_sound(data)]
+    dynamics = MujocoDynamics(scene)
+    for isometry in symmetry.isometries:
+        copy = isometry(data)
+        assert torch.equal(copy[PARAMETERS], data[PARAMETERS])
+        start = copy[:, 0]
+        dynamics.reset(start)
+        after = dynamics.step(start, start[JOINT_TORQUE])
+        torch.testing.assert_close(
+            after[QVEL], copy[NEXT_QVEL][:, 0], rtol=0.0, atol=1e-4
+        )
 
 
 def test_isometries_that_features_do_not_have_are_left_out(tmp_path):

@@ -180,12 +180,6 @@ def test_rollouts_longer_than_one_robot_stays_are_refused_at_once(generator, tmp
         Trainer(SCENE, data[is_sound(data)], SCENE, config, tmp_path)
 
 
-def test_symmetry_augmentation_of_varied_robots_are_refused(data, tmp_path):
-    config = TrainConfig(use_symmetry=True)
-    with pytest.raises(ValueError, match="one robot for use_symmetry"):
-        Trainer(SCENE, data, SCENE, config, tmp_path)
-
-
 @pytest.mark.slow
 def test_the_command_line_measures_after_a_history(tmp_path, capsys, monkeypatch):
     """Beside MuJoCo, which knows every robot, and one that is nominal for all."""

@@ -18,7 +18,14 @@ from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.base import keep_constants, keep_indices
 from torchrl_nerd.geometry.manifold import FREE, SLIDE
 from torchrl_nerd.geometry.rotations import quat_multiply
-from torchrl_nerd.keys import JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
+from torchrl_nerd.keys import (
+    JOINT_TORQUE,
+    NEXT_QPOS,
+    NEXT_QVEL,
+    PARAMETERS,
+    QPOS,
+    QVEL,
+)
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import collision_filter, own_contacts
 from torchrl_nerd.scenes.penetration import touching_bodies
@@ -97,16 +104,22 @@ class Isometry(nn.Module):
         return joint_torque[..., self.motors] * self.motor_signs
 
     def forward(self, data: TensorDict) -> TensorDict:
-        """Symmetric copy of states or transitions: of every key that is there."""
+        """Symmetric copy of states or transitions: of every key that is there.
+
+        Parameters stay: it is the same robot.
+        """
         maps = {QPOS: self.qpos, QVEL: self.qvel, JOINT_TORQUE: self.torque}
         maps |= {NEXT_QPOS: self.qpos, NEXT_QVEL: self.qvel}
         keys = data.keys(True)
         copy = {key: apply(data[key]) for key, apply in maps.items() if key in keys}
-        return TensorDict(copy, data.batch_size)
+        same = data.select(PARAMETERS, strict=False)
+        return TensorDict(copy, data.batch_size).update(same)
 
 
 def find_isometries(scene: Scene) -> list[Isometry]:
     """The symmetry group of a robot on its ground, the identity first.
+
+    Of a varied scene those that every robot has.
 
     Raises:
         ValueError: a fixed base, a ball joint, servos, or a ground that varies.
@@ -228,7 +241,8 @@ def _touch_themselves(scene: Scene, state: TensorDictBase) -> Tensor:
 def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
     """Random states and torques ``[count]``, up to ``max_depth`` m in the ground.
 
-    Joints are up to `OVERSHOOT` of their ranges beyond them.
+    Joints are up to `OVERSHOOT` of their ranges beyond them. Of a varied scene each is of
+    a robot of its own.
     """
     generator = Generator().manual_seed(0)
     state, scale = scene.sample_initial(count, generator)
@@ -240,4 +254,7 @@ def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
     draw = torch.rand(count, dtype=torch.float64, generator=generator)
     scene.place_on_terrain(state, -max_depth * draw)
     torque = sample_commands(scene.sampling, scale, 1, generator)
-    return TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
+    found = TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
+    if scene.variation is not None:
+        found[PARAMETERS] = scene.variation.draw(count, generator)
+    return found

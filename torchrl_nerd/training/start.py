@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch.nn import functional as F
 
 from torchrl_nerd.analytic import STEPS, make_step
 from torchrl_nerd.configs import TrainConfig
@@ -27,6 +28,9 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError, look_up
 from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.transforms import Stats
+
+# bias of a token that is new in a longer band: its weight is e^FAR of what it would be
+FAR = -4.0
 
 
 def make_model(
@@ -76,14 +80,15 @@ def begin_from(
     """A model with weights and statistics of another one, which is left as it is.
 
     What the network's inputs mean, their statistics, is part of what it learned, and so is
-    a hybrid's gate. The training range is left to be fitted.
+    a hybrid's gate. The training range is left to be fitted. A transformer may get a longer
+    band: tokens that are new in it count for little at first, see `FAR`.
 
     Raises:
         ValueError: in one sentence, a configuration of another network, kind or step,
             inputs of another width, or statistics that symmetric copies do not share.
     """
     known, asked = start.config, configured_network(config)
-    if known != asked:
+    if known != asked and not _has_longer_band(known, asked):
         raise ValueError(
             f"expected the network of the model to start from, {_named(known)}, "
             f"got {_named(asked)}"
@@ -104,11 +109,25 @@ def begin_from(
             raise ValueError(f"expected to start from {kind} {wants}, got {has}")
     if isinstance(model, HybridNeRD) and isinstance(start, HybridNeRD):
         model.is_gated = start.is_gated
-    model.network.load_state_dict(start.network.state_dict())
+    weights = start.network.state_dict()
+    for name, weight in model.network.state_dict().items():
+        if name.endswith("offset_bias"):  # (heads, band)
+            new = weight.shape[1] - weights[name].shape[1]
+            weights[name] = F.pad(weights[name], (0, new), value=FAR)
+    model.network.load_state_dict(weights)
     model.normalize.load_state_dict(start.normalize.state_dict())
     if symmetry is not None:
         _expect_shared(symmetry, model)
     return model
+
+
+def _has_longer_band(known: NetworkConfig, asked: NetworkConfig) -> bool:
+    """Whether two transformers differ in nothing else."""
+    if not (
+        isinstance(known, TransformerConfig) and isinstance(asked, TransformerConfig)
+    ):
+        return False
+    return known.band < asked.band and known == replace(asked, band=known.band)
 
 
 def _of_inputs(first: NeRD, second: NeRD) -> Iterator[tuple[str, Any, Any]]:
@@ -125,6 +144,9 @@ def _named(network: NetworkConfig) -> str:
         plain = replace(network, symmetries=1)
         ending = f" with symmetries {network.symmetries}"
     names = [name for name, config in NETWORKS.items() if config == plain]
+    if not names and isinstance(plain, TransformerConfig):
+        usual = replace(plain, band=TransformerConfig.band)
+        names = [f"{k}@{plain.band}" for k, v in NETWORKS.items() if v == usual]
     return (" or ".join(names) or str(plain)) + ending
 
 

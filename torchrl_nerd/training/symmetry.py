@@ -37,17 +37,11 @@ class Symmetry(nn.Module):
     not be as symmetric as the shape.
 
     Raises:
-        ValueError: see `find_isometries`; a feature that is zero in all of these states;
-            a scene whose parameters differ from robot to robot.
+        ValueError: see `find_isometries`; a feature that is zero in all of these states.
     """
 
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
         super().__init__()
-        if scene.variation is not None:
-            raise ValueError(
-                "expected one robot for use_symmetry or symmetries, got "
-                f"'{scene.name}', whose parameters vary"
-            )
         self.name, group = scene.name, find_isometries(scene)
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]
