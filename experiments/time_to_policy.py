@@ -103,10 +103,10 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
     if kept.exists() and (found := read_json(kept))["configuration"] == same:
         return found["curve"]
     use_one_thread()
-    torch.manual_seed(cfg.seed)
     how, clock, curve = cfg.ppo, Clock(), []
     env = env_of(name, cfg.task, how.num_envs, cfg.seed, compile=True)
     env = stack_frames(env, how.frame_stack)
+    torch.manual_seed(cfg.seed)  # behind the env, so that all begin with one policy
     learner = Learner(how, env)
     for point in range(cfg.points + 1):
         if point:

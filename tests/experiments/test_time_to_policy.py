@@ -10,6 +10,7 @@ import time_to_policy
 import torch
 import unmet_policies
 from plot_time_to_policy import draw
+from safetensors.torch import load_file
 from time_to_policy import env_of, time_to, wanted_of
 
 from torchrl_nerd import make_env
@@ -103,6 +104,9 @@ def test_both_scripts_with_tables_and_a_picture(tmp_path):
     }
     assert all(a == b for a, b in both["mujoco"])  # the same starts
     assert all(a != b for a, b in both["cartpole-mlp"])
+    starts = [load_file(how.folder / n / "0/policy.safetensors") for n in dynamics]
+    for key in (name for name in starts[0] if name.startswith("mlp.")):
+        assert all(torch.equal(x[key], starts[0][key]) for x in starts)
     began = time.monotonic()
     again = {name: time_to_policy.learn_in(name, how) for name in dynamics}
     assert again == found["curves"] and time.monotonic() - began < 1.0
