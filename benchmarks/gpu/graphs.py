@@ -13,9 +13,9 @@ from torchrl_nerd.dynamics.models import TorchDynamics
 from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.envs.streams import uniforms
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.kv_cache import KeyValueCache
 from torchrl_nerd.modules.linear import FullLinear
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.modules.transformer import KeyValueCache
 from torchrl_nerd.training.capture import capture
 
 

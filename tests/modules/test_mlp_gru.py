@@ -39,6 +39,16 @@ def stream(
 
 
 @each_config
+def test_steps_go_on_from_a_history_that_was_read_at_once(config, generator):
+    network, tokens = build(config, generator), randn(generator, ROWS, STEPS, INPUTS)
+    memory = network.empty_memory(ROWS)
+    first = network.read(tokens[:, :9], memory)
+    rest = [network.step(token, memory) for token in tokens[:, 9:].unbind(1)]
+    both = torch.cat((first, torch.stack(rest, 1)), 1)
+    torch.testing.assert_close(both, network(tokens), rtol=0, atol=1e-12)
+
+
+@each_config
 @pytest.mark.parametrize(
     ("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)]
 )

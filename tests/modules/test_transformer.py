@@ -57,6 +57,26 @@ def episodes(network: nn.Module, tokens: Tensor, resets: Tensor) -> Tensor:
     return torch.stack(outputs)
 
 
+@each_config
+@pytest.mark.parametrize("is_recorded", [False, True], ids=["in place", "gradients"])
+def test_steps_go_on_from_a_history_that_was_read_at_once(
+    config, is_recorded, generator
+):
+    """Shorter than the band, as long, longer; also in an env that is reset after it."""
+    network = build(config, generator)
+    for count in {1, config.band - 1, config.band, 2 * config.band + 1}:
+        tokens = randn(generator, 4, count + 3, INPUTS)
+        later, expected = tokens[:, count:], network(tokens)
+        with torch.set_grad_enabled(is_recorded):
+            memory = network.empty_memory(4)
+            outputs = [network.read(tokens[:, :count], memory)]
+            memory.clear(torch.tensor([False, True, False, False]))
+            outputs += [network.step(x, memory)[:, None] for x in later.unbind(1)]
+        expected = expected.clone()
+        expected[1, count:] = network(later[1:2])[0]
+        torch.testing.assert_close(torch.cat(outputs, 1), expected, rtol=0, atol=1e-12)
+
+
 def random_resets(rows: int, steps: int, generator: Generator) -> Tensor:
     """Rows restart at times of their own; the first row never does."""
     resets = torch.rand(rows, steps, generator=generator) < 3.0 / steps

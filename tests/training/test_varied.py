@@ -77,10 +77,21 @@ def test_a_rollout_sees_true_states_first_and_then_its_own(data):
     qvel = torch.cat((data[QVEL], data["next", QVEL][:, -1:]), 1)
     batch = qpos, qvel, data[JOINT_TORQUE], None
     loss = rollout_loss(model, *batch, LOSS_EPS, data[PARAMETERS][:, 0], history)
-    assert loss.isfinite() and len(seen) == data.batch_size[1]
-    for t, state in enumerate(seen):
-        assert torch.equal(state, qvel[:, t]) == (t <= history)
-        assert t == 0 or torch.equal(state, made[t - 1]) == (t > history)
+    assert len(seen) == 1 + data.batch_size[1] - history
+    assert torch.equal(seen[0], qvel[:, :history])  # read at once
+    assert torch.equal(seen[1], qvel[:, history])
+    for before, state in zip(made[1:], seen[2:], strict=False):
+        assert torch.equal(state, before)
+
+    def by_steps(tokens, memory):
+        steps = (model.network.step(token, memory) for token in tokens.unbind(1))
+        return torch.stack(list(steps), 1)
+
+    model.network.read = by_steps
+    same = rollout_loss(model, *batch, LOSS_EPS, data[PARAMETERS][:, 0], history)
+    torch.testing.assert_close(loss, same, rtol=1e-5, atol=0)
+    none = rollout_loss(model, *batch, LOSS_EPS, data[PARAMETERS][:, 0])
+    assert loss.isfinite() and none != same
 
 
 @pytest.mark.parametrize("is_told", [True, False])

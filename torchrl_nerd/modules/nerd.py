@@ -55,7 +55,7 @@ class NeRD(nn.Module):
     """
 
     kind: ClassVar[str] = "learned"
-    network: Any  # has `empty_memory(rows)` and `step(token, memory)`
+    network: Any  # has `empty_memory(rows)`, `step(token, memory)` and `read`
     compile_single_threaded: bool = True  # in parts, a thread each
 
     def __init__(

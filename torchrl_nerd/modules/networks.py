@@ -50,6 +50,10 @@ class MLP(nn.Module):
             x = block(x)
         return self.head(x)
 
+    def read(self, tokens: Tensor, memory: NoMemory) -> Tensor:
+        """``(rows, T, F) -> (rows, T, D)``."""
+        return self(tokens)
+
     def empty_memory(self, rows: int) -> NoMemory:
         """Nothing."""
         return NoMemory()
@@ -94,6 +98,12 @@ class GRU(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
         return self.head(self.gru(self._embedded(tokens))[0])
+
+    def read(self, tokens: Tensor, memory: HiddenState) -> Tensor:
+        """As `forward`; an empty ``memory`` is then as after so many steps."""
+        output, value = self.gru(self._embedded(tokens))
+        memory.value = stored(memory.value, value.transpose(0, 1))
+        return self.head(output)
 
     def empty_memory(self, rows: int) -> HiddenState:
         """A hidden state of zeros for ``rows`` rows."""

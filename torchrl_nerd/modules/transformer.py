@@ -17,7 +17,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from torchrl_nerd.modules.history import History, replaced, stored
+from torchrl_nerd.modules.history import stored
+from torchrl_nerd.modules.kv_cache import KeyValueCache
 from torchrl_nerd.modules.symmetric import (
     hidden_shape,
     make_activation,
@@ -48,95 +49,6 @@ class TransformerConfig:
         return CausalTransformer(self, num_inputs, num_outputs)
 
 
-@dataclass
-class KeyValueCache(History):
-    """Keys and values of the last ``band`` tokens of every layer.
-
-    ``last`` is what the last token adds to the embedding of the next one, of width zero
-    without ``pairs``.
-    """
-
-    keys: list[Tensor]  # per layer (rows, heads, band, head width)
-    values: list[Tensor]  # the same
-    age: Tensor  # (rows,): tokens seen since the env's reset, at most band - 1
-    # (1,): where the oldest token lies, which the next one overwrites; a tensor, so that
-    # compiled code is the same for all of them
-    slot: Tensor
-    last: Tensor  # (rows, *hidden)
-
-    def clear(self, rows: Tensor) -> None:
-        """See `History.clear`."""
-        # the rings stay as they are: nobody sees what is older than the age, and emptying
-        # them at every reset of some env took longer than a step of all
-        self.age.masked_fill_(rows, 0)
-        self.slot.masked_fill_(rows.all(), 0)  # as in a new one
-        self.last = replaced(self.last, rows, 0.0)
-
-    def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
-        """See `History.restore`: its rings turned to where the oldest token lies now."""
-        size = self.keys[0].shape[2]
-        slots = torch.arange(size, device=rows.device)
-        turned = (slots + past.slot - self.slot) % size
-        for ring, then in ((self.keys, past.keys), (self.values, past.values)):
-            for layer, old in enumerate(then):
-                ring[layer] = replaced(ring[layer], rows, old.index_select(2, turned))
-        self.age.copy_(torch.where(rows, past.age, self.age))
-        self.last = replaced(self.last, rows, past.last)
-
-    def tensors(self) -> list[Tensor]:
-        """See `History.tensors`."""
-        return [*self.keys, *self.values, self.age, self.last]
-
-    def chunk(self, parts: int) -> list["KeyValueCache"]:
-        """See `History.chunk`: each has a slot of its own, which its step moves on."""
-        rows = [x.chunk(parts) for x in self.tensors()]
-        count, found = len(self.keys), []
-        for part in zip(*rows, strict=True):
-            *rings, age, last = part
-            keys, values = rings[:count], rings[count:]
-            found.append(KeyValueCache(keys, values, age, self.slot.clone(), last))
-        return found
-
-    def join(self, parts: list["KeyValueCache"]) -> None:
-        """See `History.join`: the slot is the same in all of them."""
-        self.slot.copy_(parts[0].slot)
-
-    def __copy__(self) -> "KeyValueCache":
-        """See `History.__copy__`."""
-        keys, values = ([x.clone() for x in ring] for ring in (self.keys, self.values))
-        rest = (x.clone() for x in (self.age, self.slot, self.last))
-        return KeyValueCache(keys, values, *rest)
-
-    def write(self, layer: int, key: Tensor, value: Tensor) -> Tensor:
-        """Store one token ``(rows, heads, head width)``; with gradients, out of place.
-
-        What is not finite is stored as zero: times a weight of zero it would be NaN, also
-        in the env's next episode. The token's own output is not finite either way.
-        Returns how long ago the token of every slot was, ``(band,)``.
-        """
-        size, device = self.keys[layer].shape[2], key.device
-        slots = torch.arange(size, device=device)
-        for past, x in ((self.keys, key), (self.values, value)):
-            new = torch.where(x.isfinite(), x, 0.0)
-            if torch.is_grad_enabled():
-                later = (slots[1:] + self.slot) % size
-                kept = past[layer].index_select(2, later)
-                past[layer] = torch.cat((kept, new[:, :, None]), 2)
-            else:
-                past[layer].index_copy_(2, self.slot, new[:, :, None])
-        newest = size - 1 if torch.is_grad_enabled() else self.slot
-        return (newest - slots) % size
-
-    def advance(self) -> None:
-        """Count one token."""
-        size = self.keys[0].shape[2]
-        if torch.is_grad_enabled():  # there `write` shifts
-            self.slot.zero_()
-        else:
-            self.slot.add_(1).remainder_(size)
-        self.age.add_(1).clamp_(max=size - 1)
-
-
 def softmax(scores: Tensor) -> Tensor:
     """Over the last dimension; of few numbers torch's own takes four times as long."""
     if scores.shape[-1] > NARROW or not scores.is_cpu:
@@ -161,11 +73,15 @@ class Attention(nn.Module):
         parts = self.project(x).unflatten(-1, (3, -1)).unbind(-2)
         return tuple(part.reshape(*batch, self.heads, -1) for part in parts)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """All tokens at once, ``(rows, T, *hidden)``."""
+    def forward(
+        self, x: Tensor, cache: KeyValueCache | None = None, layer: int = 0
+    ) -> Tensor:
+        """All tokens at once, ``(rows, T, *hidden)``; an empty ``cache`` is filled."""
         # (rows, heads, T, head width) each
         parts = self._split(x, *x.shape[:2])
         query, key, value = (part.transpose(1, 2) for part in parts)
+        if cache is not None:
+            cache.fill(layer, key, value)
         steps = torch.arange(x.shape[1], device=x.device)
         offset = steps[:, None] - steps[None, :]  # (T, T): how long ago
         is_seen = (offset >= 0) & (offset < self.band)
@@ -221,9 +137,11 @@ class Block(FeedForward):
         super().__init__(config.width, config.symmetries)
         self.attention = Attention(config)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, cache: KeyValueCache | None = None, layer: int = 0
+    ) -> Tensor:
         """``(rows, T, *hidden)``."""
-        return super().forward(x + self.attention(x))
+        return super().forward(x + self.attention(x, cache, layer))
 
     def step(self, x: Tensor, cache: KeyValueCache, layer: int) -> Tensor:
         """``(rows, *hidden)``."""
@@ -269,12 +187,20 @@ class CausalTransformer(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Sequences that start with an empty history: ``(rows, T, F) -> (rows, T, D)``."""
+        return self.read(tokens, None)
+
+    def read(self, tokens: Tensor, memory: KeyValueCache | None) -> Tensor:
+        """As `forward`; an empty ``memory`` is then as after so many steps."""
         x = self.embed(tokens)
         if self.embed_last is not None:
-            earlier = self.embed_last(tokens[:, :-1])  # (rows, T - 1, *hidden)
-            x = torch.cat((x[:, :1], x[:, 1:] + earlier), 1)
-        for block in self.blocks:
-            x = block(x)
+            adds = self.embed_last(tokens)  # (rows, T, *hidden), to the next one
+            x = torch.cat((x[:, :1], x[:, 1:] + adds[:, :-1]), 1)
+            if memory is not None:
+                memory.last = stored(memory.last, adds[:, -1])
+        for layer, block in enumerate(self.blocks):
+            x = block(x, memory, layer)
+        if memory is not None:
+            memory.begin(tokens.shape[1])
         return self.head(x)
 
     def empty_memory(self, rows: int) -> KeyValueCache:

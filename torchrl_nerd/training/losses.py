@@ -1,12 +1,17 @@
 """What training minimises: one step ahead, then several."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from torchrl_nerd.geometry.manifold import differentiate_pos
-from torchrl_nerd.modules.nerd import TARGET, NeRD
+from torchrl_nerd.modules.nerd import TARGET, NeRD, State
 from torchrl_nerd.scenes.commands import drive, drive_of
 
+Read = Callable[..., Tensor]
+"""``read`` or ``step`` of a network: tokens and ``memory`` to outputs."""
 RESOLUTION = 1e-4  # relative errors below it no longer count: keeps the root smooth
 
 
@@ -41,7 +46,7 @@ def rollout_loss(
     parameters: Tensor | None = None,
     history: int = 0,
 ) -> Tensor:
-    """Error of the model's own trajectory, fed back, from an empty history.
+    """Error of the model's own trajectory, fed back, from an empty or a recorded history.
 
     Velocity errors are measured in standard deviations of one step's change, position
     errors in what such a change moves in one control step.
@@ -57,24 +62,31 @@ def rollout_loss(
         history: recorded steps that come first; their errors count as well.
     """
     delta, layout = model.state_delta, model.scene.layout
-    scale = model.normalize.std(TARGET)[: layout.nv]
     memory = model.network.empty_memory(len(qpos))
-    position, velocity = qpos[:, 0], qvel[:, 0]
-    errors, told = [], model.scene_features.told(parameters)
-    for step in range(command.shape[1]):
-        if step <= history:
-            position, velocity = qpos[:, step], qvel[:, step]
-        driven = drive(model.scene, command[:, step], position, velocity)
-        position, velocity, _ = model.step(
-            (position, velocity),
-            drive_of(*driven, told),
-            terrain,
-            lambda token: model.network.step(token, memory),
-        )
-        slip = differentiate_pos(layout, qpos[:, step + 1], position)
-        slip = slip / (scale * delta.step_size)
-        drift = (velocity - qvel[:, step + 1]) / scale
-        errors.append(torch.cat((drift, slip), -1))
+
+    def advance(
+        state: State, command: Tensor, own: Sequence[Tensor | None], read: Read
+    ) -> State:
+        """States ``(batch, T, ...)`` or ``(batch, ...)`` a step later."""
+        told, ground = own
+        drives = drive_of(*drive(model.scene, command, *state), told)
+        return model.step(state, drives, ground, partial(read, memory=memory))[:2]
+
+    own, path = (model.scene_features.told(parameters), terrain), []
+    if history:  # all at once
+        known = [x if x is None else x[:, None].expand(-1, history, -1) for x in own]
+        seen = qpos[:, :history], qvel[:, :history]
+        path.append(advance(seen, command[:, :history], known, model.network.read))
+    state = qpos[:, history], qvel[:, history]
+    for now in command[:, history:].unbind(1):
+        state = advance(state, now, own, model.network.step)
+        path.append([x[:, None] for x in state])
+    # (batch, K, ...)
+    position, velocity = (torch.cat(x, 1) for x in zip(*path, strict=True))
+    scale = model.normalize.std(TARGET)[: layout.nv]
+    drift = (velocity - qvel[:, 1:]) / scale
+    slip = differentiate_pos(layout, qpos[:, 1:], position) / (scale * delta.step_size)
+    errors = torch.cat((drift, slip), -1)
     change = (qvel[:, 1:] - qvel[:, :-1]) / scale
     size = change.square().mean((-1, -2))[:, None]
-    return relative_error(torch.stack(errors, 1), size, loss_eps).mean().float()
+    return relative_error(errors, size, loss_eps).mean().float()
