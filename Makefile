@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive data-ant model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-franka-adaptive data-ant model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -147,6 +147,22 @@ model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequen
 	$(call LEARN_CHANGES,cartpole,long)
 	$(call LEARN_ROLLOUTS,cartpole,1000,250)
 	$(call SHIP_ADAPTIVE,cartpole)
+
+# Adaptive models that begin as the shipped transformer of one robot, with a longer band.
+BEGUN := --vary preset --network transformer-4x128@64 --single-step-fraction 0 \
+	--sequence-length 64 --batch-size 32 --rollout-history 20 --rollout-lr-ratio 0.25 \
+	--validate-every 9000 --save-every 100 --threads 1
+model-ant-adaptive: MORE := --symmetries 4 --lr 0.006 --adamw-lr 0.0018
+model-franka-adaptive: MORE := --lr 0.004 --adamw-lr 0.0012 --bf16-fraction 0.7
+
+model-ant-adaptive model-franka-adaptive: model-%-adaptive: $(STAMP) ## Ants or Frankas that find their hidden parameters
+	$(NERD) data $* --vary preset --trajectories 7000 --steps 200 --out datasets/$*_varied
+	$(NERD) train $* $(BEGUN) $(MORE) --data datasets/$*_varied --init-from $* --steps 5000 \
+		--rollout-steps 400 --rollout-length 10 --rollout-batch-size 64 --out runs/$*_varied
+	$(NERD) train $* $(BEGUN) $(MORE) --data datasets/$*_varied --init-from runs/$*_varied/last \
+		--steps 6000 --rollout-steps 300 --rollout-length 20 --rollout-batch-size 48 \
+		--out runs/$*_adaptive
+	$(call SHIP_ADAPTIVE,$*)
 
 # The Ant's networks: single steps and rollouts, then both again with more data along a run.
 ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin

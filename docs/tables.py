@@ -306,6 +306,18 @@ def state_dtype_table(folder: Path = RESULTS) -> str:
 UNTRUSTED = "untrusted_before", "untrusted_after"
 
 
+def of_hidden(errors: dict[str, Any]) -> dict[str, float]:
+    """Means by what the tables show: a base's position, and the last or mean joint."""
+    base = {k: v["mean"] for k, v in errors.items() if k.startswith("base_")}
+    joints = [v["mean"] for k, v in errors.items() if k not in base]
+    shown = {"base_position (m)": base["base_position"]} if base else {}
+    if not joints:
+        return shown | {"base_orientation (rad)": base["base_orientation"]}
+    if len(joints) > 2:
+        return shown | {"the joints (rad)": sum(joints) / len(joints)}
+    return shown | {f"{list(errors)[-1]} (rad)": joints[-1]}
+
+
 def hidden_parameters_tables(folder: Path = RESULTS) -> str:
     """Error of every robot against the length of the history, and by region."""
     parts = []
@@ -320,29 +332,26 @@ def hidden_parameters_tables(folder: Path = RESULTS) -> str:
         title = title.replace("_others", ", a GRU and a hybrid")
         parts.append(f"### {title}")
         for steps in ("20", "100"):
-            first = found["inside", next(iter(names)), lengths[0]]["errors"][steps]
-            quantity = list(first)[-1]
-            table = [["steps of history", *map(str, lengths)]]
-            for name in names:
-                cells = (found.get(("inside", name, n)) for n in lengths)
-                means = (c and c["errors"][steps][quantity]["mean"] for c in cells)
-                table.append([name, *("-" if x is None else number(x) for x in means)])
-            parts += [
-                f"Mean error of {quantity} (rad) over {steps} steps:",
-                rows(table),
-            ]
+            kept = {k: of_hidden(r["errors"][steps]) for k, r in found.items()}
+            for quantity in next(iter(kept.values())):
+                table = [["steps of history", *map(str, lengths)]]
+                for name in names:
+                    cells = (kept.get(("inside", name, n)) for n in lengths)
+                    means = ("-" if x is None else number(x[quantity]) for x in cells)
+                    table.append([name, *means])
+                parts += [f"Mean error of {quantity} over {steps} steps:", rows(table)]
         regions = dict.fromkeys(region for region, *_ in found)
         table = [["parameters, after 20 steps", *regions, "time per robot (ms)"]]
         for name in names:
             cells = [found[region, name, 20] for region in regions]
-            means = (number(cell["errors"]["100"][quantity]["mean"]) for cell in cells)
+            hidden = (of_hidden(cell["errors"]["100"]) for cell in cells)
+            means = (number(next(iter(x.values()))) for x in hidden)
             alone = found["inside", next(iter(names)), 0]  # nominal MuJoCo
             alone = found.get(("inside", name, 0), alone)
             spent = cells[0]["seconds"] - alone["seconds"]
             table.append([name, *means, number(1e3 * max(spent, 0.0))])
-        about = (
-            f"Mean error of {quantity} (rad) over 100 steps, and time for the history:"
-        )
+        first = next(iter(next(iter(kept.values()))))
+        about = f"Mean error of {first} over 100 steps, and time for the history:"
         parts += [about, rows(table)]
         head = ["what changes", "model", "before", "after", "steps until it is back"]
         head += ["untrusted before", "after"]

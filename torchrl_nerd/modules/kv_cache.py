@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_nerd.modules.history import History, replaced
+from torchrl_nerd.modules.history import History, replaced, stored
 
 
 @dataclass
@@ -96,7 +96,8 @@ class KeyValueCache(History):
         size = self.keys[layer].shape[2]
         for past, x in ((self.keys, key), (self.values, value)):
             last = torch.where(x.isfinite(), x, 0.0)[:, :, -size:]
-            past[layer] = F.pad(last, (0, 0, size - last.shape[2], 0))
+            new = F.pad(last, (0, 0, size - last.shape[2], 0))
+            past[layer] = stored(past[layer], new)
 
     def begin(self, count: int) -> None:
         """Count the first tokens, which `fill` stored in every layer."""
