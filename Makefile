@@ -151,18 +151,25 @@ model-cartpole-adaptive: varied-cartpole ## the same for Cartpoles, whose sequen
 # Adaptive models that begin as the shipped transformer of one robot, with a longer band.
 BEGUN := --vary preset --network transformer-4x128@64 --single-step-fraction 0 \
 	--sequence-length 64 --batch-size 32 --rollout-history 20 --rollout-lr-ratio 0.25 \
-	--validate-every 9000 --save-every 100 --threads 1
-model-ant-adaptive: MORE := --symmetries 4 --lr 0.006 --adamw-lr 0.0018
-model-franka-adaptive: MORE := --lr 0.004 --adamw-lr 0.0012 --bf16-fraction 0.7
+	--validate-every 9000 --threads 1
+FEW_ROLLOUTS := --steps 5000 --rollout-steps 400 --rollout-length 10 --rollout-batch-size 64 \
+	--save-every 250
 
-model-ant-adaptive model-franka-adaptive: model-%-adaptive: $(STAMP) ## Ants or Frankas that find their hidden parameters
-	$(NERD) data $* --vary preset --trajectories 7000 --steps 200 --out datasets/$*_varied
-	$(NERD) train $* $(BEGUN) $(MORE) --data datasets/$*_varied --init-from $* --steps 5000 \
-		--rollout-steps 400 --rollout-length 10 --rollout-batch-size 64 --out runs/$*_varied
-	$(NERD) train $* $(BEGUN) $(MORE) --data datasets/$*_varied --init-from runs/$*_varied/last \
-		--steps 6000 --rollout-steps 300 --rollout-length 20 --rollout-batch-size 48 \
-		--out runs/$*_adaptive
-	$(call SHIP_ADAPTIVE,$*)
+model-ant-adaptive: $(STAMP) ## Ants that find their hidden parameters
+	$(NERD) data ant --vary preset --trajectories 7000 --steps 200 --out datasets/ant_varied
+	$(NERD) train ant $(BEGUN) $(FEW_ROLLOUTS) --data datasets/ant_varied --init-from ant \
+		--symmetries 4 --lr 0.006 --adamw-lr 0.0018 --out runs/ant_adaptive
+	$(call SHIP_ADAPTIVE,ant)
+
+FRANKA := --data datasets/franka_varied --lr 0.004 --adamw-lr 0.0012 --bf16-fraction 0.7
+
+model-franka-adaptive: $(STAMP) ## Frankas that find them
+	$(NERD) data franka --vary preset --trajectories 7000 --steps 200 --out datasets/franka_varied
+	$(NERD) train franka $(BEGUN) $(FEW_ROLLOUTS) $(FRANKA) --init-from franka --out runs/franka_varied
+	$(NERD) train franka $(BEGUN) $(FRANKA) --init-from runs/franka_varied/last --steps 6000 \
+		--rollout-steps 300 --rollout-length 20 --rollout-batch-size 48 --save-every 100 \
+		--out runs/franka_adaptive
+	$(call SHIP_ADAPTIVE,franka)
 
 # The Ant's networks: single steps and rollouts, then both again with more data along a run.
 ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
