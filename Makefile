@@ -163,7 +163,7 @@ model-ant-adaptive: $(STAMP) ## Ants that find their hidden parameters
 
 FRANKA := --data datasets/franka_varied --lr 0.004 --adamw-lr 0.0012 --bf16-fraction 0.7
 
-model-franka-adaptive: $(STAMP) ## Frankas that find them
+model-franka-adaptive: $(STAMP) ## Frankas that find their hidden parameters
 	$(NERD) data franka --vary preset --trajectories 7000 --steps 200 --out datasets/franka_varied
 	$(NERD) train franka $(BEGUN) $(FEW_ROLLOUTS) $(FRANKA) --init-from franka --out runs/franka_varied
 	$(NERD) train franka $(BEGUN) $(FRANKA) --init-from runs/franka_varied/last --steps 6000 \

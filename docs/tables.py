@@ -307,7 +307,10 @@ UNTRUSTED = "untrusted_before", "untrusted_after"
 
 
 def of_hidden(errors: dict[str, Any]) -> dict[str, float]:
-    """Means by what the tables show: a base's position, and the last or mean joint."""
+    """Means by what the tables show: a base's position, and the last or mean joint.
+
+    The base's orientation is shown where there are no joints.
+    """
     base = {k: v["mean"] for k, v in errors.items() if k.startswith("base_")}
     joints = [v["mean"] for k, v in errors.items() if k not in base]
     shown = {"base_position (m)": base["base_position"]} if base else {}

@@ -1,4 +1,4 @@
-"""A model that is told its robot's parameters and does not heed them yet.
+"""A model that is told its robot's parameters, on which its output does not depend yet.
 
     python -m experiments.hidden_parameters.told ant-mlp runs/ant_told_start
     nerd train ant --vary preset --parameters --init-from runs/ant_told_start ...
@@ -23,9 +23,17 @@ BEGINNINGS = {"weight": 0.0, "mean": 0.0, "std": SPREAD, "entry_signs": 1.0}
 
 
 def told(start: NeRD) -> NeRD:
-    """A copy of a learned model whose tokens have the parameters of the preset as well."""
+    """A copy of a learned model whose tokens have the parameters of the preset as well.
+
+    Raises:
+        ValueError: a hybrid, or a robot whose preset varies nothing.
+    """
     scene = start.scene.vary(preset_of(start.scene.name).variation)
-    assert scene.variation is not None
+    if type(start) is not NeRD or scene.variation is None:
+        raise ValueError(
+            "expected a learned model of a robot whose preset has a variation, got a "
+            f"{start.kind} one of '{scene.name}'"
+        )
     features = replace(start.scene_features.config, parameters=True)
     model = NeRD(scene, features, start.config)
     at = sum(start.scene_features.robot.sizes.values())  # behind state and drive
@@ -59,8 +67,9 @@ def insert(x: Tensor, at: int, count: int, value: float) -> Tensor:
 def main(model: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:
     """Write the checkpoint ``out`` that begins as the shipped ``model``."""
     start = from_pretrained(model, load_scene(model.partition("-")[0]))
-    assert isinstance(start, NeRD)
-    save_checkpoint(told(start), out, make_card(told(start)))
+    assert isinstance(start, NeRD)  # no analytic step has this name
+    found = told(start)
+    save_checkpoint(found, out, make_card(found))
 
 
 if __name__ == "__main__":

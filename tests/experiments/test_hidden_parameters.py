@@ -13,6 +13,7 @@ from hidden_parameters.policies import Options as PolicyOptions
 from hidden_parameters.policies import by_part
 from hidden_parameters.policies import main as learn_policies
 from hidden_parameters.told import main as tell
+from tables import of_hidden
 from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import (
@@ -77,6 +78,26 @@ def first(model, state, torque):
     dynamics = NeRDDynamics(model)
     dynamics.reset(state)
     return dynamics.step(state, torque)["qvel"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "shown"),
+    [
+        ({"cart": 1.0, "hinge": 2.0}, {"hinge (rad)": 2.0}),
+        (dict.fromkeys("abc", 3.0), {"the joints (rad)": 3.0}),
+        (
+            {"base_position": 1.0, "base_orientation": 2.0},
+            {"base_position (m)": 1.0, "base_orientation (rad)": 2.0},
+        ),
+        (
+            {"base_position": 1.0, "base_orientation": 2.0, "joints": 3.0},
+            {"base_position (m)": 1.0, "joints (rad)": 3.0},
+        ),
+    ],
+    ids=["two joints", "an arm", "a cube", "a walker"],
+)
+def test_tables_show_a_base_and_the_joints(errors, shown):
+    assert of_hidden({k: {"mean": v} for k, v in errors.items()}) == shown
 
 
 def test_a_parameter_changes_where_it_should(generator):

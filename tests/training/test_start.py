@@ -19,7 +19,7 @@ from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training import start
 from torchrl_nerd.training import trainer as module
 from torchrl_nerd.training.samples import cover, data_stats
-from torchrl_nerd.training.start import begin_from, fingerprint
+from torchrl_nerd.training.start import begin_from, fingerprint, make_model
 from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import Trainer
 
@@ -145,6 +145,29 @@ def test_a_longer_band_begins_where_the_shorter_one_is(name, generator, monkeypa
     assert (apart[0][4:] > apart[1][4:]).all() and (apart[1] < 1e-4).all()
     with pytest.raises(ValueError, match="from, transformer-2x64@9, got .*2x64@4"):
         begin_from(model, scene, replace(CONFIG, network="transformer-2x64@4"))
+
+
+def test_mirrors_that_some_varied_robots_lack_are_refused(generator):
+    """Whichever two commute: one of the start's may be no symmetry of the scene."""
+    scene = load_scene("ant")
+    config = replace(MLP, symmetries=2)
+    first = Symmetry(scene)
+    stats = first.complete(data_stats(scene, little_data(scene)))
+    initial = make_model(scene, config, stats, first)
+    whole = scene.vary({"motor": (0.6, 1.2)})
+    begin_from(initial, whole, config, Symmetry(whole))
+    one_leg = scene.vary({"damping:hip_1": (0.0, 5.0)})
+    with pytest.raises(ValueError, match="whose mirrors all robots of 'ant' have"):
+        begin_from(initial, one_leg, config, Symmetry(one_leg))
+
+
+def test_a_told_model_goes_on_with_the_parameters_that_it_knows(generator):
+    first, second = {"mass:pole": (0.3, 3.0)}, {"motor": (0.6, 1.4)}
+    scene, config = CARTPOLE.vary(first | second), replace(MLP, parameters=True)
+    initial = make_model(scene, config)
+    begin_from(initial, scene, config)
+    with pytest.raises(ValueError, match="expected the parameters .* is told"):
+        begin_from(initial, CARTPOLE.vary(second | first), config)
 
 
 def test_symmetry_needs_statistics_that_copies_share(generator):

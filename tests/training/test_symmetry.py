@@ -135,8 +135,13 @@ def test_a_robot_that_touches_itself_may_have_a_mirror(first, order, tmp_path):
 
 @pytest.mark.parametrize(
     ("more", "order"),
-    [({}, 8), ({"damping:hip_1": (0.0, 5.0)}, 2), ({"slope:y": (0.0, 0.1)}, 4)],
-    ids=["whole robot", "one leg", "slope"],
+    [
+        ({}, 8),
+        ({"damping:hip_1": (0.0, 5.0)}, 2),
+        ({"slope:y": (0.0, 0.1)}, 4),
+        ({"motor:hip_1": (0.6, 1.2), "delay": (1, 2)}, 2),
+    ],
+    ids=["whole robot", "one leg", "slope", "one motor, late"],
 )
 def test_varied_robots_keep_the_isometries_that_all_of_them_have(
     more, order, generator

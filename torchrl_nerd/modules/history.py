@@ -80,7 +80,7 @@ class TokenWindow(History):
 class WindowNetwork(nn.Module):
     """A network that recomputes its last tokens at every step, as NeRD section 3.4 does.
 
-    The same signature as the network itself.
+    It has the network's `empty_memory` and `step`.
     """
 
     def __init__(self, network: nn.Module, size: int, width: int) -> None:

@@ -91,7 +91,7 @@ class KeyValueCache(History):
     def fill(self, layer: int, key: Tensor, value: Tensor) -> None:
         """Store the first tokens of all envs at once, ``(rows, heads, T, head width)``.
 
-        Of those the ones that the band still holds, the last of them at the end.
+        The band keeps the last of them, and the ring ends with the very last one.
         """
         size = self.keys[layer].shape[2]
         for past, x in ((self.keys, key), (self.values, value)):

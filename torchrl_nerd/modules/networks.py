@@ -100,8 +100,9 @@ class GRU(nn.Module):
         return self.head(self.gru(self._embedded(tokens))[0])
 
     def read(self, tokens: Tensor, memory: HiddenState) -> Tensor:
-        """As `forward`; an empty ``memory`` is then as after so many steps."""
-        output, value = self.gru(self._embedded(tokens))
+        """``(rows, T, F) -> (rows, T, D)``; advances ``memory`` by T steps."""
+        hidden = memory.value.transpose(0, 1).contiguous()
+        output, value = self.gru(self._embedded(tokens), hidden)
         memory.value = stored(memory.value, value.transpose(0, 1))
         return self.head(output)
 

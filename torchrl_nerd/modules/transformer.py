@@ -190,7 +190,10 @@ class CausalTransformer(nn.Module):
         return self.read(tokens, None)
 
     def read(self, tokens: Tensor, memory: KeyValueCache | None) -> Tensor:
-        """As `forward`; an empty ``memory`` is then as after so many steps."""
+        """As `forward`; ``memory`` is then as after so many steps from an empty one.
+
+        It has to be empty: what it holds is replaced.
+        """
         x = self.embed(tokens)
         if self.embed_last is not None:
             adds = self.embed_last(tokens)  # (rows, T, *hidden), to the next one

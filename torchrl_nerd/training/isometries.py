@@ -119,7 +119,7 @@ class Isometry(nn.Module):
 def find_isometries(scene: Scene) -> list[Isometry]:
     """The symmetry group of a robot on its ground, the identity first.
 
-    Of a varied scene those that every robot has.
+    Of a varied scene they are those that every robot has.
 
     Raises:
         ValueError: a fixed base, a ball joint, servos, or a ground that varies.
@@ -256,5 +256,8 @@ def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
     torque = sample_commands(scene.sampling, scale, 1, generator)
     found = TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
     if scene.variation is not None:
-        found[PARAMETERS] = scene.variation.draw(count, generator)
+        own = scene.variation.draw(count, generator)
+        kinds = [p.kind for p in scene.variation.parameters]
+        # every isometry has a delay, which would hide the torque of a single step
+        found[PARAMETERS] = own * torch.tensor([kind != "delay" for kind in kinds])
     return found

@@ -59,7 +59,10 @@ def rollout_loss(
         terrain: ``(batch, terrain.size)`` or None.
         loss_eps: see `relative_error`.
         parameters: ``(batch, variation.size)`` or None.
-        history: recorded steps that come first; their errors count as well.
+        history: recorded steps that come first, at most K; their errors count as well.
+
+    Returns:
+        ``()``, float32.
     """
     delta, layout = model.state_delta, model.scene.layout
     memory = model.network.empty_memory(len(qpos))

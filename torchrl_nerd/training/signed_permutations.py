@@ -52,6 +52,11 @@ class SignedPermutations(nn.Module):
         apart = torch.maximum((means - mean).abs(), (stds - std).abs())
         return bool((apart < STATS_TOL * std).all())
 
+    def have(self, copies: SignedCopies) -> bool:
+        """Whether each of these ``(K, F)`` is one of them."""
+        mine, asked = ((1 + x) * s for x, s in (self.copies, copies))  # (*, F)
+        return bool((asked[:, None] == mine).all(-1).any(1).all())
+
     def mirrors(self, count: int) -> list[int] | None:
         """Numbers of ``count = 2^n`` isometries, products of n that commute; None if fewer.
 

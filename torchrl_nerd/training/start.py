@@ -22,14 +22,16 @@ from torchrl_nerd.modules.networks import (
     NetworkConfig,
     network_config,
 )
-from torchrl_nerd.modules.symmetric import set_mirrors
+from torchrl_nerd.modules.symmetric import Mirrored, Readout, set_mirrors
 from torchrl_nerd.modules.transformer import TransformerConfig
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.variation import expect_told, ranges_of
 from torchrl_nerd.settings import SettingError, look_up
 from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.transforms import Stats
 
-# bias of a token that is new in a longer band: its weight is e^FAR of what it would be
+# bias of a token that is new in a longer band: its weight is e^FAR of what a bias of zero
+# gives
 FAR = -4.0
 
 
@@ -85,7 +87,8 @@ def begin_from(
 
     Raises:
         ValueError: in one sentence, a configuration of another network, kind or step,
-            inputs of another width, or statistics that symmetric copies do not share.
+            inputs of another width or of other told parameters, statistics that symmetric
+            copies do not share, or mirrors that the scene does not have.
     """
     known, asked = start.config, configured_network(config)
     if known != asked and not _has_longer_band(known, asked):
@@ -104,6 +107,7 @@ def begin_from(
             f"expected a model to start from with {widths[0]} inputs and {widths[1]} "
             f"outputs as scene '{scene.name}' has, got {found[0]} and {found[1]}"
         )
+    expect_told(ranges_of(start.scene_features.variation), scene.variation)
     for kind, has, wants in _of_inputs(start, model):
         if has != wants:
             raise ValueError(f"expected to start from {kind} {wants}, got {has}")
@@ -118,11 +122,12 @@ def begin_from(
     model.normalize.load_state_dict(start.normalize.state_dict())
     if symmetry is not None:
         _expect_shared(symmetry, model)
+        _expect_mirrors(symmetry, model)
     return model
 
 
 def _has_longer_band(known: NetworkConfig, asked: NetworkConfig) -> bool:
-    """Whether two transformers differ in nothing else."""
+    """Whether ``asked`` is the transformer ``known`` with a longer band."""
     if not (
         isinstance(known, TransformerConfig) and isinstance(asked, TransformerConfig)
     ):
@@ -157,6 +162,18 @@ def _expect_shared(symmetry: Symmetry, model: NeRD) -> None:
             "expected a model to start from that was trained with use_symmetry, got one "
             "whose statistics they change: train without use_symmetry and symmetries"
         )
+
+
+def _expect_mirrors(symmetry: Symmetry, model: NeRD) -> None:
+    """Refuse mirrors in a network that are no symmetries of the scene."""
+    for layer in model.network.modules():
+        if isinstance(layer, Mirrored):
+            known = symmetry.targets if isinstance(layer, Readout) else symmetry.tokens
+            if not known.have((layer.sources, layer.entry_signs)):
+                raise ValueError(
+                    "expected a model to start from whose mirrors all robots of "
+                    f"'{symmetry.name}' have, got others: train a new one"
+                )
 
 
 def find_symmetry(scene: Scene, config: TrainConfig) -> Symmetry | None:
