@@ -59,7 +59,9 @@ def watch(model: NeRD, data: TensorDict) -> Watched:
     layers = [m.output for m in model.network.modules() if isinstance(m, Attention)]
     watched, seen = layers or [model.network.head], []
     handles = [
-        layer.register_forward_pre_hook(lambda _, given: seen.append(given[0].clone()))
+        layer.register_forward_pre_hook(
+            lambda _, given: seen.append(given[0].flatten(1).clone())
+        )
         for layer in watched
     ]
     dynamics.reset(cast(TensorDict, data[:, 0]))

@@ -100,6 +100,15 @@ def test_tables_show_a_base_and_the_joints(errors, shown):
     assert of_hidden({k: {"mean": v} for k, v in errors.items()}) == shown
 
 
+def test_hidden_states_of_symmetric_layers_are_vectors(generator):
+    """One of each row and step, whatever a layer's own shape is."""
+    scene = load_scene("ant").vary(preset_of("ant").variation)
+    own = draw_parameters(scene, "inside", ROWS, generator)
+    data = motions(scene, [own], [3], generator)
+    seen = watch(from_pretrained("ant-adaptive", scene), data)
+    assert seen.hidden.shape == (len(data), 3, 4 * 128)
+
+
 def test_a_parameter_changes_where_it_should(generator):
     before = draw_parameters(SCENE, "inside", ROWS, generator)
     after = before.clone()
