@@ -101,7 +101,7 @@ def test_tables_show_a_base_and_the_joints(errors, shown):
 
 
 def test_hidden_states_of_symmetric_layers_are_vectors(generator):
-    """One of each row and step, whatever a layer's own shape is."""
+    """One of each motion and step, whatever a layer's own shape is."""
     scene = load_scene("ant").vary(preset_of("ant").variation)
     own = draw_parameters(scene, "inside", ROWS, generator)
     data = motions(scene, [own], [3], generator)
