@@ -471,16 +471,16 @@ def policy_curves_table(folder: Path = RESULTS) -> str:
 
 def time_to_policy_table(folder: Path = RESULTS) -> str:
     """What PPO took in each dynamics until its policy had earned enough in MuJoCo."""
-    table = [["task", "learned in", "return wanted", "minutes to it", "minutes in all"]]
-    table[0] += ["last return", "promised"]
+    table = [["task, seed", "learned in", "return wanted", "minutes to it"]]
+    table[0] += ["minutes in all", "last return", "promised"]
     records = read("time_to_policy", folder).values()
     for record in records:
         found = record["results"]
         for name, curve in found["curves"].items():
             taken = found["seconds"][name]
             to_it = "not reached" if taken is None else f"{taken / 60:.1f}"
-            about = found["configuration"]["task"], name, f"{found['wanted']:,.0f}"
-            last = curve[-1]
+            how, last = found["configuration"], curve[-1]
+            about = f"{how['task']}, {how['seed']}", name, f"{found['wanted']:,.0f}"
             returns = (last.get(key) for key in ("return", "promised"))
             shown = ("not measured" if x is None else f"{x:,.0f}" for x in returns)
             table.append([*about, to_it, f"{last['seconds'] / 60:.1f}", *shown])
