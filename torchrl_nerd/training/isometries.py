@@ -109,11 +109,10 @@ class Isometry(nn.Module):
         Parameters stay: it is the same robot.
         """
         maps = {QPOS: self.qpos, QVEL: self.qvel, JOINT_TORQUE: self.torque}
-        maps |= {NEXT_QPOS: self.qpos, NEXT_QVEL: self.qvel}
+        maps |= {NEXT_QPOS: self.qpos, NEXT_QVEL: self.qvel, PARAMETERS: nn.Identity()}
         keys = data.keys(True)
         copy = {key: apply(data[key]) for key, apply in maps.items() if key in keys}
-        same = data.select(PARAMETERS, strict=False)
-        return TensorDict(copy, data.batch_size).update(same)
+        return TensorDict(copy, data.batch_size)
 
 
 def find_isometries(scene: Scene) -> list[Isometry]:
