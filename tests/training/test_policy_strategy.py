@@ -13,7 +13,7 @@ from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save
 from torchrl_nerd.files import read_json
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.seeds import fold_in
-from torchrl_nerd.training.policy_data import along_policy, policy_data
+from torchrl_nerd.training.policy_data import along_policies, policy_data
 
 TASK = "cartpole/swingup"
 SCENE = load_scene("cartpole")
@@ -32,7 +32,7 @@ def folder(tmp_path, seed):
 
 
 def test_it_draws_what_the_policy_does(folder, tmp_path):
-    strategy = along_policy(SCENE, folder, noise=0.2)
+    strategy = along_policies(SCENE, [folder], noise=0.2)
     data = load_data(SCENE, generate(SCENE, CONFIG, tmp_path / "d", True, strategy))
     task = make_task(TASK)
     actor = make_actor(load_policy(folder, task))
@@ -44,10 +44,26 @@ def test_it_draws_what_the_policy_does(folder, tmp_path):
             assert torch.equal(found[key], expected[key]), key
 
 
+def test_several_policies_share_the_trajectories(folder, tmp_path):
+    folders = folder, save_policy(Policy((4, 8, 1)), tmp_path / "b", {"task": TASK})
+    argv = ["data", "cartpole", "--policy", *map(str, folders), "--seed", "3"]
+    argv += ["--trajectories", "8", "--steps", "4", "--quiet"]
+    assert main([*argv, "--out", str(tmp_path / "d")]) == 0
+    assert read_json(tmp_path / "d" / "data.json")["strategy"].startswith("2 policies ")
+    data, task = load_data(SCENE, tmp_path / "d"), make_task(TASK)
+    actors = [make_actor(load_policy(folder, task)) for folder in folders]
+    for chunk in range(2):
+        generator = fold_in(3, chunk)
+        for half, actor in enumerate(actors):
+            expected = policy_data(task, actor, 2, 4, generator)
+            first = chunk * CHUNK + 2 * half
+            assert torch.equal(data[first : first + 2]["qpos"], expected["qpos"])
+
+
 def test_a_set_cut_short_goes_on_to_the_same_bits(folder, tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    generate(SCENE, CONFIG, whole, True, along_policy(SCENE, folder))
-    name, draw = along_policy(SCENE, folder)
+    generate(SCENE, CONFIG, whole, True, along_policies(SCENE, [folder]))
+    name, draw = along_policies(SCENE, [folder])
     calls = iter(range(2))
 
     def dying(rows, steps, generator):
@@ -58,18 +74,21 @@ def test_a_set_cut_short_goes_on_to_the_same_bits(folder, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         generate(SCENE, CONFIG, cut, True, (name, dying))
     assert read_json(cut / "data.json")["chunks_done"] == 1
-    generate(SCENE, CONFIG, cut, True, along_policy(SCENE, folder))
+    generate(SCENE, CONFIG, cut, True, along_policies(SCENE, [folder]))
     data, expected = load_data(SCENE, cut), load_data(SCENE, whole)
     assert all(torch.equal(data[k], expected[k]) for k in expected.keys(True, True))
 
 
 def test_another_policy_or_noise_is_refused(folder, tmp_path):
     out, copy = tmp_path / "d", tmp_path / "copy"
-    generate(SCENE, CONFIG, out, True, along_policy(SCENE, folder))
+    generate(SCENE, CONFIG, out, True, along_policies(SCENE, [folder]))
     save_policy(load_policy(folder), copy, {"task": TASK})  # the same one elsewhere
-    generate(SCENE, CONFIG, out, True, along_policy(SCENE, copy))
+    generate(SCENE, CONFIG, out, True, along_policies(SCENE, [copy]))
     other = save_policy(Policy((4, 8, 1)), tmp_path / "other", {"task": TASK})
-    for strategy in (along_policy(SCENE, other), along_policy(SCENE, folder, 0.4)):
+    for strategy in (
+        along_policies(SCENE, [other]),
+        along_policies(SCENE, [folder], 0.4),
+    ):
         with pytest.raises(ValueError, match=f"{out} already holds data with strategy"):
             generate(SCENE, CONFIG, out, True, strategy)
 
@@ -115,7 +134,7 @@ def test_a_folder_without_a_policy_is_refused(tmp_path, capsys):
 
 def test_varied_robots_follow_it_each_with_its_own_parameters(folder, tmp_path):
     scene = SCENE.vary({"mass:pole": (0.3, 3.0)})
-    strategy = along_policy(scene, folder)
+    strategy = along_policies(scene, [folder])
     data = load_data(scene, generate(scene, CONFIG, tmp_path / "d", True, strategy))
     masses = data["parameters"][:, 0, 0]
     assert masses.min() >= 0.3 and masses.max() <= 3.0 and masses.std() > 0.1

@@ -26,7 +26,7 @@ from torchrl_nerd.files import folder_name, read_json
 from torchrl_nerd.robots import preset_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
-from torchrl_nerd.training.policy_data import along_policy
+from torchrl_nerd.training.policy_data import along_policies
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,9 @@ class Data(SceneOptions, Command):
     recorded: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """File of recorded trajectories (npz or CSV); units and frames are checked."""
     config: Flat[DataConfig] = field(default_factory=DataConfig)
-    policy: Path | None = None
-    """Folder of a policy (see examples/ppo.py) that acts, from the resets of its task."""
+    policy: tuple[Path, ...] = ()
+    """Folders of policies (see examples/ppo.py) that act, from the resets of their tasks.
+    Each gets an equal share of the trajectories."""
     noise: float = 0.5
     """Largest standard deviation of the noise on a policy's actions, in [-1, 1]."""
     strategy: Strategy | None = None
@@ -80,10 +81,10 @@ class Data(SceneOptions, Command):
             ValueError: a strategy beside a policy, one that does not fit the robot, or
                 too few steps for hidden parameters to change.
         """
-        if self.policy is not None and self.strategy is not None:
+        if self.policy and self.strategy is not None:
             raise ValueError("expected --strategy without --policy")
-        if self.policy is not None:
-            return along_policy(scene, self.policy, self.noise)
+        if self.policy:
+            return along_policies(scene, self.policy, self.noise)
         if self.strategy is None:
             return preset_strategy(scene)
         if self.strategy == "changing":
@@ -99,7 +100,7 @@ class Data(SceneOptions, Command):
             if any(drawing) or other or is_noisy:
                 raise ValueError("expected --from without options that draw data")
             return recorded_scene(self.scene), None
-        if self.policy is None and is_noisy:
+        if not self.policy and is_noisy:
             raise ValueError(
                 "expected --noise with --policy, whose actions it is added to"
             )

@@ -1,6 +1,7 @@
-"""Training data from trajectories of an exploring policy, or of a saved one."""
+"""Training data from trajectories of an exploring policy, or of saved ones."""
 
 import hashlib
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_nerd.data.generate import Draw
 from torchrl_nerd.data.simulate import as_transitions
+from torchrl_nerd.data.strategies import mix
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.envs.actor import Actor
 from torchrl_nerd.envs.frame_stack import append_frame, frame_stack_of
@@ -80,17 +82,28 @@ def policy_data(
     return as_transitions(scene, states, commands, terrain, parameters)
 
 
-def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, Draw]:
-    """A saved policy as a strategy for `generate`: its name, and what it draws.
+def along_policies(
+    scene: Scene, folders: Sequence[Path], noise: float = 0.5
+) -> tuple[str, Draw]:
+    """Saved policies as a strategy for `generate`: its name, and what it draws.
 
-    The name contains a hash of the weights and the noise: no data set mixes two policies.
-    See `save_policy` for the folder, whose card names the task, and `policy_data`.
+    Each policy gets an equal share of the trajectories. The name contains a hash of the
+    weights and the noise: no data set is continued with other policies.
+    See `save_policy` for the folders, whose cards name the tasks, and `policy_data`.
 
     Raises:
         ValueError: in one sentence, no such policy, one for another scene, or a
             negative noise.
     """
     expect_at_least(0.0, noise=noise)
+    draws = mix(*(_along(scene, folder, noise) for folder in folders))
+    weights = b"".join((folder / WEIGHTS).read_bytes() for folder in folders)
+    names = "policy" if len(folders) == 1 else f"{len(folders)} policies"
+    digest = hashlib.sha256(weights).hexdigest()[:16]
+    return f"{names} {digest} with noise {noise:g}", draws
+
+
+def _along(scene: Scene, folder: Path, noise: float) -> Draw:
     task = policy_task(folder)
     if task.scene.hash != scene.hash:
         raise ValueError(
@@ -100,6 +113,4 @@ def along_policy(scene: Scene, folder: Path, noise: float = 0.5) -> tuple[str, D
     if scene.variation is not None:  # which a scene's hash leaves out
         task = task.with_scene(scene)
     policy = load_policy(folder, task)
-    digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:16]
-    draw = partial(policy_data, task, make_actor(policy), noise=noise)
-    return f"policy {digest} with noise {noise:g}", draw
+    return partial(policy_data, task, make_actor(policy), noise=noise)
