@@ -63,10 +63,21 @@ def test_sets_follow_each_other_in_the_order_given(scene, tmp_path, seed):
         parts = [load_data(scene, folder) for folder in order]
         assert not unequal(load_data(scene, *order), torch.cat(parts))
     generate(scene, DataConfig(trajectories=2, steps=3), tmp_path / "d", quiet=True)
-    with pytest.raises(ValueError, match=f"of 2 steps in {tmp_path}/d, as .*/a, got 3"):
+    with pytest.raises(ValueError, match=f"of 2 steps, as .* in {tmp_path}/d, got 3"):
         load_data(scene, *[*folders, tmp_path / "d"])
     with pytest.raises(ValueError, match=f"data set in {tmp_path}/none"):
         load_data(scene, *[*folders, tmp_path / "none"])
+
+
+def test_long_trajectories_are_cut_to_the_length_of_the_first_set(scene, tmp_path):
+    for name, steps in (("short", 2), ("long", 6)):
+        config = DataConfig(trajectories=3, steps=steps)
+        generate(scene, config, tmp_path / name, quiet=True)
+    data = load_data(scene, tmp_path / "short", tmp_path / "long")
+    assert data.batch_size == (12, 2)
+    whole = load_data(scene, tmp_path / "long")
+    for i, start in enumerate((0, 2, 4)):
+        assert not unequal(data[3 + i :: 3], whole[:, start : start + 2])
 
 
 def test_every_transition_obeys_the_mujoco_dynamics(scene, generator):

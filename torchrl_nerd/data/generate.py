@@ -113,21 +113,25 @@ def expect_few_dropped(card: dict[str, Any]) -> None:
 def load_data(scene: Scene, *folders: Path) -> TensorDict:
     """Finished data sets of one scene, one after the other, ``[trajectories, steps]``.
 
+    Trajectories are as long as those of the first set; longer ones are cut to pieces.
     A single chunk stays memory-mapped; several are copied to memory.
 
     Raises:
         ValueError: a data set is missing, unfinished, corrupted, recorded, of another
-            scene, or has trajectories of another length than the first one.
+            scene, or has trajectories that cannot be cut to pieces of that length.
     """
     chunks: list[TensorDict] = []
     for folder in folders:
-        chunks += _load_chunks(scene, folder)
-        steps, expected = chunks[-1].batch_size[1], chunks[0].batch_size[1]
-        if steps != expected:
+        found = _load_chunks(scene, folder)
+        steps, wanted = found[0].batch_size[1], (chunks or found)[0].batch_size[1]
+        if steps % wanted:
             raise ValueError(
-                f"expected trajectories of {expected} steps in {folder}, as in "
-                f"{folders[0]}, got {steps}"
+                f"expected trajectories of {wanted} steps, as in {folders[0]}, or of a "
+                f"multiple in {folder}, got {steps}"
             )
+        if steps > wanted:  # [n, k * steps] -> [n * k, steps]
+            found = [cast(TensorDict, chunk.reshape(-1, wanted)) for chunk in found]
+        chunks += found
     return chunks[0] if len(chunks) == 1 else cast(TensorDict, TensorDict.cat(chunks))
 
 
