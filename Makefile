@@ -49,7 +49,7 @@ $(STAMP):
 # Threads that soon fall asleep: on a loaded machine the longer wait of GNU's OpenMP takes
 # up to thirty times as long, see docs/howto/machine.md.
 demo: $(STAMP) ## learn a swing-up in learned dynamics, check it in MuJoCo
-	GOMP_SPINCOUNT=1000 $(PY) examples/ppo.py
+	GOMP_SPINCOUNT=$${GOMP_SPINCOUNT:-1000} $(PY) examples/ppo.py
 
 test: check ## lint, types and the test suite
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(ARGS)

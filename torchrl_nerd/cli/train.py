@@ -35,7 +35,7 @@ class Train(SceneOptions, DeviceCommand):
 
     Example: nerd train double_pendulum --kind hybrid
 
-    Example: nerd train ant --init-from ant-mlp --data datasets/ant datasets/ant_policy
+    Example: nerd train ant --init-from ant --data datasets/ant datasets/ant_policy
     """
 
     kind: Kind = "learned"
