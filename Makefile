@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-franka-adaptive data-ant model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-franka-adaptive data-ant data-ant-learned model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -172,10 +172,17 @@ model-franka-adaptive: $(STAMP) ## Frankas that find their hidden parameters
 	$(call SHIP_ADAPTIVE,franka)
 
 # The Ant's networks: single steps and rollouts, then both again with more data along a run.
+# Then policies learn in the MLP, and both networks learn from how they move in MuJoCo.
 ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
+ANT_LEARNED := $(ANT_DATA) datasets/ant_correlated datasets/ant_resting datasets/ant_learned
 ANT := --symmetries 4 --save-every 500 --threads 1
 FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
-AGAIN := --data $(ANT_DATA) datasets/ant_run_more --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
+BEGIN := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
+AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(BEGIN)
+LAST := --data $(ANT_LEARNED) $(BEGIN) --validate-every 4000
+LEARNED := ant_mlp_second/best
+IN_THE_MLP := $(PY) experiments/time_to_policy.py --dynamics runs/$(LEARNED) --wanted 0 \
+	--frames 8000000 --horizon 16 --minibatch 8192 --lr 1e-3 --episodes 64
 
 data-ant: $(STAMP)
 	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
@@ -185,8 +192,23 @@ data-ant: $(STAMP)
 		--out datasets/ant_spin
 	$(NERD) data ant --policy torchrl_nerd/policies/ant-run --trajectories 3000 --seed 51 \
 		--out datasets/ant_run_more
+	$(NERD) data ant --strategy correlated --trajectories 6000 --seed 81 --out datasets/ant_correlated
+	$(NERD) data ant --strategy resting --trajectories 9000 --seed 71 --out datasets/ant_resting
 
-model-ant: data-ant ## the Ant's transformer, with the mirrors of the Ant built in
+data-ant-learned: data-ant
+	$(NERD) train ant $(ANT) $(FIRST) --network mlp-4x160 --single-step-fraction 1 \
+		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp_first
+	$(NERD) train ant $(ANT) $(AGAIN) --network mlp-4x160 --single-step-fraction 1 \
+		--validate-every 4000 --init-from runs/ant_mlp_first/best \
+		--steps 10000 --rollout-steps 4500 --out runs/ant_mlp_second
+	for seed in 11 12 13; do \
+		$(IN_THE_MLP) ant/run --seed $$seed --out runs/learned_$$seed || exit 1; \
+	done
+	$(IN_THE_MLP) ant/spin --seed 11 --out runs/learned_11
+	$(NERD) data ant --policy runs/learned_*/ant-*/runs/$(LEARNED)/[0-9]* \
+		--trajectories 2200 --steps 500 --seed 61 --out datasets/ant_learned
+
+model-ant: data-ant-learned ## the Ant's transformer, with the mirrors of the Ant built in
 	$(NERD) train ant $(ANT) $(FIRST) --network transformer-4x128 --single-step-fraction 0.85 \
 		--steps 15000 --rollout-steps 3000 --out runs/ant_first
 	$(NERD) train ant $(ANT) $(AGAIN) --network transformer-4x128 --single-step-fraction 0.85 \
@@ -195,15 +217,14 @@ model-ant: data-ant ## the Ant's transformer, with the mirrors of the Ant built 
 	$(NERD) train ant $(ANT) $(AGAIN) --network transformer-4x128 --single-step-fraction 0.85 \
 		--validate-every 1500 --init-from runs/ant_second/best \
 		--steps 0 --rollout-steps 3000 --out runs/ant_third
-	cp runs/ant_third/best/* $(PRETRAINED)/ant/
+	$(NERD) train ant $(ANT) $(LAST) --network transformer-4x128 --single-step-fraction 0.85 \
+		--init-from runs/ant_third/best --steps 8000 --rollout-steps 3500 --out runs/ant_fourth
+	cp runs/ant_fourth/best/* $(PRETRAINED)/ant/
 
-model-ant-mlp: data-ant ## the Ant's MLP, with the same mirrors
-	$(NERD) train ant $(ANT) $(FIRST) --network mlp-4x160 --single-step-fraction 1 \
-		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp_first
-	$(NERD) train ant $(ANT) $(AGAIN) --network mlp-4x160 --single-step-fraction 1 \
-		--validate-every 4000 --init-from runs/ant_mlp_first/best \
-		--steps 10000 --rollout-steps 4500 --out runs/ant_mlp_second
-	cp runs/ant_mlp_second/best/* $(PRETRAINED)/ant-mlp/
+model-ant-mlp: data-ant-learned ## the Ant's MLP, with the same mirrors
+	$(NERD) train ant $(ANT) $(LAST) --network mlp-4x160 --single-step-fraction 1 \
+		--init-from runs/ant_mlp_second/best --steps 10000 --rollout-steps 4500 --out runs/ant_mlp_third
+	cp runs/ant_mlp_third/best/* $(PRETRAINED)/ant-mlp/
 
 # Transformers that learned single steps on a GPU, in minutes: make model-franka DEVICE=cuda.
 # On two cores the same takes a day. The second stage is short and runs anywhere.

@@ -272,15 +272,18 @@ def last_training(target: str) -> tuple[dict, int]:
     }
     sets = words[words.index("--data") + 1 :]
     sets = sets[: next(i for i, x in enumerate(sets) if x.startswith("--"))]
-    return changes, sum(drawn(lines, folder) for folder in sets)
+    found = [drawn(lines, folder) for folder in sets]
+    return changes, sum(count * (steps // found[0][1]) for count, steps in found)
 
 
-def drawn(lines: list[list[str]], folder: str) -> int:
-    """Trajectories that the commands draw into a data set."""
+def drawn(lines: list[list[str]], folder: str) -> tuple[int, int]:
+    """Trajectories that the commands draw into a data set, and their steps."""
     for words in (x for x in lines if "--trajectories" in x):
         out = words[words.index("--out") + 1].rstrip(";")
         if re.fullmatch(re.sub(r"\$\w+", r"\\w+", out), folder):
-            return int(words[words.index("--trajectories") + 1].rstrip(";"))
+            given = dict(pairwise(words))
+            steps = int(given.get("--steps", 100))
+            return int(given["--trajectories"].rstrip(";")), steps
     raise AssertionError(f"no command draws {folder}")
 
 
