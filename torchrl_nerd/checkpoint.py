@@ -42,9 +42,9 @@ KINDS = ("nerd", "hybrid", "analytic")
 """Names of the models of a scene, beside those of engines and of shipped models."""
 
 
-def save_checkpoint(model: Model, folder: Path, card: dict[str, Any]) -> Path:
+def save_checkpoint(model: Model, folder: str | Path, card: dict[str, Any]) -> Path:
     """Write weights, with a few steps to check them by, then card: each whole or not."""
-    folder = writable_folder(folder)
+    folder = writable_folder(Path(folder))
     steps = stored_steps(model, _solver_scene(card, model.scene))
     write_tensors(folder / WEIGHTS, model.state_dict() | steps)
     write_json(folder / CARD, card)

@@ -19,6 +19,7 @@ from torchrl_nerd.data.recorded import (
 )
 from torchrl_nerd.data.store import chunk_path, read_chunk
 from torchrl_nerd.geometry.manifold import integrate_pos
+from torchrl_nerd.scenes import Scene
 
 
 def write_csv(path, header, *columns):
@@ -297,3 +298,38 @@ def test_estimated_velocities_of_a_fall_are_exact_from_the_first_frame_on(real_c
     no_torque, offsets = torch.zeros(12, 0).double(), torch.tensor([0, 12])
     found = complete(Recording(qpos, none, no_torque, offsets, frame), real_cube)
     torch.testing.assert_close(found.qvel[:, 2], 0.5 + gravity * t)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("joint_torques", "an array 'joint_torque' in .*, got 'joint_torques'"),
+        ("Trajectory", "an array 'trajectory' in .*, got 'Trajectory'"),
+        ("ctrl", "'joint_torque' in .* of the motors of 'cartpole', got 'ctrl'"),
+    ],
+)
+def test_arrays_that_would_be_left_out_are_refused(name, words, tmp_path):
+    """Not read as a robot that nothing drives."""
+    path, frames = tmp_path / "log.npz", np.zeros((9, 2))
+    np.savez(path, qpos=frames, qvel=frames, **{name: np.ones((9, 1))})
+    with pytest.raises(ValueError, match=words):
+        read_log(path, load_scene("cartpole"))
+
+
+def test_a_free_body_without_a_ground_is_in_flight(tmp_path):
+    body = '<body pos="0 0 1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+    (tmp_path / "body.xml").write_text(
+        f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    )
+    scene = Scene.from_mjcf(tmp_path / "body.xml", control_step=0.01)
+    time, speeds = 0.01 * np.arange(20), np.arange(1, 7) / 10.0
+    qpos = np.zeros((6, 20, 7))
+    qpos[..., 2] = 1.0 + speeds[:, None] * time - 0.5 * 9.81 * time**2
+    qpos[..., 3] = 1.0
+    numbers = np.repeat(np.arange(6), 20)
+    np.savez(tmp_path / "log.npz", qpos=qpos.reshape(-1, 7), trajectory=numbers)
+    log, _ = load_recording(tmp_path / "log.npz", scene)
+    expected = torch.tensor(speeds[:, None] - 9.81 * time)
+    torch.testing.assert_close(
+        log.qvel[:, 2].reshape(6, 20)[:, 1:], expected[:, 1:], atol=1e-6, rtol=0.0
+    )

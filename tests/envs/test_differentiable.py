@@ -129,3 +129,46 @@ def test_no_grad_records_nothing_and_breaks_nothing(network, inference, generato
     for slope, expected in zip(*slopes, strict=True):
         assert (slope is None) == (expected is None)
         assert slope is None or torch.equal(slope, expected)
+
+
+@pytest.mark.parametrize("dynamics", ["analytic", "nerd"])
+@pytest.mark.parametrize(
+    ("key", "column", "value"), [("qpos", 2, -20.0), ("qvel", 0, 1e20)]
+)
+def test_an_env_at_fault_leaves_the_gradients_of_others(dynamics, key, column, value):
+    how = {"differentiable": True, "seed": 0, "state_dtype": torch.float32}
+    gradients = []
+    for is_broken in (False, True):
+        env = make_env("ant/run", dynamics, ROWS, **how)
+        start = env.reset()
+        if is_broken:
+            start[key][1, column] = value
+            start = env.reset(start, set_state=True)
+        gain = torch.ones((), requires_grad=True)
+        for _ in range(2):
+            action = gain * torch.full((ROWS, 8), 0.5)
+            start = env.step(start.set("action", action))["next"].exclude("reward")
+        assert not start["fault"][[0, 2]].any()
+        found = start["qpos"][[0, 2]].sum()
+        gradients += torch.autograd.grad(found, gain)
+    assert gradients[0].isfinite() and gradients[0] != 0.0
+    torch.testing.assert_close(gradients[1], gradients[0])
+
+
+def test_gradients_of_a_compiled_env_are_those_of_an_eager_one(generator):
+    """A later step or reset leaves what an earlier one recorded."""
+    gradients = []
+    for is_compiled in (False, True):
+        env = make_env(TASK, "nerd", ROWS, seed=0, differentiable=True)
+        if is_compiled:
+            env.compile(backend="aot_eager")
+        now, gain = env.reset(), torch.ones((), requires_grad=True)
+        for step in range(5):
+            if step == 3:
+                rows = torch.tensor([[True], [False], [False]])
+                now = env.reset(now.set("_reset", rows))
+            action = gain * torch.full((ROWS, 1), 0.3)
+            now = env.step(now.set("action", action))["next"].exclude("reward")
+        gradients += torch.autograd.grad(now["qpos"].sum(), gain)
+    assert gradients[0] != 0.0
+    torch.testing.assert_close(gradients[1], gradients[0])

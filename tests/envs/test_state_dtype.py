@@ -17,8 +17,9 @@ from torchrl_nerd import NeRDEnv, make_env
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import ENGINES
 from torchrl_nerd.geometry.constants import cast_constants
-from torchrl_nerd.robots import TASKS
+from torchrl_nerd.robots import TASKS, load_scene
 from torchrl_nerd.settings import expect_device
+from torchrl_nerd.tasks import SceneTask
 
 STEPS, ROWS = 5, 8
 DYNAMICS = ("nerd", "analytic", "mujoco")
@@ -142,3 +143,29 @@ def test_a_device_without_float64_takes_float32_alone(monkeypatch):
     assert expect_device("mps", torch.float32) == torch.device("mps")
     with pytest.raises(ValueError, match=r"that torch finds here .*, got 'mps'"):
         expect_device("mps")
+
+
+class OwnVelocity(SceneTask):
+    """Hands out views of the state."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.observation_size = scene.model.nv
+
+    def observation(self, state):
+        return state["qvel"]
+
+    def reward(self, state, action, next_state):
+        return next_state["qvel"][..., 0]
+
+
+@pytest.mark.parametrize("dynamics", ["mujoco", "nerd"])
+def test_nothing_handed_out_is_the_envs_own_memory(dynamics):
+    task = OwnVelocity(load_scene("cartpole"))
+    env = make_env(task, dynamics, ROWS, seed=0, state_dtype=torch.float32)
+    found = env.reset()
+    for shown in (found, env.rand_step(found)["next"]):
+        kept = env.state.clone()
+        for key in {"observation", "reward", "qpos", "qvel"} & {*shown.keys()}:
+            shown[key].fill_(9.0)
+        assert (env.state == kept).all()

@@ -19,12 +19,17 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, make_env
+from torchrl_nerd.analytic import make_step
 from torchrl_nerd.checkpoint import from_pretrained
+from torchrl_nerd.configs import DataConfig
+from torchrl_nerd.data.generate import generate, load_data
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.envs.base import SceneEnv
+from torchrl_nerd.evaluation.policy import Policy, make_actor
 from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.tasks import SceneTask
+from torchrl_nerd.training.policy_data import policy_data
 
 ROWS, STEPS = 5, 7
 RANGES = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4), "delay": (0, 2)}
@@ -180,6 +185,8 @@ def test_what_steps_one_robot_is_refused_for_many():
     for name in ("nerd", "analytic", "unconstrained", "cartpole-mlp"):
         with pytest.raises(ValueError, match=f"got '{name}', which steps one robot"):
             make_env(task, name)
+    with pytest.raises(ValueError, match="got 'analytic', which steps one robot"):
+        NeRDEnv(task, make_step(task.scene))
     assert PARAMETERS in make_env(task, "cartpole-adaptive").reset()
     other = task.scene.vary({"motor": (0.5, 2.0)})
     for dynamics in (
@@ -249,3 +256,35 @@ def test_a_history_that_shows_nothing_is_refused():
     ):
         with pytest.raises(ValueError, match=words):
             env.warm_up(bad)
+
+
+def test_the_fallbacks_mujoco_reads_parameters_in_its_own_order():
+    ranges = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4)}
+    backwards = dict(reversed(ranges.items()))
+    scene, task = load_scene("cartpole").vary(ranges), make_task("cartpole/swingup")
+    model = from_pretrained("cartpole-mlp", scene)
+    NeRDEnv(task.vary(ranges), model, guard="fallback")
+    with pytest.raises(ValueError, match="got some of another variation"):
+        NeRDEnv(task.vary(backwards), model, guard="fallback")
+
+
+def test_data_keep_the_order_of_their_parameters(tmp_path):
+    ranges = {"mass:pole": (0.3, 3.0), "motor": (0.6, 1.4)}
+    one = load_scene("cartpole").vary(ranges)
+    other = load_scene("cartpole").vary(dict(reversed(ranges.items())))
+    config = DataConfig(trajectories=3, steps=2)
+    generate(one, config, tmp_path, quiet=True)
+    assert len(load_data(one, tmp_path)) == 3
+    with pytest.raises(ValueError, match="give --vary as the data were drawn"):
+        load_data(other, tmp_path)
+    with pytest.raises(ValueError, match="already holds data with variation"):
+        generate(other, config, tmp_path, quiet=True)
+
+
+def test_data_along_a_policy_keep_the_parameters_of_a_start(generator):
+    task = make_task("cartpole/swingup").vary({"mass:pole": (0.3, 3.0)})
+    start = GroundTruthEnv(task, num_envs=ROWS, seed=0).reset()
+    start[PARAMETERS] = torch.full((ROWS, 1), 2.5, dtype=torch.float64)
+    actor = make_actor(Policy((4, 8, 1)))
+    data = policy_data(task, actor, ROWS, 3, generator, start=start)
+    assert (data[PARAMETERS] == 2.5).all()

@@ -98,8 +98,10 @@ def data() -> TensorDict:
     return simulate(load_scene(SCENE), 60, 10, Generator().manual_seed(1))
 
 
-def make_trainer(folder: Path, init_from: NeRD | None = None) -> Trainer:
-    how = {"horizons": (2, 4), "quiet": True, "init_from": init_from}
+def make_trainer(
+    folder: Path, init_from: NeRD | None = None, horizons: tuple[int, ...] = (2, 4)
+) -> Trainer:
+    how = {"horizons": horizons, "quiet": True, "init_from": init_from}
     return Trainer(load_scene(SCENE), data(), make_task(TASK), CONFIG, folder, **how)
 
 
@@ -208,6 +210,12 @@ def test_a_finished_run_is_left_as_it_is(whole):
     assert {k: v for k, v in after.items() if k not in boards} == {
         k: v for k, v in before.items() if k not in boards
     }
+
+
+def test_a_run_is_not_continued_with_other_validations(whole):
+    """Its table would have other columns, its best model another measure."""
+    with pytest.raises(ValueError, match="holds a run with validation"):
+        make_trainer(whole, horizons=(3,))
 
 
 def test_two_runs_of_one_seed_agree_whatever_else_is_random(whole, tmp_path):

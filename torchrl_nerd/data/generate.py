@@ -156,7 +156,7 @@ def read_card(scene: Scene, folder: Path) -> tuple[dict[str, Any], DataConfig]:
             f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
         )
     ranges = ranges_of(scene.variation)
-    if card.get("variation") != ranges:
+    if _ordered(card.get("variation")) != _ordered(ranges):
         raise ValueError(
             f"expected data that vary {ranges or 'nothing'}, got {folder}, which vary "
             f"{card.get('variation') or 'nothing'}: give --vary as the data were drawn"
@@ -206,13 +206,20 @@ def _open_card(
         return fresh
     card = read_json(path)
     identity = ("scene_hash", "config", "strategy", "ranges", "variation")
-    asked = {key: fresh.get(key) for key in identity}
-    expect_same(f"{folder} already holds data", card, asked)
+    kept, asked = ({key: x.get(key) for key in identity} for x in (card, fresh))
+    for about in (kept, asked):
+        about["variation"] = _ordered(about["variation"])
+    expect_same(f"{folder} already holds data", kept, asked)
     counted(card, folder)
     drawn = min(card["chunks_done"] * CHUNK, config.trajectories)
     if card["trajectories"] + card["dropped"] != drawn:
         raise ValueError(f"expected {path} to count the trajectories of whole chunks")
     return card
+
+
+def _ordered(ranges: dict[str, Any] | None) -> list[list[Any]] | None:
+    """A variation with its order, which is that of the numbers in ``parameters``."""
+    return None if ranges is None else [[name, [*x]] for name, x in ranges.items()]
 
 
 def counted(card: dict[str, Any], folder: Path) -> DataConfig:

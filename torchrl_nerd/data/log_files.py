@@ -69,6 +69,11 @@ def read_log(path: Path, scene: Scene) -> Recording:
     if num_ctrl(scene):
         needed.append(CONTROL)
         sizes[CONTROL] = num_ctrl(scene)
+    elif CONTROL in arrays:
+        raise ValueError(
+            f"expected '{TORQUE}' in {path} of the motors of '{scene.name}', got "
+            f"'{CONTROL}'"
+        )
     for name in needed:
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"
@@ -143,12 +148,18 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
         if size > LARGEST_LOG:
             raise ValueError(f"{size} bytes when unpacked")
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in ARRAYS if name in file.files}
+            others = sorted(set(file.files).difference(ARRAYS))
+            found = {name: file[name] for name in ARRAYS if name in file.files}
     except Exception as error:  # numpy and zipfile raise a dozen kinds at odd bytes
         said = str(error).splitlines() or [type(error).__name__]
         raise ValueError(
             f"expected an npz file in {path}, got another: {said[0]}"
         ) from None
+    missing = set(ARRAYS).difference(found, FREE_BODY if QPOS in found else ())
+    for name in others:
+        if meant := get_close_matches(name.lower(), missing, 1, 0.8):
+            raise ValueError(f"expected an array '{meant[0]}' in {path}, got '{name}'")
+    return found
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:

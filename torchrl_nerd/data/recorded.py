@@ -143,7 +143,7 @@ def complete(log: Recording, scene: Scene) -> Recording:
     log = replace(log, qpos=qpos)
     qvel = torch.where(log.qvel.isnan(), estimate_velocities(log, scene), log.qvel)
     if is_free_body(scene):
-        is_airborne = scene.clearances(qpos, log.terrain).amin(-1) > CLEAR
+        is_airborne = (scene.clearances(qpos, log.terrain) > CLEAR).all(-1)
         steady = is_airborne & log.inside
         if steady.any():
             mean = backward_differences(log, scene)[:, 2]

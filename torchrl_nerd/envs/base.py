@@ -21,7 +21,7 @@ from torchrl_nerd.envs.rendering import Renderer
 from torchrl_nerd.envs.specs import make_specs
 from torchrl_nerd.envs.streams import env_keys, stream_offsets, uniforms
 from torchrl_nerd.envs.transition import FLAGS, Transition, drive_sizes
-from torchrl_nerd.keys import ACTION, FAULT, PARAMETERS, QPOS, QVEL, TRUST
+from torchrl_nerd.keys import ACTION, FAULT, OBSERVATION, PARAMETERS, QPOS, QVEL, TRUST
 from torchrl_nerd.robots import task_id
 from torchrl_nerd.settings import expect_count, expect_device
 from torchrl_nerd.tasks import Task
@@ -105,6 +105,7 @@ class SceneEnv(RenderedEnv):
         self.register_buffer("_offsets", offsets, persistent=False)
         self.register_buffer("_keys", zeros.long(), persistent=False)
         self.register_buffer("_seed", zeros[0].long())
+        self._shown: dict[str, Tensor] = {}  # what was handed out beside the state
         self._set_seed(secrets.randbits(SEED_BITS) if seed is None else seed)
         self.eager()
 
@@ -189,6 +190,7 @@ class SceneEnv(RenderedEnv):
         for name, value in self._buffers.items():
             self._buffers[name] = cast(Tensor, value).detach().clone()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        self._shown = {}
         self._keys = env_keys(self.seed, len(self._episode), self.device)
         self.dynamics.reset(self.state)
 
@@ -229,9 +231,11 @@ class SceneEnv(RenderedEnv):
             given = given_state(self.scene, tensordict, is_reset, sizes, dtype)
         # nothing of the past is left: no gradients of it either
         if self._is_differentiable and is_reset.all():
-            old = {key: value.detach() for key, value in old.items()}
+            old, self._shown = {key: value.detach() for key, value in old.items()}, {}
         found = self._begin(old, is_reset, given)
         episode, age = self._episode + is_reset, self._age.masked_fill(is_reset, 0)
+        column = is_reset[:, None]  # other envs were shown what they were
+        found |= {k: torch.where(column, found[k], x) for k, x in self._shown.items()}
         result = self._hand_out(found, {"_episode": episode, "_age": age})
         self.dynamics.reset(result, is_reset)
         return self._seen(result)
@@ -270,12 +274,11 @@ class SceneEnv(RenderedEnv):
     ) -> dict[str, Tensor]:
         """``found``, but held envs are as they were before the step and earn nothing.
 
-        Flags are those of ``tensordict``; a transform may have changed its observation.
+        Flags are those of ``tensordict``; what else it holds a transform may have changed.
         """
-        shown = self._begin(self._state(), is_held & False, {})
-        for key in (*drive_sizes(self.task), FAULT, TRUST, *FLAGS):
-            shown[key] = tensordict.get(key, shown[key])
-        held = is_held[:, None]
+        state, held = self._state(), is_held[:, None]
+        shown = {**state, **(self._shown or self._begin(state, is_held & False, {}))}
+        shown |= {flag: tensordict.get(flag, held & False) for flag in FLAGS}
         return {k: torch.where(held, shown.get(k, 0.0), v) for k, v in found.items()}
 
     def _hand_out(
@@ -290,4 +293,7 @@ class SceneEnv(RenderedEnv):
             found[key] = own.clone()
         if not self.guard:
             found.pop(TRUST, None)
+        beside = OBSERVATION, *drive_sizes(self.task), FAULT, TRUST
+        self._shown = {key: found[key] for key in beside if key in found}
+        found |= {key: x.clone() for key, x in self._shown.items()}
         return tensordict_of(found, self.batch_size, self.device)

@@ -8,6 +8,7 @@ states, torques, actions and the ground of one such env.
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -39,6 +40,26 @@ def find_faults(
     is_finite = torch.all(qpos.isfinite(), -1) & torch.all(qvel.isfinite(), -1)
     fault = torch.where(is_finite, 3 * runs.long(), 2)  # (num_envs,)
     return torch.where(torch.all(action.isfinite(), -1), fault, 1)[:, None]
+
+
+class _FiniteGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        (grad,) = grads  # (num_envs, size)
+        return torch.where(grad.isfinite().all(-1, keepdim=True), grad, 0.0)
+
+
+def finite_gradient(x: Tensor) -> Tensor:
+    """``x (num_envs, size)``, whose gradient is zero in envs where it is not finite.
+
+    An env that diverged keeps its last state, so its next state has no gradient. But zero
+    times what is not finite is none either, and all envs share a policy's weights.
+    """
+    return cast(Tensor, _FiniteGradient.apply(x))
 
 
 class FaultRecorder:

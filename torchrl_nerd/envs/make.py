@@ -118,6 +118,8 @@ class NeRDEnv(SceneEnv):
             if task.scene.variation is not None:
                 _expect_varied(given, task.scene)
             name = model_name(given, task.scene)
+        elif task.scene.variation is not None and model.kind == "analytic":
+            _expect_varied("analytic", task.scene)
         if state_dtype == torch.float32:
             kept = {id(model.scene): model.scene}
             model = cast_constants(copy.deepcopy(model, kept), state_dtype)

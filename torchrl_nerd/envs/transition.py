@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl_nerd.compiled import Compiled, uncompiled
 from torchrl_nerd.dynamics import Dynamics, GuardedDynamics
 from torchrl_nerd.dynamics.base import warm_up
-from torchrl_nerd.envs.faults import find_faults
+from torchrl_nerd.envs.faults import find_faults, finite_gradient
 from torchrl_nerd.keys import (
     ACTION,
     CTRL,
@@ -57,12 +57,12 @@ class Transition:
 
     def __init__(self, task: Task, dynamics: Dynamics) -> None:
         if dynamics.scene.hash != task.scene.hash:
-            raise ValueError(
-                f"the task is for scene '{task.scene.name}', the dynamics for "
-                f"'{dynamics.scene.name}'"
-            )
+            ours, its = (f"'{x.name}' ({x.hash})" for x in (task.scene, dynamics.scene))
+            raise ValueError(f"the task is for scene {ours}, the dynamics for {its}")
         own, varied = dynamics.scene.variation, task.scene.variation
-        is_exact = dynamics.kind == "ground truth"  # reads parameters by their order
+        guard = dynamics.guard if isinstance(dynamics, GuardedDynamics) else None
+        # MuJoCo reads parameters by their order
+        is_exact = dynamics.kind == "ground truth" or guard == "fallback"
         is_other = is_exact and str(ranges_of(own)) != str(ranges_of(varied))
         if varied is not None and (own is None or is_other):
             raise ValueError(
@@ -78,8 +78,7 @@ class Transition:
                 f"order, dofs {tuple(motors)}, got one of dofs {tuple(driven)}"
             )
         self.task, self.dynamics = task, dynamics
-        is_guarded = isinstance(dynamics, GuardedDynamics)
-        self.is_truncating = is_guarded and dynamics.guard == "truncate"
+        self.is_truncating = guard == "truncate"
         self.eager()
 
     def eager(self) -> None:
@@ -114,7 +113,11 @@ class Transition:
         """
         # an action that is not finite is a fault, found below; the physics gets zeros
         given = torch.where(action.isfinite().all(-1, keepdim=True), action, 0.0)
-        steps = self._control_steps(self._advance, state, given, state.get(TERRAIN))
+        seen, acted = state, given
+        if torch.is_grad_enabled():  # through an env at fault no gradient goes back
+            seen = state | {key: finite_gradient(state[key]) for key in (QPOS, QVEL)}
+            acted = finite_gradient(given)
+        steps = self._control_steps(self._advance, seen, acted, state.get(TERRAIN))
         moved, drive = steps[-1]
         trusts = [after[TRUST] for after, _ in steps if TRUST in after]
         trust = reduce(torch.minimum, trusts) if trusts else None
@@ -191,7 +194,7 @@ class Transition:
             **{key: drive[key] for key in drive_sizes(self.task)},
             FAULT: fault,
             OBSERVATION: self._observation(shown),
-            "reward": reward.to(torch.float32),
+            "reward": reward.to(torch.float32, copy=True),  # a task may give a view
             "done": terminated | truncated,
             "terminated": terminated,
             "truncated": truncated,

@@ -73,7 +73,7 @@ class TokenWindow(History):
         slots = torch.arange(size, device=token.device) == index[:, None]
         tokens = torch.where(slots[..., None], token[:, None], tokens)
         self.tokens = stored(self.tokens, tokens)
-        self.age.add_(1).clamp_(max=size)
+        self.age = stored(self.age, (self.age + 1).clamp_max(size))
         return index
 
 

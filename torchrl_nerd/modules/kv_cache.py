@@ -29,8 +29,9 @@ class KeyValueCache(History):
         """See `History.clear`."""
         # the rings stay as they are: nobody sees what is older than the age, and emptying
         # them at every reset of some env took longer than a step of all
-        self.age.masked_fill_(rows, 0)
-        self.slot.masked_fill_(rows.all(), 0)  # as in a new one
+        self.age = stored(self.age, self.age.masked_fill(rows, 0))
+        slot = self.slot.masked_fill(rows.all(), 0)  # as in a new one
+        self.slot = stored(self.slot, slot)
         self.last = replaced(self.last, rows, 0.0)
 
     def restore(self, past: "KeyValueCache", rows: Tensor) -> None:
@@ -41,7 +42,7 @@ class KeyValueCache(History):
         for ring, then in ((self.keys, past.keys), (self.values, past.values)):
             for layer, old in enumerate(then):
                 ring[layer] = replaced(ring[layer], rows, old.index_select(2, turned))
-        self.age.copy_(torch.where(rows, past.age, self.age))
+        self.age = stored(self.age, torch.where(rows, past.age, self.age))
         self.last = replaced(self.last, rows, past.last)
 
     def tensors(self) -> list[Tensor]:
@@ -107,8 +108,7 @@ class KeyValueCache(History):
     def advance(self) -> None:
         """Count one token."""
         size = self.keys[0].shape[2]
-        if torch.is_grad_enabled():  # there `write` shifts
-            self.slot.zero_()
-        else:
-            self.slot.add_(1).remainder_(size)
-        self.age.add_(1).clamp_(max=size - 1)
+        # with gradients `write` shifts
+        slot = self.slot * 0 if torch.is_grad_enabled() else (self.slot + 1) % size
+        self.slot = stored(self.slot, slot)
+        self.age = stored(self.age, (self.age + 1).clamp_max(size - 1))

@@ -84,7 +84,7 @@ def fit_flight(scene: Scene, recording: Recording) -> dict[str, float]:
     is off the ground long enough.
     """
     gaps = scene.clearances(recording.qpos, recording.terrain)
-    is_airborne = gaps.amin(-1) > CLEAR
+    is_airborne = (gaps > CLEAR).all(-1)
     rows, values = [], []
     for trajectory in recording.trajectories:
         # until it first lands

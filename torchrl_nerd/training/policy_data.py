@@ -36,10 +36,10 @@ def policy_data(
 ) -> TensorDict:
     """Draw ``[trajectories, steps]`` of a policy in MuJoCo, diverged ones included.
 
-    They start with the task's resets, or in the states ``start [trajectories]``, and
-    continue where an episode would end. Actions are the policy's mean plus normal noise,
-    clipped to [-1, 1]; the noise of each trajectory has a standard deviation from
-    U(0, ``noise``), in units of the action.
+    They start with the task's resets, or in the states ``start [trajectories]``, with its
+    hidden parameters where it has some, and continue where an episode would end. Actions
+    are the policy's mean plus normal noise, clipped to [-1, 1]; the noise of each
+    trajectory has a standard deviation from U(0, ``noise``), in units of the action.
 
     Raises:
         ValueError: a task that drives a robot with servos by torques.
@@ -55,7 +55,9 @@ def policy_data(
     dynamics = MujocoDynamics(scene)
     dynamics.reset(current)
     state: TensorDictBase = current.select(QPOS, QVEL)
-    if scene.variation is not None:
+    if start is not None and PARAMETERS in start.keys():
+        state[PARAMETERS] = start[PARAMETERS]
+    elif scene.variation is not None:
         state[PARAMETERS] = scene.variation.draw(trajectories, generator)
     action = torch.zeros(trajectories, controller.num_actions, dtype=torch.float64)
     states, commands, recent = [state.select(QPOS, QVEL)[:, None]], [], None

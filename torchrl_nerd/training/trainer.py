@@ -104,9 +104,8 @@ class Trainer:
             )
         self.scene, self.source, self.config = scene, source, config
         check_writable(folder / STATE)
-        self.folder, self.device = folder, torch.device(device)
+        self.folder, self.device, self.quiet = folder, torch.device(device), quiet
         self.horizons, self.random_actions = list(horizons), random_actions
-        self.quiet = quiet
         self.logger: LoggerName = logger
         torch.manual_seed(config.seed)
         self._build(data, init_from)
@@ -115,6 +114,7 @@ class Trainer:
             "scene_hash": scene.hash,
             "init_from": self.init_from,
             "data": data_fingerprint(data),
+            "validation": [self.horizons, random_actions],
         }
         self.optimizers = self.make_optimizers()
         weights = self.model.network.named_parameters()
@@ -122,8 +122,8 @@ class Trainer:
         self.state = RunState(self.model.network, self.average, self.optimizers)
         one = torch.ones((), device=self.device)
         self.lr_ratio, self.ema_share = one, one.clone()
-        coarse = in_bfloat16(self._one_step, self.device)
-        losses = {"one_step": self._one_step, "bfloat16": coarse}
+        one_step = self._one_step
+        losses = {"one_step": one_step, "bfloat16": in_bfloat16(one_step, self.device)}
         if compile:
             how = {"warmup": 0, "dynamic": False}
             losses = {name: Compiled(x, **how) for name, x in losses.items()}

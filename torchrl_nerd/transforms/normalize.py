@@ -98,7 +98,7 @@ class Normalize(StateTransform):
         for key, of_key in stats.items():
             parts = (key,) if isinstance(key, str) else key
             name = "_".join(("key", *parts)).replace(".", "_")  # pyright: ignore
-            if name in self.names.values():  # "a_b" beside ("a", "b")
+            while name in self.names.values():  # "a_b" beside ("a", "b")
                 name = f"{name}_{len(self.names)}"
             self.names[key] = name
             self.register_buffer(f"{name}_mean", of_key.mean.clone())
