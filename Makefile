@@ -180,8 +180,7 @@ FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
 BEGIN := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
 AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(BEGIN)
 LAST := --data $(ANT_LEARNED) $(BEGIN) --validate-every 4000
-LEARNED := ant_mlp_second/best
-IN_THE_MLP := $(PY) experiments/time_to_policy.py --dynamics runs/$(LEARNED) --wanted 0 \
+IN_THE_MLP := $(PY) experiments/time_to_policy.py --dynamics runs/ant_mlp_second/best --wanted 0 \
 	--frames 8000000 --horizon 16 --minibatch 8192 --lr 1e-3 --episodes 64
 
 data-ant: $(STAMP)
@@ -205,7 +204,7 @@ data-ant-learned: data-ant
 		$(IN_THE_MLP) ant/run --seed $$seed --out runs/learned_$$seed || exit 1; \
 	done
 	$(IN_THE_MLP) ant/spin --seed 11 --out runs/learned_11
-	$(NERD) data ant --policy runs/learned_*/ant-*/runs/$(LEARNED)/[0-9]* \
+	$(NERD) data ant --policy runs/learned_*/ant-*/*/[0-9]* \
 		--trajectories 2200 --steps 500 --seed 61 --out datasets/ant_learned
 
 model-ant: data-ant-learned ## the Ant's transformer, with the mirrors of the Ant built in

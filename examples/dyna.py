@@ -71,7 +71,7 @@ def make_buffer(size: int, batch_size: int) -> TensorDictReplayBuffer:
 def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer, TensorDictReplayBuffer]:
     """An agent, the transitions of MuJoCo and the learned ones."""
     env = make_env(cfg.task, "mujoco", cfg.num_envs, seed=cfg.seed)
-    model = make_env(cfg.task, cfg.dynamics, cfg.starts)
+    model = make_env(cfg.task, cfg.dynamics, cfg.starts, seed=cfg.seed + 1)
     agent, frames = Agent(env), cfg.num_envs * cfg.horizon
     fraction = cfg.learned_fraction if cfg.branch else 0.0
     num_learned = round(fraction * cfg.batch_size)

@@ -127,8 +127,8 @@ def train(
         schedule.step()
         progress.update(frames)
         if number % cfg.evaluate_every == 0 or number * frames == total:
-            episodes, seed = min(256, cfg.episodes), cfg.seed + 1
-            found = transfer(task, actor, [cfg.dynamics], episodes, seed=seed)
+            how = {"seed": cfg.seed + 1, "device": cfg.device}
+            found = transfer(task, actor, [cfg.dynamics], min(256, cfg.episodes), **how)
             means = {name: returns.mean for name, returns in found.items()}
             progress.set_postfix(means)
             curve.append({"frames": number * frames, **means})
@@ -141,7 +141,7 @@ def main(cfg: Run, collect: Callable = collect) -> None:
     policy, curve = train(cfg, collect=collect)
     save_policy(policy, cfg.out, asdict(cfg))
     write_json(cfg.out / "learning_curve.json", {"curve": curve})
-    how = cfg.dynamics, cfg.episodes, cfg.seed + 2, cfg.out
+    how = cfg.dynamics, cfg.episodes, cfg.seed + 2, cfg.out, cfg.device
     report_transfer(cfg.task, make_actor(policy), *how)
     print(f"Policy: {cfg.out}. Video: nerd play {cfg.task} --policy {cfg.out}")
 

@@ -32,7 +32,7 @@ from torchrl_nerd.envs.frame_stack import stack_frames
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.files import read_json, write_json
+from torchrl_nerd.files import folder_name, read_json, write_json
 from torchrl_nerd.robots import PPO_CONFIGS, make_task
 
 FEW = "mujoco-"  # and a number of substeps
@@ -99,10 +99,13 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
 
     A curve that is in the folder already, with the same settings, is not made again.
     """
-    kept, same = cfg.folder / name / "curve.json", json_of(cfg)
+    folder = cfg.folder / folder_name(name)
+    kept, same = folder / "curve.json", json_of(cfg)
     if kept.exists() and (found := read_json(kept))["configuration"] == same:
         return found["curve"]
     use_one_thread()
+    cold = TemporaryDirectory()  # nothing is compiled yet, whoever came first
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = cold.name
     how, clock, curve = cfg.ppo, Clock(), []
     env = env_of(name, cfg.task, how.num_envs, cfg.seed, compile=True)
     env = stack_frames(env, how.frame_stack)
@@ -118,12 +121,13 @@ def learn_in(name: str, cfg: Config) -> list[dict[str, Any]]:
             returns[judge] = float(policy_returns(tried, learner.actor).mean())
         reached, promised = returns["mujoco"], returns[name]
         about = {"learned_in": name, "task": cfg.task, "return": reached}
-        save_policy(learner.policy, cfg.folder / name / f"{point}", about)
+        save_policy(learner.policy, folder / f"{point}", about)
         frames = learner.done * learner.batch
         curve.append({"frames": frames, "seconds": clock.spent()})
         curve[-1] |= {"return": reached, "promised": promised}
         print(f"{name}: {curve[-1]}", flush=True)
         clock.note("watching")
+    cold.cleanup()
     write_json(kept, {"configuration": same, "curve": curve})
     return curve
 
@@ -171,6 +175,4 @@ def main(cfg: Config) -> None:
 
 if __name__ == "__main__":
     os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # so that it is counted
-    with TemporaryDirectory() as nothing_compiled:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = nothing_compiled
-        run(main, Config, __doc__)
+    run(main, Config, __doc__)

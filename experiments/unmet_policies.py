@@ -21,10 +21,11 @@ from learner import run, use_one_thread
 from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import model_name, shipped_models
-from torchrl_nerd.evaluation.policy import load_policy, make_actor
+from torchrl_nerd.evaluation.policy import CARD, load_policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import GROUND_TRUTH, transfer
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.tables import text_table
+from torchrl_nerd.files import read_json
 from torchrl_nerd.robots import make_task
 
 
@@ -63,9 +64,10 @@ def found_policies(folder: Path) -> list[Path]:
 def play(cfg: Config, policy: Path) -> list[dict[str, Any]]:
     """A row for each model that the policy did not learn in."""
     use_one_thread()
-    task, learned_in = make_task(cfg.task), policy.parent.name
+    task, learned_in = make_task(cfg.task), read_json(policy / CARD)["learned_in"]
     own = model_name(learned_in, task.scene)
-    unmet = [name for name in cfg.names() if name not in (learned_in, own)]
+    named = {name: model_name(name, task.scene) for name in cfg.names()}
+    unmet = [name for name, model in named.items() if model != own]
     actor = make_actor(load_policy(policy, task))
     found = transfer(task, actor, unmet, cfg.episodes, seed=cfg.seed)
     reached = found[GROUND_TRUTH].mean

@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 
 from torchrl_nerd.data.simulate import as_transitions, is_sound
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.keys import PARAMETERS, TERRAIN
+from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import held
 from torchrl_nerd.scenes.sampling import sample_correlated_commands
@@ -46,15 +46,22 @@ def motions(
     start, scale = scene.sample_initial(rows, generator)
     terrain = start.pop(TERRAIN, None)
     how = total, scene.control_step, generator
-    commands = sample_correlated_commands(scene.sampling, scale, *how)
+    how = total, scene.control_step, generator
+    drawn = sample_correlated_commands(scene.sampling, scale, *how).split(steps, 1)
     dynamics, state = MujocoDynamics(scene), TensorDict(start, [rows])
     dynamics.reset(state)
-    path, own = [state[:, None]], []
-    for part, given in zip(commands.split(steps, 1), parameters, strict=True):
-        last = cast(TensorDict, path[-1][:, -1]).set(PARAMETERS, given)
-        torque, ctrl = held(scene, part)
-        path.append(dynamics.rollout(last, torque, terrain, ctrl))
+    path, own, commands = [state[:, None]], [], []
+    drive = scene.sampling.drive
+    for part, given in zip(drawn, parameters, strict=True):
+        # what depends on the state, as in the training data, is made step by step
+        for command in (part,) if drive is None else part.split(1, 1):
+            last = cast(TensorDict, path[-1][:, -1]).set(PARAMETERS, given)
+            if drive is not None:
+                command = drive(last[QPOS], last[QVEL], scale, generator)[:, None]
+            torque, ctrl = held(scene, command)
+            path.append(dynamics.rollout(last, torque, terrain, ctrl))
+            commands.append(command)
         own.append(given[:, None].expand(-1, part.shape[1], -1))
-    data = as_transitions(scene, path, [commands], terrain)
+    data = as_transitions(scene, path, commands, terrain)
     data[PARAMETERS] = torch.cat(own, 1)
     return cast(TensorDict, data[is_sound(data)])

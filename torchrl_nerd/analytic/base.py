@@ -10,7 +10,12 @@ from torch import Tensor, nn
 
 from torchrl_nerd.configs import StepConfig
 from torchrl_nerd.geometry.rigid_body import other_forces
-from torchrl_nerd.scenes.contact_points import own_contacts, touching_geoms
+from torchrl_nerd.scenes.contact_points import (
+    ground_geoms,
+    own_contacts,
+    terrain_geoms,
+    touching_geoms,
+)
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.shapes import EXACT, geom_kind
 
@@ -89,6 +94,7 @@ def check_supported(scene: Scene) -> None:
     model = scene.model
     kinds = {geom_kind(model, geom) for geom in touching_geoms(model)}
     flags = model.opt.enableflags
+    obstacles = {*ground_geoms(model)} - {*terrain_geoms(model)}
     forces = other_forces(model) | {
         "self-contact": own_contacts(model),
         "contact pairs with a law of their own": model.npair,
@@ -98,6 +104,7 @@ def check_supported(scene: Scene) -> None:
         "shapes that adhere": model.geom_adhesion.any(),
         "cylinders, ellipsoids or meshes on the ground": not kinds <= {*EXACT},
         "servos of MuJoCo": scene.servos is not None,
+        "obstacles but planes, boxes and height fields": obstacles,
     }
     found = ", ".join(name for name, is_there in forces.items() if is_there)
     if found:

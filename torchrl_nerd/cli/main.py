@@ -26,7 +26,7 @@ from torchrl_nerd.cli.train import Train
 from torchrl_nerd.cli.transfer import Transfer
 from torchrl_nerd.configs import DataConfig, TrainConfig
 from torchrl_nerd.files import check_writable
-from torchrl_nerd.robots import PRESETS, preset_of
+from torchrl_nerd.robots import SCENES, preset_of
 from torchrl_nerd.scenes import is_import
 from torchrl_nerd.settings import SettingError, did_you_mean
 
@@ -111,7 +111,7 @@ def _scene_in(kind: type[Data | Train], args: list[str]) -> str | None:
     for before, word in pairwise(["", *args]):
         name = before.removeprefix("--").replace("-", "_").removeprefix("no_")
         is_value = before.startswith("--") and "=" not in before and name not in flags
-        if not is_value and (word in PRESETS or is_import(word)):
+        if not is_value and (word in SCENES or is_import(word)):
             return word
     return None
 

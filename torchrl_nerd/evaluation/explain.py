@@ -22,7 +22,7 @@ from torchrl_nerd.keys import (
 )
 from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
-from torchrl_nerd.scenes.contact_points import body_label, own_contacts
+from torchrl_nerd.scenes.contact_points import body_label, ground_geoms, own_contacts
 from torchrl_nerd.scenes.penetration import touching_bodies
 from torchrl_nerd.scenes.symmetries import Effect, base_effects, why_all_kept
 from torchrl_nerd.scenes.terrain import PLANE
@@ -222,6 +222,8 @@ def _count(number: int, what: str) -> str:
 
 def _terrain(scene: Scene, has_normal: bool) -> str:
     terrain = scene.terrain
+    if terrain is None and ground_geoms(scene.model):
+        return "shapes that no feature shows"
     if terrain is None:
         return "none that the robot can touch" + FALLS * scene.base.is_floating
     planes = sum(surface.kind == PLANE for surface in terrain.surfaces)

@@ -151,16 +151,22 @@ def transfer_table(summaries: dict[str, ReturnSummary]) -> str:
 
 
 def report_transfer(
-    task: str, actor: Actor, learned_in: str, episodes: int, seed: int, folder: Path
+    task: str,
+    actor: Actor,
+    learned_in: str,
+    episodes: int,
+    seed: int,
+    folder: Path,
+    device: torch.device | str = "cpu",
 ) -> dict[str, ReturnSummary]:
     """Print returns in every dynamics and write them to ``folder / "returns.json"``.
 
     The policy is measured in the dynamics that it ``learned_in``, the shipped model, MuJoCo
-    and dm_control; see `transfer`, which it raises as.
+    and dm_control, all on ``device``; see `transfer`, which it raises as.
     """
     learned = ("nerd",) if shipped_models(make_task(task).scene) else ()
     everywhere = (learned_in, *learned, "mujoco", "dm_control")
-    returns = transfer(task, actor, everywhere, episodes, seed=seed)
+    returns = transfer(task, actor, everywhere, episodes, seed=seed, device=device)
     print(transfer_table(returns))
     write_json(folder / "returns.json", {k: asdict(v) for k, v in returns.items()})
     return returns

@@ -91,7 +91,10 @@ class RigidBodyDynamics(nn.Module):
         where = {dof: at for at, dof in enumerate(actuated)}
         # of each dof its place among the torques, behind them where there is none
         self.torque_at = [where.get(dof, len(actuated)) for dof in range(model.nv)]
-        moves, has_mass = model.body_weldid != 0, model.body_mass > 0.0
+        is_still = (model.body_weldid == 0) | (
+            model.body_mocapid[model.body_weldid] >= 0
+        )
+        moves, has_mass = ~is_still, model.body_mass > 0.0
         if model.body_inertia[moves & ~has_mass].any():
             raise ValueError(
                 "expected mass where there is inertia, got a moving body without mass"

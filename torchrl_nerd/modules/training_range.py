@@ -208,15 +208,19 @@ class Sleep(nn.Module):
         self.register_buffer("sleep_speed", zero)
         self.register_buffer("sleep_gain", zero.clone())
 
+    def is_asleep(self, before: Tensor, after: Tensor) -> Tensor:
+        """Where ``qvel (*batch, nv)`` before and after a step counts as rest."""
+        old, new = (magnitudes(self.vectors, qvel) for qvel in (before, after))
+        is_slow = torch.maximum(old, new) < self.sleep_speed
+        return (is_slow & (new - old < self.sleep_gain)).all(-1)
+
     def apply_sleep(
         self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """The state after, or the one before at zero velocity where the robot sleeps."""
         if not self.can_rest:
             return after
-        old, new = (magnitudes(self.vectors, state[1]) for state in (before, after))
-        is_slow = torch.maximum(old, new) < self.sleep_speed
-        is_asleep = (is_slow & (new - old < self.sleep_gain)).all(-1, keepdim=True)
+        is_asleep = self.is_asleep(before[1], after[1])[..., None]
         qpos = torch.where(is_asleep, before[0], after[0])
         return qpos, after[1].masked_fill(is_asleep, 0.0)
 

@@ -176,7 +176,8 @@ class Variation:
         """
         fields = Fields(self.model, len(parameters))
         for kind, about in KINDS.items():
-            for i, p in self._of_kind(kind):
+            # those of all bodies or joints first: one of its own has the last word
+            for i, p in sorted(self._of_kind(kind), key=lambda x: ":" in x[1].name):
                 value, indices = parameters[:, i : i + 1], p.indices
                 if kind == "payload":
                     names = (f"payload_{x}{p.suffix}" for x in "xyz")

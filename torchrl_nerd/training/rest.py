@@ -18,6 +18,7 @@ MAX_STATES, MIN_STATES = 256, 16
 STEPS = 20
 QUANTILE, MARGIN = 0.99, 1.5
 MAX_SPEED = 0.1  # m/s or rad/s: a model that moves faster than this does not rest
+LEAST_RESTING = 0.01  # of what would sleep: legs on soft ground creep, and never rest
 
 
 def resting(data: TensorDict) -> TensorDict:
@@ -28,13 +29,25 @@ def resting(data: TensorDict) -> TensorDict:
     return cast(TensorDict, flat[still[:: max(1, -(-len(still) // MAX_STATES))]])
 
 
+def slow(data: TensorDict) -> Tensor:
+    """Velocities before and after transitions that are slow, ``(n, 2, nv)``."""
+    both = torch.stack((data[QVEL], data[NEXT_QVEL]), -2).flatten(0, 1)
+    return both[both.abs().amax((-2, -1)) < MAX_SPEED]
+
+
+def rest_of(data: TensorDict) -> tuple[TensorDict, Tensor]:
+    """What `find_rest` needs of a data set ``[trajectories, steps]``."""
+    return resting(data), slow(data)
+
+
 @torch.no_grad()
-def find_rest(model: NeRD, states: TensorDict) -> None:
+def find_rest(model: NeRD, states: TensorDict, slow: Tensor) -> None:
     """Set a model's `Sleep` thresholds from its own motion of states at rest.
 
     ``sleep_speed`` is above the speeds that it gives them within 20 steps, ``sleep_gain``
     above those that it gives them, stopped, within one. Nothing is changed where there are
-    too few such states; a model that does not keep them at rest never sleeps.
+    too few such states. A model that does not keep them at rest never sleeps, nor does one
+    where hardly any of the ``slow`` transitions below these thresholds are at rest.
     """
     if len(states) < MIN_STATES or not model.sleep.can_rest:
         return
@@ -46,6 +59,11 @@ def find_rest(model: NeRD, states: TensorDict) -> None:
     if speeds.max() < MAX_SPEED:  # False where it is no number
         model.sleep.sleep_speed.copy_(MARGIN * speeds)
         model.sleep.sleep_gain.copy_(MARGIN * gains)
+        asleep = slow[model.sleep.is_asleep(slow[:, 0], slow[:, 1])]
+        count = int((asleep.abs().amax((-2, -1)) < REST_SPEED).sum())
+        if count < LEAST_RESTING * len(asleep):
+            model.sleep.sleep_speed.zero_()
+            model.sleep.sleep_gain.zero_()
 
 
 def _speeds(model: NeRD, states: TensorDict, steps: int) -> Tensor:

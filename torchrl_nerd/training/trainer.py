@@ -38,7 +38,7 @@ from torchrl_nerd.training.optimizers import (
     learning_rate_ratio,
     make_optimizers,
 )
-from torchrl_nerd.training.rest import find_rest, resting
+from torchrl_nerd.training.rest import find_rest, rest_of
 from torchrl_nerd.training.samples import cover, data_stats
 from torchrl_nerd.training.sequences import Inputs, Sequences
 from torchrl_nerd.training.start import (
@@ -149,7 +149,7 @@ class Trainer:
         self.model = model.to(self.device)
         symmetry = symmetry and symmetry.to(self.device)
         shown = symmetry if self.config.use_symmetry else None
-        self.sequences, self.resting = Sequences(model, data, shown), resting(data)
+        self.sequences, self.rest = Sequences(model, data, shown), rest_of(data)
         if self.config.rollout_steps:
             self.sequences.expect_rollouts(self.config.rollout_states)
         seen = self.sequences.features, self.sequences.targets
@@ -244,7 +244,7 @@ class Trainer:
         """A copy of the model with the averaged weights and its sleep threshold."""
         model = copy.deepcopy(self.model)
         model.network.load_state_dict(self.average, strict=False)  # mirrors stay
-        find_rest(model.eval(), self.resting)
+        find_rest(model.eval(), *self.rest)
         return model
 
     def validate(self) -> dict[str, float]:
