@@ -8,6 +8,7 @@ import torch
 from helpers import make_scene, mujoco_step, random_transitions
 
 from torchrl_nerd.analytic.unconstrained import UnconstrainedStep
+from torchrl_nerd.evaluation.explain import explain
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.transforms import StateDelta
@@ -185,3 +186,30 @@ def test_forces_that_it_does_not_have_are_refused(old, new, said):
     text = CHAIN.format(integrator="Euler").replace(old, new, 1)
     with pytest.raises(ValueError, match=said):
         UnconstrainedStep(make_scene(text))
+
+
+OBSTACLE = """<mujoco><worldbody><geom type="sphere" size="0.1" pos="0.3 0 0.5"/>
+  <body pos="0 0 1"><joint axis="0 1 0"/><geom type="capsule" size="0.04"
+  fromto="0 0 0 -0.6 0 0"/></body>{more}</worldbody></mujoco>"""
+
+
+def test_an_obstacle_that_no_step_sees_is_refused_and_named():
+    scene = make_scene(OBSTACLE.format(more=""))
+    with pytest.raises(ValueError, match="with obstacles but planes, boxes and height"):
+        UnconstrainedStep(scene)
+    assert "shapes that no feature shows" in str(explain(scene))
+
+
+def test_what_is_moved_by_hand_is_no_part_of_the_robot(generator):
+    """A target to look at changes nothing, whatever it weighs."""
+    untouched = 'contype="0" conaffinity="0"'
+    hand = f'<body mocap="true"><geom size="0.05" {untouched} {{weight}}/></body>'
+    free = OBSTACLE.replace('<geom type="sphere"', f"<geom {untouched}")
+    scenes = [
+        make_scene(free.format(more=hand.format(weight=weight)))
+        for weight in ('mass="0"', 'mass="5"')
+    ]
+    rows = random_transitions(scenes[0], ROWS, generator)
+    given = rows[QPOS], rows[QVEL], rows[JOINT_TORQUE]
+    light, heavy = (UnconstrainedStep(scene)(*given) for scene in scenes)
+    assert torch.equal(light.qvel, heavy.qvel) and light.qvel.isfinite().all()

@@ -203,3 +203,14 @@ def test_bad_settings_are_named(capsys):
     assert "unknown case 'luck'" in capsys.readouterr().err
     assert main(["stability", "cartpole", "--scale", "0"]) == 2
     assert "expected a scale in (0, 1], got 0.0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_a_fall_is_that_of_the_robots_integrator(integrator):
+    body = '<body pos="0 0 9"><freejoint/><geom size="0.1"/></body>'
+    how = f'<option timestep="0.01" integrator="{integrator}"/>'
+    floor = '<geom type="plane" size="0 0 1"/>'
+    scene = make_scene(f"<mujoco>{how}<worldbody>{floor}{body}</worldbody></mujoco>")
+    found = list(run_cases(MujocoDynamics(scene), [CASES["free_fall"]], 0))
+    values = list(found[0].ground_truth.values())
+    assert values and max(values) < 1e-4

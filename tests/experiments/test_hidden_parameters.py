@@ -187,3 +187,13 @@ def test_policies_of_seconds(generator, tmp_path):
     rows = json.loads(path.read_text())["results"]["policies"]
     assert len(rows) == 6 and all(len(row["by_parameter"]) == 5 for row in rows)
     assert ["promised" in row for row in rows] == [True, True] + 4 * [False]
+
+
+def test_a_robot_is_driven_as_in_its_training_data(generator):
+    """ANYmal by PD controllers, which keep it on its feet; torques let it fall."""
+    scene = load_scene("anymal").vary(preset_of("anymal").variation)
+    own = draw_parameters(scene, "inside", 16, generator)
+    data = motions(scene, [own, own], [40, 20], generator)
+    assert data.shape[1] == 60 and len(data) > 8
+    height = data["qpos"][:, -1, 2]
+    assert height.median() > 0.25

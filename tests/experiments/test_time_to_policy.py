@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from time_to_policy import env_of, time_to, wanted_of
 
 from torchrl_nerd import make_env
+from torchrl_nerd.evaluation.policy import Policy, save_policy
 from torchrl_nerd.robots import make_task
 
 
@@ -125,3 +126,19 @@ def test_both_scripts_with_tables_and_a_picture(tmp_path):
     counts = {m["model"]: m["policies"] for m in found["models"]}
     assert counts == {"cartpole-mlp": 6, "analytic": 9}  # its own three are left out
     assert "analytic" in tables.unmet_policies_table(tmp_path)
+
+
+def test_a_policy_does_not_play_in_the_model_it_learned_in(tmp_path, monkeypatch):
+    """Whatever that model is called."""
+    played = []
+    monkeypatch.setattr(
+        unmet_policies, "transfer", lambda *given, **how: played.append(given[2]) or {}
+    )
+    monkeypatch.setattr(unmet_policies, "GROUND_TRUTH", "none")
+    models = ("nerd", "cartpole", "cartpole-mlp")
+    cfg = unmet_policies.Config("cartpole/swingup", tmp_path, models)
+    about = {"task": "cartpole/swingup", "learned_in": "nerd"}
+    folder = save_policy(Policy((4, 8, 1)), tmp_path / "any" / "0", about)
+    with pytest.raises(KeyError, match="none"):
+        unmet_policies.play(cfg, folder)
+    assert played == [["cartpole-mlp"]]

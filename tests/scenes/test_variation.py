@@ -239,3 +239,11 @@ def test_the_centre_of_a_simple_body_stays(kind):
     ranges = {kind: (-0.01, 0.01), **({"payload": (0, 1)} if "load" in kind else {})}
     with pytest.raises(ValueError, match=f"no simple one for '{kind}'"):
         load_scene("cube").vary(ranges)
+
+
+def test_a_joints_own_range_goes_before_that_of_all():
+    ranges = {"damping:hinge": (0.0, 1.0), "damping": (0.0, 1.0)}
+    for given in (ranges, dict(reversed(ranges.items()))):
+        variation = load_scene("cartpole").vary(given).variation
+        drawn = np.array([[0.9 if ":" in name else 0.1 for name in given]])
+        assert variation.fields(drawn)["dof_damping"].tolist() == [[0.1, 0.9]]
