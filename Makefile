@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-franka-adaptive data-ant data-ant-learned model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -160,6 +160,12 @@ model-ant-adaptive: $(STAMP) ## Ants that find their hidden parameters
 	$(NERD) train ant $(BEGUN) $(FEW_ROLLOUTS) --data datasets/ant_varied --init-from ant \
 		--symmetries 4 --lr 0.006 --adamw-lr 0.0018 --out runs/ant_adaptive
 	$(call SHIP_ADAPTIVE,ant)
+
+model-anymal-adaptive: $(STAMP) ## ANYmals that find their hidden parameters
+	$(NERD) data anymal --vary preset --trajectories 7000 --steps 200 --out datasets/anymal_varied
+	$(NERD) train anymal $(BEGUN) $(FEW_ROLLOUTS) --data datasets/anymal_varied --init-from anymal \
+		--lr 0.006 --adamw-lr 0.0018 --save-every 100 --out runs/anymal_adaptive
+	$(call SHIP_ADAPTIVE,anymal)
 
 FRANKA := --data datasets/franka_varied --lr 0.004 --adamw-lr 0.0012 --bf16-fraction 0.7
 
