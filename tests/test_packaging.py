@@ -106,7 +106,8 @@ def test_a_second_make_installs_nothing_until_the_pins_change(tmp_path):
     stamp = tmp_path / re.findall(r"touch (\S+)", first)[0]
     stamp.parent.mkdir()
     stamp.touch()
-    assert plan() == "GOMP_SPINCOUNT=1000 .venv/bin/python examples/ppo.py\n"
+    spins = "GOMP_SPINCOUNT=${GOMP_SPINCOUNT:-1000}"  # another value is kept
+    assert plan() == f"{spins} .venv/bin/python examples/ppo.py\n"
     with open(tmp_path / "constraints.txt", "a") as file:
         file.write("# newer\n")
     assert plan().count("pip install") == 3
