@@ -183,9 +183,9 @@ ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
 ANT_LEARNED := $(ANT_DATA) datasets/ant_correlated datasets/ant_resting datasets/ant_learned
 ANT := --symmetries 4 --save-every 500 --threads 1
 FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
-BEGIN := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
-AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(BEGIN)
-LAST := --data $(ANT_LEARNED) $(BEGIN) --validate-every 4000
+SMALLER := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
+AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(SMALLER)
+LAST := --data $(ANT_LEARNED) $(SMALLER) --validate-every 4000
 IN_THE_MLP := $(PY) experiments/time_to_policy.py --dynamics runs/ant_mlp_second/best --wanted 0 \
 	--frames 8000000 --horizon 16 --minibatch 8192 --lr 1e-3 --episodes 64
 

@@ -78,9 +78,9 @@ class Agent:
 def make_collectors(cfg: Config, agent: Agent) -> dict[str, Iterator[TensorDictBase]]:
     """One for each dynamics that has a share, by its name."""
     num_mujoco = round(cfg.mujoco_fraction * cfg.num_envs)
-    sizes = {"mujoco": num_mujoco, cfg.dynamics: cfg.num_envs - num_mujoco}
-    if cfg.dynamics == "mujoco":
-        sizes = {"mujoco": cfg.num_envs}
+    sizes = {"mujoco": num_mujoco}
+    others = cfg.num_envs - num_mujoco
+    sizes[cfg.dynamics] = sizes.get(cfg.dynamics, 0) + others
     collectors = {
         dynamics: Collector(
             make_env(cfg.task, dynamics, num_envs, seed=cfg.seed),

@@ -46,7 +46,6 @@ def motions(
     start, scale = scene.sample_initial(rows, generator)
     terrain = start.pop(TERRAIN, None)
     how = total, scene.control_step, generator
-    how = total, scene.control_step, generator
     drawn = sample_correlated_commands(scene.sampling, scale, *how).split(steps, 1)
     dynamics, state = MujocoDynamics(scene), TensorDict(start, [rows])
     dynamics.reset(state)

@@ -19,7 +19,7 @@ from torchrl_nerd.training.rest import (
     REST_SPEED,
     find_rest,
     resting,
-    slow,
+    slow_velocities,
 )
 
 ON_GROUND = [name for name in SCENES if load_scene(name).terrain is not None]
@@ -92,7 +92,7 @@ def test_slow_transitions_are_slow_before_and_after(generator):
     qvel, after = torch.zeros(2, 4, 3, 5, dtype=torch.float64)
     qvel[1, 2, 0], after[2, 1, 4] = -2 * MAX_SPEED, 2 * MAX_SPEED
     data = TensorDict({QVEL: qvel, NEXT_QVEL: after}, [4, 3])
-    found = slow(data)
+    found = slow_velocities(data)
     assert found.shape == (10, 2, 5) and found.abs().max() < MAX_SPEED
 
 

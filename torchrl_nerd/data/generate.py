@@ -156,7 +156,7 @@ def read_card(scene: Scene, folder: Path) -> tuple[dict[str, Any], DataConfig]:
             f"({card.get('scene_hash')}), expected '{scene.name}' ({scene.hash})"
         )
     ranges = ranges_of(scene.variation)
-    if _ordered(card.get("variation")) != _ordered(ranges):
+    if str(card.get("variation")) != str(ranges):  # their order counts
         raise ValueError(
             f"expected data that vary {ranges or 'nothing'}, got {folder}, which vary "
             f"{card.get('variation') or 'nothing'}: give --vary as the data were drawn"
@@ -208,18 +208,13 @@ def _open_card(
     identity = ("scene_hash", "config", "strategy", "ranges", "variation")
     kept, asked = ({key: x.get(key) for key in identity} for x in (card, fresh))
     for about in (kept, asked):
-        about["variation"] = _ordered(about["variation"])
+        about["variation"] = str(about["variation"])  # their order counts
     expect_same(f"{folder} already holds data", kept, asked)
     counted(card, folder)
     drawn = min(card["chunks_done"] * CHUNK, config.trajectories)
     if card["trajectories"] + card["dropped"] != drawn:
         raise ValueError(f"expected {path} to count the trajectories of whole chunks")
     return card
-
-
-def _ordered(ranges: dict[str, Any] | None) -> list[list[Any]] | None:
-    """A variation with its order, which is that of the numbers in ``parameters``."""
-    return None if ranges is None else [[name, [*x]] for name, x in ranges.items()]
 
 
 def counted(card: dict[str, Any], folder: Path) -> DataConfig:

@@ -29,7 +29,7 @@ def resting(data: TensorDict) -> TensorDict:
     return cast(TensorDict, flat[still[:: max(1, -(-len(still) // MAX_STATES))]])
 
 
-def slow(data: TensorDict) -> Tensor:
+def slow_velocities(data: TensorDict) -> Tensor:
     """Velocities before and after transitions that are slow, ``(n, 2, nv)``."""
     both = torch.stack((data[QVEL], data[NEXT_QVEL]), -2).flatten(0, 1)
     return both[both.abs().amax((-2, -1)) < MAX_SPEED]
@@ -37,7 +37,7 @@ def slow(data: TensorDict) -> Tensor:
 
 def rest_of(data: TensorDict) -> tuple[TensorDict, Tensor]:
     """What `find_rest` needs of a data set ``[trajectories, steps]``."""
-    return resting(data), slow(data)
+    return resting(data), slow_velocities(data)
 
 
 @torch.no_grad()
