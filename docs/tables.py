@@ -501,6 +501,23 @@ def unmet_policies_table(folder: Path = RESULTS) -> str:
     return with_sources(table, records)
 
 
+def own_policies_table(folder: Path = RESULTS) -> str:
+    """Models by the returns of policies that learned in them alone."""
+    head = "task", "model", "seeds", "return in MuJoCo, promised"
+    table = [[*head, "difference, largest (%)", "paper (%)"]]
+    records = read("own_policies", folder).values()
+    for record in records:
+        found, paper = record["results"], record["results"]["paper"]
+        for model in found["models"]:
+            about = found["task"], f"{model['model']}, {model['kind']}"
+            returns = f"{model['return']:,.0f}, {model['promised']:,.0f}"
+            shares = (f"{100.0 * model[key]:+.1f}" for key in ("difference", "worst"))
+            line = [*about, str(model["policies"]), returns, ", ".join(shares)]
+            published = "-" if paper is None else f"{100.0 * paper:+.2g}"
+            table.append([*line, published])
+    return with_sources(table, records)
+
+
 def falls_table(folder: Path = RESULTS) -> str:
     """Robots on their back along one policy, and how far those of a model run ahead."""
     shown, records = [], read("falls", folder).values()
@@ -651,6 +668,7 @@ TABLES = {
     "open_loop": open_loop_table,
     "time_to_policy": time_to_policy_table,
     "unmet_policies": unmet_policies_table,
+    "own_policies": own_policies_table,
     "falls": falls_table,
     "gallery": gallery_table,
     "returns": returns_table,
@@ -669,7 +687,8 @@ COMMANDS |= {"policies": POLICIES, "policy_curves": POLICIES}
 COMMANDS |= {"open_loop": "python experiments/open_loop.py ROBOT --json FILE"}
 TIMES = "python experiments/time_to_policy.py TASK --json FILE"
 UNMET = "python experiments/unmet_policies.py TASK --policies FOLDER --json FILE"
-COMMANDS |= {"time_to_policy": TIMES, "unmet_policies": UNMET}
+OWN = "python experiments/own_policies.py TASK --policies FOLDERS --json FILE"
+COMMANDS |= {"time_to_policy": TIMES, "unmet_policies": UNMET, "own_policies": OWN}
 COMMANDS |= {"falls": "python experiments/falls.py TASK FOLDER --json FILE"}
 COMMANDS |= {
     "network_off": "python experiments/network_off.py",

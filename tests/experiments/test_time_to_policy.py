@@ -4,6 +4,7 @@ import json
 import math
 import time
 
+import own_policies
 import pytest
 import tables
 import time_to_policy
@@ -14,7 +15,8 @@ from safetensors.torch import load_file
 from time_to_policy import env_of, time_to, wanted_of
 
 from torchrl_nerd import make_env
-from torchrl_nerd.evaluation.policy import Policy, save_policy
+from torchrl_nerd.evaluation.policy import Policy, load_policy, make_actor, save_policy
+from torchrl_nerd.evaluation.policy_transfer import transfer
 from torchrl_nerd.robots import make_task
 
 
@@ -142,3 +144,41 @@ def test_a_policy_does_not_play_in_the_model_it_learned_in(tmp_path, monkeypatch
     with pytest.raises(KeyError, match="none"):
         unmet_policies.play(cfg, folder)
     assert played == [["cartpole-mlp"]]
+
+
+def test_a_policy_plays_where_it_learned_and_in_mujoco(tmp_path):
+    """The last of each dynamics; differences are those of one `nerd transfer`."""
+    for seed in range(2):
+        torch.manual_seed(seed)
+        for name in ("mujoco", "mujoco-1", "cartpole-mlp"):
+            for number in (2, 10):
+                about = {"task": "cartpole/swingup", "learned_in": name}
+                folder = tmp_path / f"{seed}" / name / f"{number}"
+                save_policy(Policy((4, 8, 1)), folder, about)
+    folders = tmp_path / "0", tmp_path / "1"
+    last = [tmp_path / f"{seed}/cartpole-mlp/10" for seed in range(2)]
+    assert [own_policies.last_policies(folder)[0] for folder in folders] == last
+    path = tmp_path / "own_policies_cartpole.json"
+    cfg = own_policies.Config("cartpole/swingup", folders, episodes=4, json=path)
+    own_policies.main(cfg)
+    found = json.loads(path.read_text())["results"]
+    assert [row["model"] for row in found["policies"]] == ["cartpole-mlp"] * 2
+    task = make_task("cartpole/swingup")
+    actor = make_actor(load_policy(last[0], task))
+    played = transfer(task, actor, ("cartpole-mlp",), 4, seed=cfg.seed)
+    assert found["policies"][0]["share"] == played["cartpole-mlp"].difference
+    (model,) = found["models"]
+    shares = [row["share"] for row in found["policies"]]
+    assert model["worst"] == max(shares, key=abs) and model["policies"] == 2
+    promised, reached = (
+        sum(row[key] for row in found["policies"]) for key in ("promised", "return")
+    )
+    assert model["difference"] == pytest.approx((promised - reached) / reached)
+    assert "cartpole-mlp, learned" in tables.own_policies_table(tmp_path)
+
+
+def test_a_folder_of_engines_alone_is_refused(tmp_path):
+    about = {"task": "cartpole/swingup", "learned_in": "mujoco-4"}
+    save_policy(Policy((4, 8, 1)), tmp_path / "mujoco-4" / "0", about)
+    with pytest.raises(ValueError, match="expected policies of a model"):
+        own_policies.last_policies(tmp_path)
