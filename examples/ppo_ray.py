@@ -41,7 +41,7 @@ def make_worker_env(cfg: Run, num_envs: int, seed: int) -> EnvBase:
     # the other processors have other workers
     os.environ.setdefault("NERD_THREADS", "1")
     torch.manual_seed(seed)
-    env = make_env(cfg.task, dynamics=cfg.dynamics, num_envs=num_envs, seed=seed)
+    env = make_env(cfg.task, cfg.dynamics, num_envs, seed, compile=cfg.compile)
     return stack_frames(env, cfg.frame_stack)
 
 
@@ -70,6 +70,8 @@ def collect(
 ) -> Iterator[TensorDictBase]:
     """Batches ``[num_envs, horizon]`` of all workers together."""
     expect_at_least(1, workers=cfg.workers)
+    if cfg.device != "cpu":
+        raise ValueError(f"expected device cpu, as the workers have, got {cfg.device}")
     if cfg.num_envs % cfg.workers:
         raise ValueError(
             f"expected num_envs to be a multiple of the {cfg.workers} workers, "

@@ -216,6 +216,15 @@ def test_ppo_outlives_a_worker_of_ray(example, moment, monkeypatch, capsys):
     assert not torch.equal(*starts)
 
 
+def test_workers_of_ray_have_no_gpu(example):
+    """Said before any of them starts."""
+    pytest.importorskip("ray")
+    ppo_ray = example("ppo_ray")
+    batches = ppo_ray.collect(ppo_ray.Run(device="cuda"), None, None)
+    with pytest.raises(ValueError, match="expected device cpu"):
+        next(batches)
+
+
 @pytest.mark.slow
 def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path):
     first_order = example("first_order")
