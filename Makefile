@@ -178,7 +178,8 @@ model-franka-adaptive: $(STAMP) ## Frankas that find their hidden parameters
 	$(call SHIP_ADAPTIVE,franka)
 
 # The Ant's networks: single steps and rollouts, then both again with more data along a run.
-# Then policies learn in the MLP, and both networks learn from how they move in MuJoCo.
+# Then policies learn in the MLP, and both networks learn from how they move in MuJoCo. Others
+# learn in the transformer, which learns from how these move as well.
 ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
 ANT_LEARNED := $(ANT_DATA) datasets/ant_correlated datasets/ant_resting datasets/ant_learned
 ANT := --symmetries 4 --save-every 500 --threads 1
@@ -186,8 +187,11 @@ FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
 SMALLER := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
 AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(SMALLER)
 LAST := --data $(ANT_LEARNED) $(SMALLER) --validate-every 4000
-IN_THE_MLP := $(PY) experiments/time_to_policy.py --dynamics runs/ant_mlp_second/best --wanted 0 \
-	--frames 8000000 --horizon 16 --minibatch 8192 --lr 1e-3 --episodes 64
+OWN := --data $(ANT_LEARNED) datasets/ant_own_run datasets/ant_own_spin $(SMALLER)
+POLICY_IN := $(PY) experiments/time_to_policy.py --wanted 0 --frames 8000000 --horizon 16 \
+	--minibatch 8192 --lr 1e-3
+IN_THE_MLP := $(POLICY_IN) --dynamics runs/ant_mlp_second/best --episodes 64
+IN_THE_TRANSFORMER := $(POLICY_IN) --dynamics runs/ant_fourth/best --episodes 2
 
 data-ant: $(STAMP)
 	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
@@ -224,7 +228,21 @@ model-ant: data-ant-learned ## the Ant's transformer, with the mirrors of the An
 		--steps 0 --rollout-steps 3000 --out runs/ant_third
 	$(NERD) train ant $(ANT) $(LAST) --network transformer-4x128 --single-step-fraction 0.85 \
 		--init-from runs/ant_third/best --steps 8000 --rollout-steps 3500 --out runs/ant_fourth
-	cp runs/ant_fourth/best/* $(PRETRAINED)/ant/
+	for seed in 21 22; do \
+		$(IN_THE_TRANSFORMER) ant/run --seed $$seed --out runs/own_$$seed || exit 1; \
+	done
+	$(IN_THE_TRANSFORMER) ant/spin --seed 21 --out runs/own_21
+	$(NERD) data ant --policy runs/own_*/ant-run/*/[0-9]* \
+		--trajectories 1100 --steps 500 --seed 62 --out datasets/ant_own_run
+	$(NERD) data ant --policy runs/own_*/ant-spin/*/[0-9]* \
+		--trajectories 550 --steps 500 --seed 63 --out datasets/ant_own_spin
+	$(NERD) train ant $(ANT) $(OWN) --network transformer-4x128 --single-step-fraction 0.85 \
+		--validate-every 4000 --init-from runs/ant_fourth/best \
+		--steps 6000 --rollout-steps 2500 --out runs/ant_fifth
+	$(NERD) train ant $(ANT) $(OWN) --network transformer-4x128 --single-step-fraction 0.85 \
+		--validate-every 1500 --init-from runs/ant_fifth/best \
+		--steps 0 --rollout-steps 4500 --out runs/ant_sixth
+	cp runs/ant_sixth/best/* $(PRETRAINED)/ant/
 
 model-ant-mlp: data-ant-learned ## the Ant's MLP, with the same mirrors
 	$(NERD) train ant $(ANT) $(LAST) --network mlp-4x160 --single-step-fraction 1 \
