@@ -19,13 +19,12 @@ from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, dynamics_of
+from torchrl_nerd.evaluation.position_error import position_errors, unit_of
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
-    position_errors,
     rollout,
     scene_of,
-    unit_of,
 )
 from torchrl_nerd.evaluation.stability.states import mechanics
 from torchrl_nerd.robots import load_scene, protocol_of

@@ -19,12 +19,12 @@ from tyro.conf import Positional
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, dynamics_of
+from torchrl_nerd.evaluation.position_error import position_errors
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
     open_loop,
-    position_errors,
     scene_of,
 )
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate

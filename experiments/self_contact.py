@@ -22,8 +22,9 @@ from torch import Generator, Tensor
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import NeRDDynamics
+from torchrl_nerd.evaluation.position_error import position_errors, unit_of
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors, unit_of
+from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE, NEXT_QPOS, NEXT_QVEL, QPOS, QVEL
 from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene

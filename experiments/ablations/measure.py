@@ -13,12 +13,8 @@ from torchrl_nerd.configs import DataConfig
 from torchrl_nerd.data.generate import generate, load_data
 from torchrl_nerd.data.strategies import preset_strategy
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import (
-    initial_states,
-    open_loop,
-    position_errors,
-    summarize,
-)
+from torchrl_nerd.evaluation.position_error import position_errors
+from torchrl_nerd.evaluation.rollout_error import initial_states, open_loop, summarize
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import protocol_of, source_of

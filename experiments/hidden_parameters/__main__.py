@@ -25,8 +25,9 @@ from torch import Generator, Tensor
 from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.dynamics.base import warm_up
+from torchrl_nerd.evaluation.position_error import position_errors
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.evaluation.rollout_error import interval_of_mean, position_errors
+from torchrl_nerd.evaluation.rollout_error import interval_of_mean
 from torchrl_nerd.keys import NEXT_QPOS, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, preset_of

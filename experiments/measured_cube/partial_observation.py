@@ -22,13 +22,14 @@ from torchrl_nerd.analytic.free_body import PARAMETERS
 from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import AnalyticDynamics, dynamics_of
+from torchrl_nerd.evaluation.position_error import Errors, position_errors
 from torchrl_nerd.evaluation.recorded_error import (
     STATES,
     summarize_windows,
     window_errors,
 )
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.evaluation.rollout_error import Errors, open_loop, position_errors
+from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.finetune import start_model, weighted_error
 from torchrl_nerd.training.physics_fit import fit_flight, fit_parameters

@@ -333,3 +333,25 @@ def test_a_free_body_without_a_ground_is_in_flight(tmp_path):
     torch.testing.assert_close(
         log.qvel[:, 2].reshape(6, 20)[:, 1:], expected[:, 1:], atol=1e-6, rtol=0.0
     )
+
+
+def test_other_columns_are_left_alone(generator, tmp_path):
+    """As other arrays of an npz file are; an ending may be in capitals."""
+    others = "position_0", "tool_position_0", "velocity_0", "time_step_0"
+    more = dict.fromkeys(others, 1.0)
+    log = cartpole_csv(tmp_path / "log.CSV", generator, **more)
+    assert same(read_log(tmp_path / "log.CSV", load_scene("cartpole")), log)
+
+
+def test_a_control_beyond_its_range_is_clipped_as_mujoco_does(tmp_path):
+    (tmp_path / "arm.xml").write_text("""<mujoco><worldbody><body><joint name="j"/>
+      <geom size="0.1" pos="0.2 0 0"/></body></worldbody><actuator>
+      <position joint="j" kp="10" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+      </mujoco>""")
+    scene = Scene.from_mjcf(tmp_path / "arm.xml")
+    zero = torch.zeros(3, 1).double()
+    frames = {"offsets": torch.tensor([0, 3]), "frame": scene.control_step}
+    log = Recording(zero, zero, zero, **frames, ctrl=zero + 3.0)
+    found = complete(log, scene)
+    torch.testing.assert_close(found.joint_torque, zero + 10.0)
+    torch.testing.assert_close(found.ctrl, zero + 1.0)

@@ -169,3 +169,11 @@ def test_nothing_handed_out_is_the_envs_own_memory(dynamics):
         for key in {"observation", "reward", "qpos", "qvel"} & {*shown.keys()}:
             shown[key].fill_(9.0)
         assert (env.state == kept).all()
+
+
+def test_a_state_that_float32_cannot_hold_is_refused():
+    env = make_env("cartpole/swingup", "nerd", 2, seed=0, state_dtype=torch.float32)
+    given = env.reset().select("qpos", "qvel").double()
+    given["qvel"][0] = 1e39
+    with pytest.raises(ValueError, match="expected finite qvel"):
+        env.reset(given, set_state=True)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from dynamics_helpers import EnvMaker
 
+from torchrl_nerd import make_env
 from torchrl_nerd.envs import StatelessEnv
 
 STATES, CANDIDATES, STEPS = 2, 3, 4
@@ -59,3 +60,18 @@ def test_a_reset_takes_what_the_env_has_just_given(generator):
     after = env.reset(again.set("_reset", mask))["qpos"]
     assert torch.equal(after[1::2], before[1::2])
     assert not (after[::2] == before[::2]).any()
+
+
+def test_gradients_reach_the_state_that_the_env_already_has():
+    """As they reach another."""
+    found = []
+    for far in (0.0, 1e-9):
+        plain = make_env("cartpole/swingup", "nerd", 2, seed=0, differentiable=True)
+        env = StatelessEnv(plain)
+        start = env.reset()
+        qpos = (start["qpos"] + far).requires_grad_()
+        given = start.set("qpos", qpos).set("action", torch.zeros(2, 1))
+        moved = env.step(given)["next", "qpos"].sum()
+        found += torch.autograd.grad(moved, qpos)
+    assert found[0].abs().min() > 0.5
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-5)

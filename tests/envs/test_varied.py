@@ -288,3 +288,19 @@ def test_data_along_a_policy_keep_the_parameters_of_a_start(generator):
     actor = make_actor(Policy((4, 8, 1)))
     data = policy_data(task, actor, ROWS, 3, generator, start=start)
     assert (data[PARAMETERS] == 2.5).all()
+
+
+def test_a_history_begins_anew_where_an_episode_ended():
+    """As if it held what came after alone."""
+    task = make_task("cartpole/swingup").vary(RANGES)
+    log = NeRDEnv(task, "cartpole-adaptive", num_envs=3, seed=0).rollout(8)
+    log["next", "done"][1:, 3] = True
+    found = []
+    for history in (log, log[:, 4:]):
+        env = NeRDEnv(task, "cartpole-adaptive", num_envs=3, seed=0)
+        env.reset(log[:, -1]["next"].select(QPOS, QVEL, PARAMETERS), set_state=True)
+        env.warm_up(history)
+        given = env.state.set("action", torch.ones(3, 1))
+        found.append(env.step(given)["next", QVEL])
+    torch.testing.assert_close(found[0][1:], found[1][1:])
+    assert (found[0][0] - found[1][0]).abs().max() > 1e-6

@@ -11,11 +11,11 @@ from tensordict import TensorDict
 from torchrl_nerd import from_pretrained
 from torchrl_nerd.checkpoint import shipped_card, shipped_models
 from torchrl_nerd.dynamics import AnalyticDynamics, MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.position_error import position_errors
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
     open_loop,
-    position_errors,
 )
 from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.robots import protocol_of

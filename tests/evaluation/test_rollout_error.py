@@ -12,15 +12,14 @@ from tensordict import TensorDict
 
 from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.position_error import position_errors, unit_of
 from torchrl_nerd.evaluation.rollout_error import (
     action_drive,
     initial_states,
     motion_before,
     open_loop,
     passive_errors,
-    position_errors,
     summarize,
-    unit_of,
 )
 from torchrl_nerd.robots import TASKS, load_scene, make_task
 from torchrl_nerd.seeds import fold_in
@@ -84,7 +83,7 @@ def test_ball_joint_by_hand(rng):
     a, b = ground_truth.numpy(), learned.numpy()
     expected = angle_between(a[..., :4], b[..., :4])
     np.testing.assert_allclose(errors["shoulder"], expected, atol=1e-7)
-    np.testing.assert_allclose(errors["elbow"], wrapped(a[..., 4] - b[..., 4]))
+    np.testing.assert_allclose(errors["elbow"], np.abs(a[..., 4] - b[..., 4]))
 
 
 def test_floating_base_by_hand(rng):
@@ -96,18 +95,22 @@ def test_floating_base_by_hand(rng):
     np.testing.assert_allclose(errors["base_position"], offset)
     turn = angle_between(a[..., 3:7], b[..., 3:7])
     np.testing.assert_allclose(errors["base_orientation"], turn, atol=1e-7)
-    knee = wrapped(a[..., 7] - b[..., 7])
+    knee = np.abs(a[..., 7] - b[..., 7])  # it has limits
     hip = angle_between(a[..., 8:12], b[..., 8:12])
     rod = np.abs(a[..., 12] - b[..., 12])
-    np.testing.assert_allclose(errors["joints"], (knee + hip + rod) / 3, atol=1e-7)
-    assert set(errors) == {"base_position", "base_orientation", "joints"}
+    np.testing.assert_allclose(errors["joints"], (knee + hip) / 2, atol=1e-7)
+    np.testing.assert_allclose(errors["slides"], rod, atol=1e-7)
+    assert set(errors) == {"base_position", "base_orientation", "joints", "slides"}
 
 
 def test_full_turns_and_quaternion_signs_are_no_error(rng, generator):
-    scene = HANDMADE["floater"]
+    cartpole, scene = load_scene("cartpole"), HANDMADE["floater"]
+    path, _ = random_paths(cartpole, rng)
+    turned = path.clone()
+    turned[..., 1] += 2.0 * torch.pi * torch.randint(-3, 4, (ROWS, STEPS)).double()
+    assert position_errors(cartpole, path, turned)["hinge"].max() < 1e-6
     ground_truth, _ = random_paths(scene, rng)
     other = ground_truth.clone()
-    other[..., 7] += 2.0 * torch.pi * torch.randint(-3, 4, (ROWS, STEPS)).double()
     other[..., 3:7] *= -1.0
     other[..., 8:12] *= torch.where(torch.rand(ROWS, STEPS, 1) < 0.5, -1.0, 1.0)
     for error in position_errors(scene, ground_truth, other).values():
@@ -120,6 +123,15 @@ def test_full_turns_and_quaternion_signs_are_no_error(rng, generator):
     )
     torch.testing.assert_close(there, back)
     assert (there <= torch.pi + 1e-9).all() and there.max() > 0.1
+
+
+def test_turns_of_a_limited_hinge_are_an_error(rng):
+    scene = HANDMADE["floater"]
+    path, _ = random_paths(scene, rng)
+    turned = path.clone()
+    turned[..., 7] += 2.0 * torch.pi
+    errors = position_errors(scene, path, turned)["joints"]  # of the knee and the hip
+    torch.testing.assert_close(errors, torch.full_like(errors, torch.pi))
 
 
 def test_a_slide_is_never_wrapped(rng):
@@ -135,7 +147,7 @@ def test_units():
     assert unit_of(cartpole, "slider") == "m" and unit_of(cartpole, "hinge") == "rad"
     assert unit_of(HANDMADE["arm"], "shoulder") == "rad"
     assert unit_of(HANDMADE["arm"], "elbow") == "rad"
-    assert unit_of(floater, "base_position") == "m"
+    assert unit_of(floater, "base_position") == unit_of(floater, "slides") == "m"
     assert unit_of(floater, "base_orientation") == unit_of(floater, "joints") == "rad"
 
 
@@ -268,7 +280,7 @@ def state_of(state):
 
 @pytest.mark.parametrize("base", ["", "<freejoint/>"])
 def test_joints_without_a_name_count_one_by_one(base, rng):
-    """A fixed base has an error for each; a floating one their mean."""
+    """A fixed base has an error for each; a floating one the mean of those of a unit."""
     body = '<body pos="0 0 1"><geom size="0.1"/>{joint}{inside}</body>'
     slide, hinge = ('<joint type="slide"/>', '<joint axis="0 1 0"/>')
     leg = body.format(joint=hinge, inside=body.format(joint=slide, inside=""))
@@ -281,10 +293,12 @@ def test_joints_without_a_name_count_one_by_one(base, rng):
     if not base:
         assert units == {"joint 0": "rad", "joint 1": "rad", "joint 2": "m"}
         return
-    assert list(units) == ["base_position", "base_orientation", "joints"]
+    assert list(units) == ["base_position", "base_orientation", "joints", "slides"]
+    assert [*units.values()] == ["m", "rad", "rad", "m"]
     apart = (paths[0] - paths[1]).abs().numpy()[..., 7:]  # hinge, slide, hinge, slide
-    apart[..., ::2] = wrapped(apart[..., ::2])
-    assert found["joints"].mean == pytest.approx(apart.mean())
+    hinges = wrapped(apart[..., ::2])
+    assert found["joints"].mean == pytest.approx(hinges.mean())
+    assert found["slides"].mean == pytest.approx(apart[..., 1::2].mean())
 
 
 VARIED = make_task("cartpole/swingup").vary(

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers import every_scene, random_states, random_tree
 
+from torchrl_nerd import load_scene
 from torchrl_nerd.geometry.manifold import (
     JointLayout,
     differentiate_pos,
@@ -117,3 +118,16 @@ def test_a_quaternion_keeps_its_norm_over_many_integrations(rng):
     for q, _ in layout.rotations:
         norm = torch.linalg.vector_norm(qpos[:, q : q + 4], dim=-1)
         assert (norm - 1.0).abs().max() < 1e-12
+
+
+def test_many_velocities_of_one_pose_by_vmap(generator):
+    layout = load_scene("ant").layout
+    state, _ = load_scene("ant").sample_initial(1, generator)
+    start = state["qpos"][0]
+    many = torch.randn(5, layout.nv, dtype=torch.float64, generator=generator)
+    moved = integrate_pos(layout, start.expand(5, -1), many)
+    move = torch.func.vmap(lambda v: integrate_pos(layout, start, v))
+    torch.testing.assert_close(move(many), moved, rtol=0, atol=0)
+    back = differentiate_pos(layout, start.expand(5, -1), moved)
+    apart = torch.func.vmap(lambda q: differentiate_pos(layout, start, q))
+    torch.testing.assert_close(apart(moved), back, rtol=0, atol=0)

@@ -509,7 +509,11 @@ def test_a_plane_for_a_file_without_ground(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "default", ["", 'contype="0" conaffinity="0"', 'pos="0 0 0.5"', 'friction="0"']
+    "default",
+    [
+        *("", 'contype="0" conaffinity="0"', 'pos="0 0 0.5"', 'friction="0"'),
+        'euler="90 0 0"',
+    ],
 )
 def test_an_added_plane_is_level_ground_whatever_geoms_are_by_default(
     default, tmp_path
@@ -586,3 +590,34 @@ def test_a_plane_has_no_end(tmp_path):
     scene = Scene.from_mjcf(write(tmp_path, floor + ball))
     qpos = scene.sample_initial(20, torch.Generator().manual_seed(0))[0]["qpos"]
     assert (qpos[:, 2] >= 3.1 - 1e-9).all()
+
+
+@pytest.mark.parametrize("default", ['fromto="0 0 0 0 0 1"', 'type="mesh" mesh="m"'])
+def test_an_added_plane_is_no_capsule_or_mesh(default, tmp_path):
+    """Which MuJoCo would refuse to make level ground of."""
+    (tmp_path / "body.xml").write_text(
+        f"""<mujoco><asset>
+      <mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+      <default><geom size="0.1" {default}/></default><worldbody>
+      <body pos="0 0 1"><freejoint/><geom/></body></worldbody></mujoco>""".replace(
+            "<geom/>", "<geom/>" if "mesh" in default else '<geom type="capsule"/>'
+        )
+    )
+    scene = Scene.from_mjcf(tmp_path / "body.xml", terrain="plane")
+    assert scene.terrain.fixed_plane.tolist() == [0.0, 0.0, 1.0, 0.0]
+
+
+def test_a_gap_to_no_ground_is_none(tmp_path):
+    path = write(tmp_path, '<body><joint/><geom size="0.1"/></body>')
+    scene = Scene.from_mjcf(path, clearance=0.01)
+    state, _ = scene.sample_initial(4, torch.Generator().manual_seed(0))
+    assert state[QPOS].shape == (4, 1)
+
+
+def test_a_range_of_what_nothing_reads_is_refused(tmp_path):
+    arm = '<body><joint name="j"/><geom size="0.1"/></body>'
+    for kind, other in (("position", "torque"), ("motor", "ctrl")):
+        rest = f'<actuator><{kind} joint="j"/></actuator>'
+        path = write(tmp_path, arm, rest)
+        with pytest.raises(ValueError, match=f"got a range of '{other}'"):
+            Scene.from_mjcf(path, **{other: (1.0,)})

@@ -16,7 +16,7 @@ from helpers import (
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.scenes.symmetries import base_effects
+from torchrl_nerd.scenes.symmetries import base_effects, periodic_hinges
 from torchrl_nerd.transforms import StateDelta
 
 ROWS = 100
@@ -165,3 +165,43 @@ def test_what_touches_or_pulls_seldom_is_kept():
     ignored = make_scene(GRIPPER).symmetries.positions
     assert ignored == {0}  # how high the hand is, but not where its fingers are
     assert make_scene(BUNGEE).symmetries.positions == set()
+
+
+TURNING = """<mujoco><option gravity="0 0 0"/><worldbody>
+  <body><joint name="a" axis="0 1 0" {joint}/><geom size="0.1" pos="0.2 0 0"/></body>
+  <body pos="0 2 0"><joint name="b" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body>
+  </worldbody>{rest}</mujoco>"""
+SPRING = """<tendon><fixed stiffness="5"><joint joint="a" coef="1"/>
+  <joint joint="b" coef="-1"/></fixed></tendon>"""
+
+
+@pytest.mark.parametrize(
+    ("joint", "rest", "periodic"),
+    [
+        ("", "", [0, 1]),
+        ('damping="1" frictionloss="0.1"', "", [0, 1]),
+        ('stiffness="2"', "", [1]),
+        ('range="-90 90"', "", [1]),
+        ("", SPRING, []),
+        ("", '<equality><joint joint1="a" joint2="b"/></equality>', []),
+        ("", '<equality><joint joint1="b"/></equality>', [0]),
+        ("", '<actuator><position joint="a" kp="3"/></actuator>', [1]),
+        ("", '<actuator><velocity joint="a" kv="3"/></actuator>', [0, 1]),
+    ],
+)
+def test_a_whole_turn_is_told_where_it_matters(joint, rest, periodic):
+    """Measured in MuJoCo: the same step from a turn further on."""
+    model = mujoco.MjModel.from_xml_string(TURNING.format(joint=joint, rest=rest))
+    assert periodic_hinges(model, has_servos=True) == periodic
+    for hinge in range(2):
+        steps = []
+        for turn in (0.0, 2.0 * torch.pi):
+            data = mujoco.MjData(model)
+            data.qpos[:] = 0.5, 0.4
+            data.qpos[hinge] += turn
+            data.qvel[:] = 0.3, -0.2
+            mujoco.mj_step(model, data, 5)
+            steps.append(data.qvel.copy())
+        assert (abs(steps[0] - steps[1]).max() < 1e-9) == (hinge in periodic)
+    without = periodic_hinges(model, has_servos=False)
+    assert without == ([0, 1] if "position" in rest else periodic)

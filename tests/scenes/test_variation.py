@@ -247,3 +247,11 @@ def test_a_joints_own_range_goes_before_that_of_all():
         variation = load_scene("cartpole").vary(given).variation
         drawn = np.array([[0.9 if ":" in name else 0.1 for name in given]])
         assert variation.fields(drawn)["dof_damping"].tolist() == [[0.1, 0.9]]
+
+
+def test_a_payload_that_would_weigh_nothing_is_refused():
+    scene = make_scene("""<mujoco><worldbody><body name="arm" gravcomp="1">
+      <joint axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body></worldbody></mujoco>""")
+    with pytest.raises(ValueError, match="without gravcomp for 'payload:arm'"):
+        scene.vary({"payload:arm": (0.0, 3.0)})
+    scene.vary({"mass:arm": (1.0, 2.0)})

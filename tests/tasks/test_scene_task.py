@@ -87,3 +87,11 @@ def test_a_suite_task_stays_the_suites():
     )
     with pytest.raises(ValueError, match="found none at nowhere.xml"):
         make_env("nowhere.xml", "mujoco")
+
+
+def test_starts_are_those_of_the_ground_that_it_is_given():
+    """A ground of each env, and one of all."""
+    slope, level = load_scene("cube_slope"), load_scene("cube")
+    there = make_env(SceneTask(level).with_scene(slope), "mujoco", 2).rollout(2)
+    back = make_env(SceneTask(slope).with_scene(level), "mujoco", 2).rollout(2)
+    assert "terrain" in there.keys() and "terrain" not in back.keys()

@@ -8,7 +8,7 @@ from helpers import simulated, slow_but
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.configs import NO_PREDICTIONS, FinetuneConfig
-from torchrl_nerd.evaluation.rollout_error import position_errors
+from torchrl_nerd.evaluation.position_error import position_errors
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.settings import SettingError

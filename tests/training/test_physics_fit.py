@@ -5,7 +5,7 @@ import torch
 
 from torchrl_nerd.analytic.free_body import PARAMETERS, FreeBodyPenaltyStep
 from torchrl_nerd.data.recorded import Recording
-from torchrl_nerd.evaluation.rollout_error import position_errors
+from torchrl_nerd.evaluation.position_error import position_errors
 from torchrl_nerd.training.finetune import weighted_error
 from torchrl_nerd.training.physics_fit import CENTRE, fit_flight, fit_parameters, moved
 

@@ -226,3 +226,24 @@ def test_bounds_of_what_is_seen_are_normalised():
     mean, std = stats["trust"].mean.item(), stats["trust"].std.item()
     assert space.low.unique().item() == pytest.approx(-mean / std)
     assert space.high.unique().item() == pytest.approx((1.0 - mean) / std)
+
+
+def test_a_state_that_is_set_is_given_normalised_too(generator):
+    plain = make_env("cartpole/swingup", "mujoco", num_envs=2, seed=0)
+    qpos = Stats.of(torch.randn(50, 2, generator=generator) * 3.0 + 1.0)
+    env = TransformedEnv(plain, Normalize({"qpos": qpos}, in_keys_inv=["qpos"]))
+    seen, was = env.reset(), plain.state["qpos"].clone()
+    env.reset(seen.clone(), set_state=True)
+    torch.testing.assert_close(plain.state["qpos"], was)
+    check_env_specs(env)
+
+
+def test_samples_that_are_not_finite_or_no_rows_make_no_statistics():
+    samples = torch.randn(10, 2)
+    samples[3] = torch.nan
+    with pytest.raises(
+        ValueError, match=r"finite samples, got NaN or infinity in \['x'\]"
+    ):
+        Normalize({"x": Stats.of(samples)})
+    with pytest.raises(ValueError, match=r"expected samples \(\*batch, D\), got \[3\]"):
+        Stats.of(torch.zeros(3))

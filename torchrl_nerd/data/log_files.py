@@ -4,6 +4,7 @@ docs/howto/logs.md names the arrays and columns, with shapes, units and frames, 
 `data.physics_checks` checks: no file states them.
 """
 
+from collections.abc import Collection
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -51,7 +52,7 @@ def read_log(path: Path, scene: Scene) -> Recording:
     """
     if not path.is_file():
         raise ValueError(f"expected a log in {path}, found no file")
-    arrays = _read_csv(path) if path.suffix == ".csv" else _read_npz(path)
+    arrays = _read_csv(path) if path.suffix.lower() == ".csv" else _read_npz(path)
     for name, array in arrays.items():
         if array.ndim == 0 or array.dtype.kind not in "fiu":
             raise ValueError(
@@ -155,11 +156,16 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(
             f"expected an npz file in {path}, got another: {said[0]}"
         ) from None
-    missing = set(ARRAYS).difference(found, FREE_BODY if QPOS in found else ())
     for name in others:
-        if meant := get_close_matches(name.lower(), missing, 1, 0.8):
-            raise ValueError(f"expected an array '{meant[0]}' in {path}, got '{name}'")
+        if meant := _meant(name, found):
+            raise ValueError(f"expected an array '{meant}' in {path}, got '{name}'")
     return found
+
+
+def _meant(name: str, found: Collection[str], cutoff: float = 0.8) -> str | None:
+    """The missing array of which a name is a misspelling; None: of none."""
+    missing = set(ARRAYS).difference(found, FREE_BODY if QPOS in found else ())
+    return next(iter(get_close_matches(name.lower(), missing, 1, cutoff)), None)
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
@@ -193,11 +199,9 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
                 f"expected a column '{name.lower()}' in {path}, got '{name}'"
             )
         stem, _, number = name.rpartition("_")
-        meant = get_close_matches(stem, set(ARRAYS).difference(arrays), 1)
+        meant = _meant(stem, {*arrays, *others, "trajectory_offsets"}, 0.6)
         if number.isdecimal() and meant:
-            raise ValueError(
-                f"expected columns of '{meant[0]}' in {path}, got '{name}'"
-            )
+            raise ValueError(f"expected columns of '{meant}' in {path}, got '{name}'")
     return arrays | {name: table[name] for name in others if name in names}
 
 

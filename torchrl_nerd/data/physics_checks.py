@@ -20,9 +20,11 @@ from torchrl_nerd.data.recorded import (
 from torchrl_nerd.geometry.manifold import normalize_pos
 from torchrl_nerd.geometry.rotations import quat_normalize, rotate
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.support import DISABLE
 
 UNIT_ERROR = 1e-3  # of a quaternion's length
-GRAVITY_ERROR = 0.05  # of 9.81: the published recordings are 2% short
+GRAVITY_ERROR = 0.05  # of gravity: the published recordings are 2% short
+USUAL_GRAVITY = 9.81  # m/s^2, of which the error is a share where there is none
 DEEPEST = 0.2  # of the robot's size that points may lie under the ground
 VELOCITY_ERROR = 0.25  # of the median speed, measured against differences of poses
 LARGEST_JUMP = 0.5  # of a frame's displacement that its velocity does not explain
@@ -139,8 +141,11 @@ def _free_body_checks(log: Recording, scene: Scene) -> Iterator[Check]:
 
 def _gravity(fall: Tensor, scene: Scene) -> Check:
     """Acceleration along z over the first frames of each trajectory, by a parabola."""
-    expected = float(scene.model.opt.gravity[2])
-    margin = GRAVITY_ERROR * abs(expected)
+    weight = 1.0 - float(scene.model.body_gravcomp[scene.base.body])
+    if scene.model.opt.disableflags & DISABLE.mjDSBL_GRAVITY:
+        weight = 0.0
+    expected = weight * float(scene.model.opt.gravity[2])
+    margin = GRAVITY_ERROR * max(abs(expected), USUAL_GRAVITY)
     value, sideways = float(fall[2]), fall[:2].abs()
     advice = f"positions in other units or frames of another length ({value:.3g} m/s^2)"
     if float(sideways.max()) > abs(value):
@@ -148,7 +153,7 @@ def _gravity(fall: Tensor, scene: Scene) -> Check:
         advice = f"the world's {axis} axis falls, z should point up"
     elif value > 0.0:
         advice = "z points down, it should point up"
-    elif value < 0.0:
+    elif value < 0.0 and expected < 0.0:
         advice = f"positions fit if multiplied by about {expected / value:.2g}"
     limits = expected - margin, expected + margin
     return Check("free fall along z", value, *limits, "m/s^2", advice)

@@ -20,6 +20,7 @@ from torchrl_nerd.keys import (
     TERRAIN,
 )
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.controllers import clipped_ctrl
 
 SPLIT_SEED, TRAIN_SHARE, VALIDATION_SHARE = 0, 380 / 510, 65 / 510
 FEWEST = 6  # trajectories of which no split is empty
@@ -156,7 +157,8 @@ def complete(log: Recording, scene: Scene) -> Recording:
     log = replace(log, qvel=qvel)
     if scene.servos is None or log.ctrl is None:
         return log
-    return replace(log, joint_torque=scene.servos.torque(log.ctrl, qpos, qvel))
+    ctrl = clipped_ctrl(scene.model, log.ctrl)
+    return replace(log, ctrl=ctrl, joint_torque=scene.servos.torque(ctrl, qpos, qvel))
 
 
 def estimate_velocities(log: Recording, scene: Scene) -> Tensor:

@@ -92,8 +92,9 @@ def warm_up(
     A rollout from the state after the motion then starts adapted to what the motion shows;
     the ground truth learns of late torques. ``history [num_envs, T]``, oldest first, holds
     ``qpos``, ``qvel``, ``("next", "joint_torque")`` and, where there are any, ``ctrl``,
-    ``terrain`` and ``parameters``. ``advance`` makes a step of the motion from its state;
-    by default the dynamics does, with the torque.
+    ``terrain`` and ``parameters``. Where it holds the end of an episode
+    (``("next", "done")``), the past of that env begins anew. ``advance`` makes a step of
+    the motion from its state; by default the dynamics does, with the torque.
 
     Raises:
         ValueError: another number of envs, no step at all, a key that is missing (of the
@@ -114,11 +115,15 @@ def warm_up(
             raise ValueError(
                 f"expected finite {key!r} in a history, got NaN or infinity"
             )
+    ended = None  # envs whose episode was over, (num_envs, 1)
     for step, then in enumerate(history.unbind(1)):
         state = then.select(QPOS, QVEL, PARAMETERS, strict=False)
         if step == 0:
             dynamics.reset(state)
         given = (then.get(key, None) for key in (JOINT_TORQUE, TERRAIN, CTRL))
+        if ended is not None and ended.any():
+            dynamics.reset(state, ended.reshape(num_envs))
+        ended = then.get(("next", "done"), None)
         if advance is None:
             dynamics.step(state, *given)
         else:

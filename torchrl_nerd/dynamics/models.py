@@ -119,8 +119,10 @@ class TorchDynamics(Dynamics):
         out-of-distribution score of the step's input as ``ood_score (num_envs,)``.
 
         Raises:
-            ValueError: servos without ``ctrl``.
+            ValueError: no joint torque; servos without ``ctrl``.
         """
+        if joint_torque is None:
+            raise ValueError("expected a joint torque, got none")
         check_step(self.scene, state, joint_torque, terrain, ctrl)
         if ctrl is None and self.scene.servos is not None:
             raise ValueError(

@@ -40,9 +40,9 @@ def given_state(
             continue
         if (got := tuple(value.shape)) != expected:
             raise ValueError(f"expected {key} of shape {expected}, got {got}")
-        if not value[is_reset].isfinite().all():
-            raise ValueError(f"expected finite {key} to set the state to")
         values[key] = value.to(is_reset.device, dtype, copy=True)
+        if not values[key][is_reset].isfinite().all():  # in the dtype of the state
+            raise ValueError(f"expected finite {key} to set the state to")
     values[QPOS] = normalize_pos(scene.layout, values[QPOS])
     if TERRAIN in values and scene.terrain is not None:
         values[TERRAIN] = scene.terrain.normalize(values[TERRAIN])

@@ -57,4 +57,6 @@ class StatelessEnv(EnvBase):
         state = self.env._state()
         if not all(torch.equal(given[key], value) for key, value in state.items()):
             self.env.reset(given.exclude("_reset"), set_state=True)
+        elif any(given[key].requires_grad for key in state):  # gradients reach these
+            self.env._buffers.update({f"_state_{key}": given[key] for key in state})
         return self.env._step(given).reshape(tensordict.shape)

@@ -16,12 +16,8 @@ from torch import Generator, Tensor
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Dynamics
 from torchrl_nerd.evaluation.bench.candidates import NoMotion
-from torchrl_nerd.evaluation.rollout_error import (
-    Errors,
-    open_loop,
-    position_errors,
-    unit_of,
-)
+from torchrl_nerd.evaluation.position_error import Errors, position_errors, unit_of
+from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.keys import QPOS
 from torchrl_nerd.scenes import Scene

@@ -15,8 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics.base import Dynamics, warm_up
-from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE, SLIDE, joint_label
-from torchrl_nerd.geometry.rotations import orientation_error, wrap_angle
+from torchrl_nerd.evaluation.position_error import Errors, position_errors, unit_of
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL, TERRAIN
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
@@ -28,9 +27,6 @@ UNSEEN = 2**24 - 1
 
 Drive = Callable[[int, TensorDictBase], tuple[Tensor, Tensor | None]]
 """``(step, state [n]) -> joint torque (n, num_actuated), N and N m, and ctrl (n, nu)``."""
-
-Errors = dict[str, Tensor]
-"""Quantity of `position_errors` -> ``(n, steps)``, m or rad."""
 
 
 def scene_of(source: Source) -> Scene:
@@ -186,52 +182,6 @@ def rollout(
         if step % every == 0:
             kept.append(state.select(QPOS, QVEL))
     return cast(TensorDict, TensorDict.stack(kept, 1))
-
-
-def position_errors(scene: Scene, ground_truth: Tensor, other: Tensor) -> Errors:
-    """Error of every quantity at every step, ``(n, steps)``, from ``(n, steps, nq)``.
-
-    A floating base gives ``base_position`` (m), ``base_orientation`` (rad) and the mean
-    over ``joints`` (rad); a fixed base gives one entry per joint, see `joint_label`.
-    Another free body gives its position (m) and orientation (rad).
-    """
-    model, both, joints = scene.model, (ground_truth, other), {}
-    base, bodies = {}, {}  # of free joints: the base's, and all others
-    for joint in range(model.njnt):
-        q, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
-        if kind == FREE and scene.base.is_floating and q == scene.base.qpos_address:
-            base = _pose_errors("base_", q, *both)
-        elif kind == FREE:
-            body = model.body(model.jnt_bodyid[joint]).name
-            label = model.joint(joint).name or body or joint_label(model, joint)
-            bodies |= _pose_errors(f"{label} ", q, *both)
-        elif kind == BALL:
-            error = orientation_error(*(x[..., q : q + 4] for x in both))
-            joints[joint_label(model, joint)] = error
-        else:
-            error = ground_truth[..., q] - other[..., q]  # (n, steps)
-            error = (wrap_angle(error) if kind == HINGE else error).abs()
-            joints[joint_label(model, joint)] = error
-    if base and joints:
-        joints = {"joints": torch.stack(list(joints.values())).mean(0)}  # (n, steps)
-    return base | joints | bodies
-
-
-def _pose_errors(label: str, q: int, one: Tensor, other: Tensor) -> Errors:
-    """Errors of the free joint at ``q`` in qpos: position, m, and orientation, rad."""
-    offset = one[..., q : q + 3] - other[..., q : q + 3]
-    turn = orientation_error(*(x[..., q + 3 : q + 7] for x in (one, other)))
-    place = torch.linalg.vector_norm(offset, dim=-1)
-    return {f"{label}position": place, f"{label}orientation": turn}
-
-
-def unit_of(scene: Scene, quantity: str) -> str:
-    """Unit of a quantity of `position_errors`: m or rad."""
-    model = scene.model
-    kinds = {joint_label(model, i): model.jnt_type[i] for i in range(model.njnt)}
-    if quantity in kinds and not scene.base.is_floating:
-        return "m" if kinds[quantity] == SLIDE else "rad"
-    return "m" if quantity.endswith("position") else "rad"
 
 
 def interval_of_mean(samples: Tensor) -> float:

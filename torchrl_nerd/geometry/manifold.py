@@ -88,13 +88,11 @@ def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
     """
     if not layout.rotations:
         return qpos + tangent
-    moved = torch.empty_like(qpos)
-    for q, v in layout.runs:
-        moved[..., q] = qpos[..., q] + tangent[..., v]
+    parts = {q.start: qpos[..., q] + tangent[..., v] for q, v in layout.runs}
     for q, v in layout.rotations:
         turned = quat_multiply(qpos[..., q : q + 4], quat_exp(tangent[..., v : v + 3]))
-        moved[..., q : q + 4] = quat_normalize(turned)
-    return moved
+        parts[q] = quat_normalize(turned)
+    return torch.cat([part for _, part in sorted(parts.items())], -1)
 
 
 def normalize_pos(layout: JointLayout, qpos: Tensor) -> Tensor:
@@ -114,10 +112,8 @@ def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor
     """Tangent vector that takes ``start`` to ``end``, ``(*batch, nv)``."""
     if not layout.rotations:
         return end - start
-    tangent = start.new_empty((*start.shape[:-1], layout.nv))
-    for q, v in layout.runs:
-        tangent[..., v] = end[..., q] - start[..., q]
+    parts = {v.start: end[..., q] - start[..., q] for q, v in layout.runs}
     for q, v in layout.rotations:
         turn = quat_multiply(quat_conjugate(start[..., q : q + 4]), end[..., q : q + 4])
-        tangent[..., v : v + 3] = quat_log(turn)
-    return tangent
+        parts[v] = quat_log(turn)
+    return torch.cat([part for _, part in sorted(parts.items())], -1)

@@ -76,7 +76,7 @@ def transform(x: Tensor, signs: Tensor) -> Tensor:
 
 def block_product(x: Tensor, weight: Tensor) -> Tensor:
     """Every character by its own matrix: ``(*batch, K, in)``, ``(K, out, in)``."""
-    flat = x.flatten(0, -3).transpose(0, 1)  # (K, batch, in)
+    flat = x.reshape(-1, *x.shape[-2:]).transpose(0, 1)  # (K, batch, in)
     return torch.bmm(flat, weight.mT).transpose(0, 1).unflatten(0, x.shape[:-2])
 
 

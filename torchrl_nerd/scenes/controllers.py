@@ -195,6 +195,14 @@ class ActuatorController:
         return _clip(force @ moment, self.torque_low, self.torque_high)
 
 
+def clipped_ctrl(model: mujoco.MjModel, ctrl: Tensor) -> Tensor:
+    """What MuJoCo takes a control ``(*batch, nu)`` for: one within its range."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        return ctrl
+    ranges = model.actuator_ctrllimited, model.actuator_ctrlrange
+    return _clip(ctrl, *_ranges(*ranges, UNLIMITED))
+
+
 def driven_dofs(model: mujoco.MjModel) -> list[int]:
     """Distinct dofs of `has_closed_form` actuators, in the order of the actuators."""
     _, dofs = np.nonzero(_actuator_moments(model))

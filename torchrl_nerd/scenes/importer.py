@@ -66,7 +66,9 @@ def read_mjcf(
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         usual = mujoco.MjSpec().worldbody.add_geom()  # whatever the file's default is
         about = {name: getattr(usual, name) for name in CONTACT_FIELDS}
-        spec.worldbody.add_geom(type=plane, size=(0.0, 0.0, 1.0), **about)
+        added = spec.worldbody.add_geom(type=plane, size=(0.0, 0.0, 1.0), **about)
+        added.alt.type = usual.alt.type  # orientations besides quat
+        added.fromto, added.meshname, added.hfieldname = usual.fromto, "", ""
         model = spec.compile()
         if not terrain_geoms(model):
             raise ValueError(

@@ -50,13 +50,17 @@ def default_sampling(
 
     ``control_step``: s, over which a torque is held.
     ``ranges``: fields of `Sampling` to use in place of the default ones; ValueError where
-    one is none.
+    one is none, or of torques where servos take controls.
     """
     known = [field.name for field in fields(Sampling)]
     if unknown := [name for name in ranges if name not in known]:
         raise ValueError(
             f"expected ranges among {', '.join(known)}, got '{unknown[0]}'"
         )
+    other = "ctrl" if controller.is_motor else "torque"
+    if other in ranges:
+        wanted = "torque of motors" if controller.is_motor else "ctrl of servos"
+        raise ValueError(f"expected the {wanted}, got a range of '{other}'")
     base = Base.from_model(model)
     # a floating base has ranges of its own where it is the first joint
     is_first = base.is_floating and base.dof_address == 0

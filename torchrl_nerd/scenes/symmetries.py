@@ -29,6 +29,8 @@ TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
 LIMIT, CONTACT = int(DISABLE.mjDSBL_LIMIT), int(DISABLE.mjDSBL_CONTACT)
 
+AFFINE = int(mujoco.mjtGain.mjGAIN_AFFINE)  # of a gain; the same number of a bias
+
 Move = Callable[[mujoco.MjData, np.random.Generator], None]
 
 
@@ -124,6 +126,29 @@ def seldom_felt(model: mujoco.MjModel) -> set[int]:
             elif kind == mujoco.mjtWrap.mjWRAP_SITE:
                 found |= above[model.site_bodyid[target]]
     return found
+
+
+def periodic_hinges(model: mujoco.MjModel, has_servos: bool = False) -> list[int]:
+    """Addresses in ``qpos`` of hinges of which a whole turn changes nothing.
+
+    They have no limits and no spring, and no fixed tendon, equality constraint or servo
+    reads their angle.
+    """
+    is_periodic = (model.jnt_type == HINGE) & (model.jnt_limited == 0)
+    is_periodic &= (model.jnt_stiffness == 0.0) & ~model.jnt_stiffnesspoly.any(1)
+    in_tendon = model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT
+    is_periodic[model.wrap_objid[in_tendon]] = False
+    is_coupling = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
+    for ends in (model.eq_obj1id[is_coupling], model.eq_obj2id[is_coupling]):
+        is_periodic[ends[ends >= 0]] = False
+    if has_servos:
+        transmissions = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
+        for i in np.flatnonzero(np.isin(model.actuator_trntype, transmissions)):
+            laws = model.actuator_gaintype[i], model.actuator_biastype[i]
+            places = model.actuator_gainprm[i, 1], model.actuator_biasprm[i, 1]
+            if max(laws) > AFFINE or any(places):  # another law may read anything
+                is_periodic[model.actuator_trnid[i, 0]] = False
+    return model.jnt_qposadr[is_periodic].tolist()
 
 
 def base_effects(

@@ -69,7 +69,8 @@ class Variation:
 
     Raises:
         ValueError: in one sentence, a kind or target that is not there, a range that
-            cannot be, or a payload's place without a payload.
+            cannot be, a payload's place without a payload, or a payload on a body
+            whose weight MuJoCo compensates.
     """
 
     def __init__(
@@ -90,6 +91,11 @@ class Variation:
                 raise ValueError(
                     f"expected a body that MuJoCo takes for no simple one for '{name}': "
                     'give it simple="false" in the file'
+                )
+            if kind == "payload" and model.body_gravcomp[parameter.indices].any():
+                raise ValueError(
+                    f"expected a body without gravcomp for '{name}', which would carry "
+                    "the payload's weight as well"
                 )
             if kind == "motor":
                 self._expect_motors(parameter)

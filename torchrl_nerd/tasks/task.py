@@ -4,6 +4,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
+from typing import Self
 
 import torch
 from mujoco import MjData, MjModel
@@ -47,7 +48,7 @@ class Task(ABC):
         """
         return self.with_scene(self.scene.vary(ranges))
 
-    def with_scene(self, scene: Scene) -> "Task":
+    def with_scene(self, scene: Scene) -> Self:
         """The same task in another scene of the same robot.
 
         Raises ValueError where its joints or its motors are others.
@@ -118,14 +119,31 @@ class SceneTask(Task):
     num_uniforms = 1
     horizon = 1000  # as most tasks of the dm_control suite
 
-    @torch.inference_mode(False)
     def __init__(self, scene: Scene) -> None:
         self.name, self._given = scene.name, scene
         self.observation_size = scene.model.nq + scene.model.nv
+        self._draw_starts(scene)
+
+    @torch.inference_mode(False)
+    def _draw_starts(self, scene: Scene) -> None:
+        """States to begin in, and what an episode keeps of them."""
         seeded = Generator().manual_seed(0)
         self.starts, _ = scene.sample_initial(NUM_STARTS, seeded)
-        if TERRAIN in self.starts:
-            self.parameters = {TERRAIN: self.starts[TERRAIN].shape[1]}
+        size = (
+            {TERRAIN: self.starts[TERRAIN].shape[1]} if TERRAIN in self.starts else {}
+        )
+        others = {key: n for key, n in self.parameters.items() if key != TERRAIN}
+        self.parameters = others | size
+
+    def with_scene(self, scene: Scene) -> Self:
+        """The same task in another scene of the same robot; starts are drawn from it.
+
+        Raises ValueError where its joints or its motors are others.
+        """
+        twin = super().with_scene(scene)
+        if scene.hash != self.scene.hash:
+            twin._draw_starts(scene)
+        return twin
 
     def build_scene(self) -> Scene:
         """The scene that was given."""

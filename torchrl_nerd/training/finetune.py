@@ -22,12 +22,12 @@ from torchrl_nerd.checkpoint import from_pretrained
 from torchrl_nerd.configs import FinetuneConfig
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Model, dynamics_of
+from torchrl_nerd.evaluation.position_error import Errors, unit_of
 from torchrl_nerd.evaluation.recorded_error import (
     error_key,
     errors_along,
     window_errors,
 )
-from torchrl_nerd.evaluation.rollout_error import Errors, unit_of
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import recorded_protocol
 from torchrl_nerd.scenes import Scene

@@ -32,7 +32,12 @@ class Stats:
 
     @classmethod
     def of(cls, samples: Tensor) -> "Stats":
-        """Statistics of ``(*batch, D)`` samples over all leading dimensions."""
+        """Statistics of ``(*batch, D)`` samples over all leading dimensions.
+
+        Raises ValueError for samples of fewer dimensions.
+        """
+        if samples.ndim < 2:
+            raise ValueError(f"expected samples (*batch, D), got {[*samples.shape]}")
         x = samples.detach().double().flatten(0, -2)  # (n, D)
         mean = x.mean(0)
         return cls(len(x), mean, ((x - mean) ** 2).sum(0))
@@ -72,8 +77,8 @@ class Normalize(StateTransform):
     stored, an env on what it is given. `denormalize` is the inverse of one quantity.
 
     Raises:
-        ValueError: a key of ``in_keys_inv`` without statistics, statistics of nothing; when
-            called, whole numbers.
+        ValueError: a key of ``in_keys_inv`` without statistics, statistics of nothing
+            or of numbers that are not finite; when called, whole numbers.
 
     Examples:
         >>> x = torch.randn(100, 3).double() * 5.0 + 1000.0
@@ -82,6 +87,8 @@ class Normalize(StateTransform):
         >>> bool((y.mean().abs() < 1e-6) & ((y.std() - 1.0).abs() < 1e-2))
         True
     """
+
+    enable_inv_on_reset = True  # a state that is set there is given as well
 
     def __init__(
         self, stats: Mapping[NestedKey, Stats], in_keys_inv: Sequence[NestedKey] = ()
@@ -93,6 +100,13 @@ class Normalize(StateTransform):
             )
         if empty := [key for key, of_key in stats.items() if not of_key.count]:
             raise ValueError(f"expected statistics of samples, got none of {empty}")
+        is_finite = {
+            key: s.mean.isfinite() & s.m2.isfinite() for key, s in stats.items()
+        }
+        if odd := [key for key, finite in is_finite.items() if not finite.all()]:
+            raise ValueError(
+                f"expected statistics of finite samples, got NaN or infinity in {odd}"
+            )
         super().__init__(keys, keys, in_keys_inv=back, out_keys_inv=back)
         self.names = {}
         for key, of_key in stats.items():

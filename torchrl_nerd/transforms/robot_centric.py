@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_nerd.configs import NO_PREDICTIONS, FeatureConfig
 from torchrl_nerd.geometry.constants import constant, take
-from torchrl_nerd.geometry.manifold import BALL, FREE, HINGE
+from torchrl_nerd.geometry.manifold import BALL, FREE
 from torchrl_nerd.geometry.other_trees import OtherTrees
 from torchrl_nerd.geometry.rotations import matrix_from_quat, rotate_inverse
 from torchrl_nerd.keys import (
@@ -27,6 +27,7 @@ from torchrl_nerd.scenes.commands import num_ctrl
 from torchrl_nerd.scenes.penalty_law import limit_forces, limit_stiffness
 from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.support import unit_gravity
+from torchrl_nerd.scenes.symmetries import periodic_hinges
 from torchrl_nerd.transforms.base import FeatureTransform
 
 LIMIT_STEPS = 1.5  # control steps at top speed from which on a limit is a feature
@@ -123,7 +124,7 @@ class _JointFeatures:
 
     def __init__(self, scene: Scene, features: FeatureConfig) -> None:
         self.step_size = scene.control_step  # s
-        self.angles: list[int] = []  # qpos of unlimited hinges
+        self.angles: list[int] = []  # qpos of hinges that a whole turn leaves alike
         self.positions: list[int] = []  # qpos that enter as they are
         self.balls: list[int] = []  # qpos of ball joints' quaternions
         self.velocities: list[int] = []  # dofs that enter as they are
@@ -133,6 +134,7 @@ class _JointFeatures:
         self.predicted: list[int] = []  # dofs whose limit torque is predicted
         self.springs: list[tuple[float, float]] = []  # stiffness, damping of each
         model, ignored = scene.model, scene.symmetries
+        periodic = set(periodic_hinges(model, scene.servos is not None))
         speed = torch.tensor((scene.sampling.qvel_low, scene.sampling.qvel_high))
         speed = speed.abs().amax(0)
         for joint in range(model.njnt):
@@ -145,8 +147,7 @@ class _JointFeatures:
                 self.velocities.extend((v, v + 1, v + 2))
                 continue
             if q not in ignored.positions:
-                is_angle = kind == HINGE and not is_limited
-                (self.angles if is_angle else self.positions).append(q)
+                (self.angles if q in periodic else self.positions).append(q)
             if v not in ignored.velocities:
                 self.velocities.append(v)
             if is_limited:

@@ -11,17 +11,15 @@ from tqdm import tqdm
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics
 from torchrl_nerd.evaluation.bench.candidates import Candidate, mujoco_name
+from torchrl_nerd.evaluation.position_error import Errors, position_errors, unit_of
 from torchrl_nerd.evaluation.rollout_error import (
     Drive,
-    Errors,
     action_drive,
     initial_states,
     motion_before,
     open_loop,
-    position_errors,
     scene_of,
     summarize,
-    unit_of,
 )
 from torchrl_nerd.evaluation.tables import text_table
 from torchrl_nerd.geometry.manifold import integrate_pos

@@ -12,7 +12,8 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import Dynamics, MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.rollout_error import position_errors, rollout
+from torchrl_nerd.evaluation.position_error import position_errors
+from torchrl_nerd.evaluation.rollout_error import rollout
 from torchrl_nerd.evaluation.stability.states import (
     clear_of_ground,
     sample_states,

@@ -19,10 +19,10 @@ from torchrl_nerd.evaluation.stability.case import (
     norm,
 )
 from torchrl_nerd.evaluation.stability.states import rotated
-from torchrl_nerd.geometry.manifold import HINGE
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.commands import drive
+from torchrl_nerd.scenes.symmetries import periodic_hinges
 
 KEPT = 1000  # states of a long rollout
 ROUNDING = 1e-6
@@ -101,19 +101,15 @@ def quaternion_sign(trial: Trial) -> Iterator[Metric]:
     yield Metric("largest difference after 10 steps, m or rad", worst, 1e-6)
 
 
-def _free_hinges(scene: Scene) -> list[int]:
-    """Addresses in ``qpos`` of hinges without limit and spring."""
-    model = scene.model
-    is_free = (model.jnt_type == HINGE) & (model.jnt_limited == 0)
-    is_free &= model.jnt_stiffness == 0
-    return model.jnt_qposadr[is_free].tolist()
+def _periodic(scene: Scene) -> list[int]:
+    return periodic_hinges(scene.model, scene.servos is not None)
 
 
-@hard_case(lambda scene: bool(_free_hinges(scene)))
+@hard_case(lambda scene: bool(_periodic(scene)))
 def hinge_turns(trial: Trial) -> Iterator[Metric]:
-    """A hundred turns of a hinge without limits change nothing."""
+    """A hundred turns of a hinge without limits and springs change nothing."""
     start, torque = trial.starts(16), trial.commands(16, 20)
-    turns, hinges = 200.0 * torch.pi, _free_hinges(trial.scene)
+    turns, hinges = 200.0 * torch.pi, _periodic(trial.scene)
     shift = _shifted(trial, start, hinges, turns, torque, steps=20)
     yield Metric("difference after 100 turns and 20 steps, rad", shift, 1e-6)
 

@@ -14,7 +14,8 @@ from torchrl_nerd.dynamics import (
     MujocoDynamics,
     NeRDDynamics,
 )
-from torchrl_nerd.evaluation.rollout_error import open_loop, position_errors
+from torchrl_nerd.evaluation.position_error import position_errors
+from torchrl_nerd.evaluation.rollout_error import open_loop
 from torchrl_nerd.evaluation.stability.case import Metric, Trial, hard_case
 from torchrl_nerd.keys import QPOS, QVEL, TERRAIN
 from torchrl_nerd.modules.nerd import NeRD

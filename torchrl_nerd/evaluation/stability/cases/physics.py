@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.dynamics import MujocoDynamics
-from torchrl_nerd.evaluation.rollout_error import position_errors, rollout
+from torchrl_nerd.evaluation.position_error import position_errors
+from torchrl_nerd.evaluation.rollout_error import rollout
 from torchrl_nerd.evaluation.stability.case import (
     Metric,
     Trial,
