@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -196,6 +197,9 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
         )
         typo = ["--data", "datasets/cartpol", "--out", "runs/other"]
         assert "a data set in datasets/cartpol" in refusal(capsys, *learn, *typo, *dry)
+    shutil.rmtree("datasets")
+    assert "holds a run" in refusal(capsys, *learn, "--seed", "5")
+    assert not (tmp_path / "datasets").exists()  # nothing was drawn
 
 
 @pytest.mark.parametrize("command", ["data", "train", "finetune"])

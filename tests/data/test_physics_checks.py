@@ -10,6 +10,7 @@ from torchrl_nerd import load_scene
 from torchrl_nerd.data.physics_checks import check_log
 from torchrl_nerd.data.recorded import CLEAR, complete
 from torchrl_nerd.geometry.rotations import quat_multiply, rotate, rotate_inverse
+from torchrl_nerd.scenes import Scene
 
 XYZW = [1, 2, 3, 0]
 NONE = torch.nan  # of velocities that were not recorded
@@ -202,3 +203,21 @@ def test_exact_motion_passes(name, generator):
             half = {key: getattr(log, key)[::2] for key in ("qpos", "qvel")}
             torque, offsets = log.joint_torque[::2], log.offsets // 2
             check_log(replace(log, **half, joint_torque=torque, offsets=offsets), scene)
+
+
+@pytest.mark.parametrize(
+    ("option", "body"), [('gravity="0 0 0"', ""), ("", 'gravcomp="1"')]
+)
+def test_a_body_that_does_not_fall_passes(option, body, generator, tmp_path):
+    (tmp_path / "body.xml").write_text(f"""<mujoco><option {option}/><worldbody>
+      <body {body}><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody>
+      </mujoco>""")
+    scene = Scene.from_mjcf(tmp_path / "body.xml")
+    log = simulated(scene, generator)
+    assert check_log(log, scene)
+    fall = 0.5 * 9.81 * (torch.arange(20) * log.frame) ** 2
+    qpos = log.qpos.clone()
+    qpos[:, 2] -= fall.repeat(len(log))
+    qvel = torch.full_like(log.qvel, float("nan"))
+    with pytest.raises(ValueError, match="free fall along z"):
+        check_log(replace(log, qpos=qpos, qvel=qvel), scene)
