@@ -94,7 +94,7 @@ def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]
     now, recent = env.reset(), None
     progress = trange(1, cfg.updates + 1, unit="window")
     for update in progress:
-        reward, recent = window_reward(env, policy, now, recent, cfg.window)
+        reward, recent, ended = window_reward(env, policy, now, recent, cfg.window)
         optimizer.zero_grad()
         (-reward).backward()
         norm = nn.utils.clip_grad_norm_(policy.mlp.parameters(), 1.0)
@@ -102,9 +102,8 @@ def train(cfg: Config, measure: Callable = measure) -> tuple[Policy, list[float]
             optimizer.step()
         schedule.step()
         rewards.append(float(reward.detach()))
-        now, recent = go_on(
-            env, recent, policy.frame_stack, (update + turn) % windows == 0
-        )
+        ended |= (update + turn) % windows == 0
+        now, recent = go_on(env, recent, policy.frame_stack, ended)
         if update % cfg.evaluate_every == 0 or update == cfg.updates:
             earned = measure(cfg, policy)
             progress.set_postfix(earned=earned.mean, best=best.mean)
@@ -134,8 +133,10 @@ def step_back(policy: Policy, best: Policy, optimizer: Adam) -> None:
 
 def window_reward(
     env: NeRDEnv, policy: Policy, now: TensorDictBase, recent: Tensor | None, steps: int
-) -> tuple[Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor | None, Tensor]:
     """Mean reward of the policy's mean actions, with gradients, and what it saw last.
+
+    An env that ended earns nothing more; the last value is which did, ``(num_envs,)``.
 
     Args:
         env: learned dynamics that are differentiable.
@@ -144,15 +145,17 @@ def window_reward(
         recent: ``(num_envs, frame_stack * D)``, what it saw last; None at first.
         steps: how many actions.
     """
-    total = torch.zeros(())
+    total, runs = torch.zeros(()), torch.ones(*env.batch_size, 1, dtype=torch.bool)
     for _ in range(steps):
         recent = append_frame(recent, now["observation"], policy.frame_stack)
         mean, _ = policy(recent)
         if mean.requires_grad:
             mean.register_hook(bound_gradients)
         now = env.step(now.set("action", mean.tanh()))["next"]
-        total = total + now["reward"].mean()
-    return total / steps, None if recent is None else recent.detach()
+        total = total + (runs * now["reward"]).mean()
+        runs = runs & ~now["done"]
+    ended = ~runs.squeeze(-1)
+    return total / steps, None if recent is None else recent.detach(), ended
 
 
 def bound_gradients(gradient: Tensor, times: float = 4.0) -> Tensor:

@@ -242,7 +242,7 @@ def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path)
     def early(cfg, policy):  # so few updates help the first steps of an episode alone
         env = NeRDEnv(cfg.task, num_envs=64, seed=cfg.seed + 1)
         with torch.no_grad():
-            reward, _ = first_order.window_reward(env, policy, env.reset(), None, 24)
+            reward, *_ = first_order.window_reward(env, policy, env.reset(), None, 24)
         return summarize(reward.expand(2), reward.expand(2))
 
     policy, rewards = first_order.train(cfg, early)
@@ -255,7 +255,7 @@ def test_gradients_through_learned_dynamics_help_in_true_ones(example, tmp_path)
     for each in (policy, idle):
         now = env.reset(start.select(*env.state.keys()), set_state=True)
         with torch.no_grad():
-            reward, _ = first_order.window_reward(env, each, now, None, 24)
+            reward, *_ = first_order.window_reward(env, each, now, None, 24)
         earned.append(float(reward))
     assert earned[0] > earned[1] + 0.01
     first_order.main(replace(cfg, start=tmp_path, updates=1, lr=0.0))
@@ -302,10 +302,10 @@ def test_windows_go_on_where_the_last_one_ended(example, generator):
     env = NeRDEnv(cfg.task, model, 4, differentiable=True)
     policy = first_order.make_policy(cfg, env)
     start = env.reset()
-    whole, _ = first_order.window_reward(env, policy, start, None, 6)
+    whole, *_ = first_order.window_reward(env, policy, start, None, 6)
     now, recent, parts = env.reset(start, set_state=True), None, []
     for _ in range(2):
-        part, recent = first_order.window_reward(env, policy, now, recent, 3)
+        part, recent, _ = first_order.window_reward(env, policy, now, recent, 3)
         parts.append(part)
         ended = torch.zeros(4, dtype=torch.bool)
         now, recent = first_order.go_on(env, recent, policy.frame_stack, ended)
@@ -314,12 +314,43 @@ def test_windows_go_on_where_the_last_one_ended(example, generator):
     assert all(gradient.any() for gradient in gradients)
 
 
+def test_an_episode_that_is_over_earns_nothing_and_begins_anew(example):
+    """Two Ants on the ground, and two as they start."""
+    first_order = example("first_order")
+    model = from_pretrained("ant-mlp").requires_grad_(False)
+    env = NeRDEnv("ant/run", model, 4, 0, differentiable=True)
+    policy = first_order.make_policy(first_order.Config("ant/run", num_envs=4), env)
+    state = env.reset().clone()
+    state["qpos"][:2, 2] = 0.25
+    paid = []
+    for fell in (state, state[[2, 3, 2, 3]]):  # two lie there, and none does
+        start = env.reset(fell, set_state=True)
+        reward, *_ = first_order.window_reward(env, policy, start, None, 3)
+        paid.append(float(reward))
+    assert paid[0] < paid[1]
+    start = env.reset(state, set_state=True)
+    *_, ended = first_order.window_reward(env, policy, start, None, 1)
+    assert ended.tolist() == [True, True, False, False]
+    start = env.reset(state, set_state=True)
+    _, recent, ended = first_order.window_reward(env, policy, start, None, 2)
+    assert ended.tolist() == [True, True, False, False]
+    standing = env.state["qpos"][2:].clone()
+    now, _ = first_order.go_on(env, recent, policy.frame_stack, ended)
+    torch.testing.assert_close(now["qpos"][2:], standing)
+    fresh = env.task.initial_state(torch.rand(64, env.task.num_uniforms).double())
+    low, high = fresh["qpos"][:, 2].aminmax()
+    assert (
+        (now["qpos"][:2, 2] >= low - 0.1) & (now["qpos"][:2, 2] <= high + 0.1)
+    ).all()
+    assert not now["qvel"][:2].abs().max() > fresh["qvel"].abs().max() + 0.1
+
+
 def test_rows_whose_episode_ended_begin_anew_and_the_others_go_on(example, seed):
     first_order = example("first_order")
     model = from_pretrained("franka").requires_grad_(False)
     env = NeRDEnv("franka/reach", model, 6, seed, differentiable=True)
     policy = first_order.make_policy(first_order.Config(num_envs=6), env)
-    _, recent = first_order.window_reward(env, policy, env.reset(), None, 4)
+    _, recent, _ = first_order.window_reward(env, policy, env.reset(), None, 4)
     before, ended = env.state, torch.arange(6) % 2 == 0
     now, seen = first_order.go_on(env, recent, policy.frame_stack, ended)
     assert not any(x.requires_grad for x in now.values(True, True))
