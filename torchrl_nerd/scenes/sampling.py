@@ -157,9 +157,8 @@ def draw_initial(
         """States, and by how much they are too near to the ground, and too deep, m."""
         qpos, qvel = _draw(sampling, layout, count, generator)
         low = deep = qpos.new_zeros(count)
-        gaps = None if sampling.clearance is None else clearances(qpos)  # (n, P)
-        if sampling.clearance is not None and gaps is not None and gaps.shape[-1]:
-            low = (sampling.clearance - gaps.amin(-1)).clamp_min(0.0)
+        if sampling.clearance is not None and (gaps := clearances(qpos)).shape[-1]:
+            low = (sampling.clearance - gaps.amin(-1)).clamp_min(0.0)  # of (n, P)
         if sampling.penetration is not None:
             deep = (depths(qpos) - sampling.penetration).clamp_min(0.0)
         return qpos, qvel, low, deep

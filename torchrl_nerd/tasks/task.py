@@ -136,12 +136,14 @@ class SceneTask(Task):
         self.parameters = others | size
 
     def with_scene(self, scene: Scene) -> Self:
-        """The same task in another scene of the same robot; starts are drawn from it.
+        """The same task in another scene of the same robot.
 
-        Raises ValueError where its joints or its motors are others.
+        Starts are drawn anew where only one ground varies from env to env. Raises
+        ValueError where its joints or its motors are others.
         """
         twin = super().with_scene(scene)
-        if scene.hash != self.scene.hash:
+        varies = scene.terrain is not None and scene.terrain.is_per_env
+        if varies != (TERRAIN in self.starts):
             twin._draw_starts(scene)
         return twin
 
