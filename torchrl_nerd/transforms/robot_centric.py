@@ -42,7 +42,7 @@ class RobotCentric(FeatureTransform):
     | out key | what | width |
     |---|---|---|
     | ``robot_state`` | floating base: linear, angular velocity, unit gravity in B_t | 9 |
-    | | unlimited hinge: sin, cos | 2 |
+    | | hinge that whole turns leave alike: sin, cos | 2 |
     | | other hinge, slide: position, unless the dynamics ignore it | 1 |
     | | ball: first two columns of its rotation matrix | 6 |
     | | other free body: position, two columns of its rotation matrix, linear and angular
