@@ -138,9 +138,9 @@ class Train(SceneOptions, DeviceCommand):
         (out, folders), initial = self.folders, self.initial(scene)
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
-        self.expect_own(out, scene)
         self.untrained(scene, initial)  # refuses before data are drawn, or read
         if self.is_to_draw(folders):
+            self.expect_own(out, scene)
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads is not None:
