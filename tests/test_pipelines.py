@@ -326,7 +326,7 @@ def test_an_episode_that_is_over_earns_nothing_and_begins_anew(example):
     for fell in (state, state[[2, 3, 2, 3]]):  # two lie there, and none does
         start = env.reset(fell, set_state=True)
         reward, *_ = first_order.window_reward(env, policy, start, None, 3)
-        paid.append(float(reward))
+        paid.append(float(reward.detach()))
     assert paid[0] < paid[1]
     start = env.reset(state, set_state=True)
     *_, ended = first_order.window_reward(env, policy, start, None, 1)
