@@ -183,6 +183,8 @@ model-franka-adaptive: $(STAMP) ## Frankas that find their hidden parameters
 ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
 ANT_LEARNED := $(ANT_DATA) datasets/ant_correlated datasets/ant_resting datasets/ant_learned
 ANT := --symmetries 4 --save-every 500 --threads 1
+TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85
+MLP := --network mlp-4x160 --single-step-fraction 1
 FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
 SMALLER := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
 AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(SMALLER)
@@ -205,9 +207,9 @@ data-ant: $(STAMP)
 	$(NERD) data ant --strategy resting --trajectories 9000 --seed 71 --out datasets/ant_resting
 
 data-ant-learned: data-ant
-	$(NERD) train ant $(ANT) $(FIRST) --network mlp-4x160 --single-step-fraction 1 \
+	$(NERD) train ant $(ANT) $(FIRST) $(MLP) \
 		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp_first
-	$(NERD) train ant $(ANT) $(AGAIN) --network mlp-4x160 --single-step-fraction 1 \
+	$(NERD) train ant $(ANT) $(AGAIN) $(MLP) \
 		--validate-every 4000 --init-from runs/ant_mlp_first/best \
 		--steps 10000 --rollout-steps 4500 --out runs/ant_mlp_second
 	for seed in 11 12 13; do \
@@ -218,15 +220,15 @@ data-ant-learned: data-ant
 		--trajectories 2200 --steps 500 --seed 61 --out datasets/ant_learned
 
 model-ant: data-ant-learned ## the Ant's transformer, with the mirrors of the Ant built in
-	$(NERD) train ant $(ANT) $(FIRST) --network transformer-4x128 --single-step-fraction 0.85 \
+	$(NERD) train ant $(ANT) $(FIRST) $(TRANSFORMER) \
 		--steps 15000 --rollout-steps 3000 --out runs/ant_first
-	$(NERD) train ant $(ANT) $(AGAIN) --network transformer-4x128 --single-step-fraction 0.85 \
+	$(NERD) train ant $(ANT) $(AGAIN) $(TRANSFORMER) \
 		--validate-every 4000 --init-from runs/ant_first/best \
 		--steps 8000 --rollout-steps 3500 --out runs/ant_second
-	$(NERD) train ant $(ANT) $(AGAIN) --network transformer-4x128 --single-step-fraction 0.85 \
+	$(NERD) train ant $(ANT) $(AGAIN) $(TRANSFORMER) \
 		--validate-every 1500 --init-from runs/ant_second/best \
 		--steps 0 --rollout-steps 3000 --out runs/ant_third
-	$(NERD) train ant $(ANT) $(LAST) --network transformer-4x128 --single-step-fraction 0.85 \
+	$(NERD) train ant $(ANT) $(LAST) $(TRANSFORMER) \
 		--init-from runs/ant_third/best --steps 8000 --rollout-steps 3500 --out runs/ant_fourth
 	for seed in 21 22; do \
 		$(IN_THE_TRANSFORMER) ant/run --seed $$seed --out runs/own_$$seed || exit 1; \
@@ -236,16 +238,16 @@ model-ant: data-ant-learned ## the Ant's transformer, with the mirrors of the An
 		--trajectories 1100 --steps 500 --seed 62 --out datasets/ant_own_run
 	$(NERD) data ant --policy runs/own_*/ant-spin/*/[0-9]* \
 		--trajectories 550 --steps 500 --seed 63 --out datasets/ant_own_spin
-	$(NERD) train ant $(ANT) $(OWN) --network transformer-4x128 --single-step-fraction 0.85 \
+	$(NERD) train ant $(ANT) $(OWN) $(TRANSFORMER) \
 		--validate-every 4000 --init-from runs/ant_fourth/best \
 		--steps 6000 --rollout-steps 2500 --out runs/ant_fifth
-	$(NERD) train ant $(ANT) $(OWN) --network transformer-4x128 --single-step-fraction 0.85 \
+	$(NERD) train ant $(ANT) $(OWN) $(TRANSFORMER) \
 		--validate-every 1500 --init-from runs/ant_fifth/best \
 		--steps 0 --rollout-steps 4500 --out runs/ant_sixth
 	cp runs/ant_sixth/best/* $(PRETRAINED)/ant/
 
 model-ant-mlp: data-ant-learned ## the Ant's MLP, with the same mirrors
-	$(NERD) train ant $(ANT) $(LAST) --network mlp-4x160 --single-step-fraction 1 \
+	$(NERD) train ant $(ANT) $(LAST) $(MLP) \
 		--init-from runs/ant_mlp_second/best --steps 10000 --rollout-steps 4500 --out runs/ant_mlp_third
 	cp runs/ant_mlp_third/best/* $(PRETRAINED)/ant-mlp/
 
