@@ -353,29 +353,36 @@ def test_readme_s_error_of_the_hybrid_is_what_was_measured():
     assert f"has an error of {mean:.2g} rad" in README.read_text()
 
 
+ANTS = {  # row of README -> names in bench_ant.json and in time_to_policy_ant_run.json
+    '`"ant-mlp"`': ("ant-mlp, compiled", "ant-mlp"),
+    '`"nerd"`, which is `"ant"`': ("ant, compiled", "ant"),
+    '`"analytic"`': ("analytic, compiled", "analytic"),
+    '`"mujoco"`, its own 16 substeps': ("MuJoCo Euler, 16 substeps", "mujoco"),
+    "MuJoCo with 4 substeps": ("MuJoCo Euler, 4 substeps", "mujoco-4"),
+}
+
+
 def test_readme_s_rates_of_the_ant_are_what_was_measured():
-    bench = json.loads((ROOT / "results" / "bench_ant.json").read_text())["results"]
+    """Thousands of control steps per second, m, and minutes to the return wanted."""
+    bench, learned = (
+        json.loads((ROOT / "results" / f"{name}.json").read_text())["results"]
+        for name in ("bench_ant", "time_to_policy_ant_run")
+    )
     rates = {x["name"]: x["steps_per_s"] for x in bench["rates"] if x["batch"] == 512}
     errors = {
         x["name"]: x["mean"]
         for x in bench["errors"]
         if x["quantity"] == "base_position"
     }
-    own, four, mlp, transformer = (
-        "MuJoCo Euler, 16 substeps",
-        "MuJoCo Euler, 4 substeps",
-        "ant-mlp, compiled",
-        "ant, compiled",
-    )
-    said = " ".join(README.read_text().split())
-    rate = {name: f"{round(x, -3):,.0f}" for name, x in rates.items()}
-    exact = "analytic, compiled"
-    assert f"{rate[exact]} control steps per second in `analytic`" in said
-    assert f"{rate[mlp]} in `ant-mlp` and {rate[transformer]} in `ant`" in said
-    far = f"{errors[exact]:.3f}, {errors[mlp]:.3f} and {errors[transformer]:.3f} m off"
-    assert far in said
-    assert f"MuJoCo makes {round(rates[own], -2):,.0f} with its own 16 substeps" in said
-    assert f"{rate[four]} with four at {errors[four]:.3f} m" in said
+    rows = {row[0]: row[1:] for row in map(cells, tables(README)) if row[0] in ANTS}
+    assert rows == {
+        row: [
+            f"{round(rates[name], -3):,.0f}",
+            f"{errors[name]:.3f}",
+            f"{learned['seconds'][dynamics] / 60:.1f}",
+        ]
+        for row, (name, dynamics) in ANTS.items()
+    }
 
 
 def test_tables_of_the_site_are_rendered_from_results(tmp_path):

@@ -155,6 +155,6 @@ def errors_as_text(
     for name, row in (*table.items(), *papers.items()):
         for key, error in row.items():
             if key != "against":
-                cells = (f"{error[c]:.4f}" if c in error else "" for c in columns)
+                cells = (f"{error[c]:.3g}" if c in error else "" for c in columns)
                 body.append([name, key.replace("_error_", " "), *cells])
     return text_table([f"{states} states", "quantity", *columns], body)
