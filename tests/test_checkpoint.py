@@ -24,6 +24,7 @@ from torchrl_nerd.checkpoint import (
     WEIGHTS,
     load_checkpoint,
     make_card,
+    read_checkpoint,
     save_checkpoint,
     shipped_card,
     shipped_models,
@@ -289,14 +290,21 @@ def drawn(lines: list[list[str]], folder: str) -> tuple[int, int]:
 
 def test_a_model_saved_again_still_names_the_solver_it_learned_from(tmp_path):
     model = from_pretrained("cartpole-mlp-rk4")
-    card = make_card(
-        load_checkpoint(save_checkpoint(model, tmp_path, make_card(model)))
-    )
-    assert (
-        card["reference_ratio"]
-        == shipped_card("cartpole-mlp-rk4")["reference_ratio"]
-        > 1
-    )
+    again, check = read_checkpoint(save_checkpoint(model, tmp_path, make_card(model)))
+    card, shipped = make_card(again), shipped_card("cartpole-mlp-rk4")
+    for key in ("reference_ratio", "scene_hash", "control_step"):
+        assert card[key] == shipped[key], key
+    assert card["reference_ratio"] > 1
+    assert check is not None and check.model < 1e-6  # its steps are repeated
+
+
+def test_a_folder_stands_for_no_kind_and_a_scene_is_a_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nerd").mkdir()
+    with pytest.raises(ValueError, match="no learned model of .* is shipped: make one"):
+        from_pretrained("nerd", load_scene("gymnasium/Hopper-v5"))
+    with pytest.raises(ValueError, match="expected a Scene beside 'nerd', got 'ant'"):
+        from_pretrained("nerd", "ant")
 
 
 def test_a_folder_goes_before_the_short_name_of_a_shipped_model(tmp_path, monkeypatch):

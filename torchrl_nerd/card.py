@@ -35,6 +35,8 @@ KINDS: dict[str, dict[str, type]] = {
 def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str, Any]:
     """What a checkpoint says of itself; ``training``: how its weights were made."""
     scene = model.scene
+    if isinstance(model, NeRD) and model.reference_ratio > 1:
+        scene = scene.reference
     card: dict[str, Any] = {
         "format": FORMAT,
         "kind": model.kind,
@@ -50,7 +52,6 @@ def make_card(model: Model, training: dict[str, Any] | None = None) -> dict[str,
     if isinstance(model, NeRD):
         card["network"] = _described("network", model.config)
         card["features"] = asdict(model.scene_features.config)
-        card["reference_ratio"] = model.reference_ratio
     if not isinstance(step, NeRD):
         card["step"] = _described("step", step.config)
     if isinstance(model, HybridNeRD):

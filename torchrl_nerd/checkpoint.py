@@ -23,7 +23,7 @@ from torchrl_nerd.modules.hybrid import HybridNeRD
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import NetworkConfig
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.robots.registry import MODELS, RESERVED
+from torchrl_nerd.robots.registry import MODELS, PRETRAINED, RESERVED
 from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.scenes.variation import expect_told
 from torchrl_nerd.selfcheck import PREFIX as CHECK
@@ -37,7 +37,6 @@ from torchrl_nerd.settings import did_you_mean
 from torchrl_nerd.tensor_files import expect_fit, read_tensors, write_tensors
 
 WEIGHTS, CARD = "model.safetensors", "card.json"
-PRETRAINED = Path(__file__).parent / "pretrained"
 KINDS = ("nerd", "hybrid", "analytic")
 """Names of the models of a scene, beside those of engines and of shipped models."""
 
@@ -113,12 +112,14 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     """
     if not isinstance(name_or_folder, str | Path):
         raise ValueError(f"expected dynamics of {_known()}, got {name_or_folder!r}")
-    found = model_name(name_or_folder, scene)
-    if scene is not None and (found == "analytic" or found in STEPS):
+    if not isinstance(scene, Scene | None):
+        raise ValueError(f"expected a Scene beside '{name_or_folder}', got {scene!r}")
+    found, given = model_name(name_or_folder, scene), str(name_or_folder)
+    if scene is not None and (found == "analytic" or given in STEPS):
         return make_step(scene, STEPS.get(found))
     if found in shipped_models():
         return load_checkpoint(model_folder(found), scene)
-    if os.path.isdir(found):  # False, too, for what no path can be
+    if found not in KINDS and os.path.isdir(found):  # False for what no path can be
         return load_checkpoint(Path(found), scene)
     if found in ENGINES:
         raise ValueError(f"expected a model, got the engine '{found}'")
@@ -128,13 +129,12 @@ def from_pretrained(name_or_folder: str | Path, scene: Scene | None = None) -> M
     own = () if scene is None else (*KINDS, f"{scene.name}-hybrid")
     asked = scene.name if scene is not None and found in own else found
     if asked != found or is_import(found):
-        hybrid_of = scene if found.endswith("hybrid") else None
-        raise ValueError(_not_shipped(asked, hybrid_of))
+        raise ValueError(_not_shipped(asked, scene if "hybrid" in found else None))
     if Path(found).name != found:
         raise ValueError(_no_folder(Path(found)))
-    asked = "nerd" if found == "learned" else str(found)
-    meant = did_you_mean(asked, (*RESERVED, *STEPS, *shipped_models()))
-    raise ValueError(f"unknown dynamics {str(found)!r}{meant}, expected {_known()}")
+    known = *RESERVED, *STEPS, *shipped_models()
+    meant = did_you_mean("nerd" if found == "learned" else found, known)
+    raise ValueError(f"unknown dynamics {found!r}{meant}, expected {_known()}")
 
 
 def _no_folder(folder: Path) -> str:
@@ -198,8 +198,7 @@ def shipped_models(scene: Scene | None = None) -> list[str]:
     """
     own = {name for name, folder in MODELS.items() if (Path(folder) / CARD).is_file()}
     names = sorted({path.parent.name for path in PRETRAINED.glob(f"*/{CARD}")} | own)
-    here = None if scene is None else scene.name
-    return [x for x in names if here is None or shipped_card(x)["scene"] == here]
+    return [x for x in names if scene is None or shipped_card(x)["scene"] == scene.name]
 
 
 def shipped_card(name: str) -> dict[str, Any]:

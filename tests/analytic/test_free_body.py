@@ -1,5 +1,6 @@
 """The cheap simulator step obeys the physics that it stands for."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -140,6 +141,24 @@ def test_parameters_are_taken_over(real_cube, generator):
     }
     step.set_values(wanted)
     assert step.values() == pytest.approx(wanted)
+    before = step.raw.clone()
+    step.set_values({"size": 1.01})
+    assert (step.raw != before).sum() == 1  # the others stay, to the bit
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"frction": 0.2}, "expected parameters of gravity, .*, got 'frction'"),
+        ({"friction": -1.0}, "expected a finite friction above 0, got -1"),
+        ({"centre_x": math.inf}, "expected a finite centre_x, got inf"),
+    ],
+)
+def test_parameters_that_are_none_are_refused(real_cube, values, message):
+    step = FreeBodyPenaltyStep(real_cube)
+    with pytest.raises(ValueError, match=message):
+        step.set_values(values)
+    assert step.raw.isfinite().all()
 
 
 def test_gradients_are_those_of_the_motion(real_cube, generator):

@@ -75,6 +75,9 @@ def test_a_seed_is_drawn_where_none_is_given_and_workers_differ(generator):
     makers = [make_env, NeRDEnv, GroundTruthEnv]
     assert len({make(TASK).seed for make in makers + makers}) == 6
     assert all(make(TASK, seed=3).seed == 3 for make in makers)
+    env = make_env(TASK, seed=3)
+    env.set_seed()
+    assert env.seed != 3
 
 
 @pytest.mark.slow

@@ -290,6 +290,30 @@ def test_data_along_a_policy_keep_the_parameters_of_a_start(generator):
     assert (data[PARAMETERS] == 2.5).all()
 
 
+def test_a_history_that_ends_with_an_episode_shows_nothing():
+    task = make_task("cartpole/swingup").vary(RANGES)
+    log = NeRDEnv(task, "cartpole-adaptive", num_envs=3, seed=0).rollout(8)
+    log["next", "done"][1:, -1] = True
+    found = []
+    for history in (log, None):
+        env = NeRDEnv(task, "cartpole-adaptive", num_envs=3, seed=0)
+        env.reset(log[:, -1]["next"].select(QPOS, QVEL, PARAMETERS), set_state=True)
+        if history is not None:
+            env.warm_up(history)
+        given = env.state.set("action", torch.ones(3, 1))
+        found.append(env.step(given)["next", QVEL])
+    torch.testing.assert_close(found[0][1:], found[1][1:])
+    assert (found[0][0] - found[1][0]).abs().max() > 1e-6
+
+
+def test_an_action_of_another_width_is_no_history():
+    env = GroundTruthEnv("ant/run", num_envs=2, seed=0)
+    log = env.rollout(3)
+    log["action"] = log["action"][..., :1]
+    with pytest.raises(ValueError, match="'action' of width 8 in a history, got 1"):
+        env.warm_up(log)
+
+
 def test_a_history_begins_anew_where_an_episode_ended():
     """As if it held what came after alone."""
     task = make_task("cartpole/swingup").vary(RANGES)

@@ -32,14 +32,13 @@ def test_the_report_adds_up_and_its_text_names_all(scene):
     assert all(feature.key in text for feature in report.features)
     assert all(body in text for body in report.contact_bodies)
     assert len(report.contact_bodies) == len(scene.contacts)
-    solver = report.solver
-    kept = solver.points_found - solver.points_merged - solver.points_fixed
+    kept = report.points_found - report.points_merged - report.points_fixed
     assert kept == len(scene.contacts) and f", {kept} kept" in text
     assert type(scene.controller).__name__ in text
     assert ("none that the robot can touch" in text) == (scene.terrain is None)
     assert f"control step: {scene.control_step:.6g} s, MuJoCo Euler, " in text
     assert f" {scene.substeps} substep" in text
-    reason, moved = solver.why_all_kept, {effect.name for effect in solver.effects}
+    reason, moved = report.why_all_kept, {effect.name for effect in report.effects}
     for joint in np.flatnonzero(np.isin(scene.model.jnt_type, (HINGE, SLIDE))):
         assert (joint_label(scene.model, joint) in moved) == (reason is None)
     assert (reason is None) == ("every hinge and slide is kept: " not in text)
@@ -101,6 +100,5 @@ def test_pairs_are_named_by_how_often_they_touch_in_training_data():
 
 def test_merged_and_fixed_contact_points_are_counted():
     report = explain(load_scene("double_pendulum"))
-    solver = report.solver
-    assert (solver.points_found, solver.points_merged, solver.points_fixed) == (4, 1, 1)
+    assert (report.points_found, report.points_merged, report.points_fixed) == (4, 1, 1)
     assert "4 found, 1 merged" in str(report)

@@ -14,6 +14,16 @@ CONFIGS = {
     "gru": GRUConfig(),
     "deep gru": GRUConfig(layers=3, width=16),
 }
+
+
+@pytest.mark.parametrize(
+    "config", [MLPConfig(depth=-1), MLPConfig(width=0), GRUConfig(layers=0)]
+)
+def test_sizes_that_no_network_has_are_refused(config):
+    with pytest.raises(ValueError, match="a whole number of at least"):
+        config.build(INPUTS, OUTPUTS)
+
+
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 
 

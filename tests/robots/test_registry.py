@@ -46,6 +46,10 @@ ROBOT = Robot(
 )
 
 
+TOSSES = dict.fromkeys(("tasks", "presets", "ppo", "policies"), {})
+TOSSES |= {"scenes": {"cube_tosses": lambda: CART}, "models": {"cube_tosses": "runs"}}
+
+
 @pytest.fixture(autouse=True)
 def forget() -> Iterator[None]:
     """Leave all tables, and Gymnasium's registry, as they were."""
@@ -123,7 +127,24 @@ def test_a_module_that_is_loaded_again_replaces_its_robot(tmp_path, monkeypatch)
     assert [task for task in TASKS if task.startswith("cart/")] == ["cart/wait"]
 
 
+def test_robots_that_share_a_scene_s_name_in_turn_leave_each_other_alone():
+    """What a scene was once registered with is forgotten once it is dropped."""
+    names = {name: _named(name) for name in ("arm", "leg")}
+    register(Robot(scenes=names))
+    register(Robot(scenes={"arm": names["arm"]}))
+    register(Robot(scenes={"leg": names["leg"]}))
+    assert {"arm", "leg"} <= TABLES["scenes"].keys()
+
+
+def _named(name):
+    """A function of this module, as registering again asks for."""
+    function = lambda: CART  # noqa: E731
+    function.__qualname__ = function.__name__ = name
+    return function
+
+
 BAD = [
+    (ValueError, "'cube_tosses' is a model of the package", TOSSES),
     (TypeError, "expected a Robot to register, got dict", {}),
     (TypeError, "that return a Scene as scenes", {"scenes": {"cart": CART}}),
     (TypeError, "names and functions", {"scenes": [CART]}),

@@ -89,17 +89,6 @@ def test_an_action_is_a_spring_to_a_displacement_and_a_damper(name, rng):
     torch.testing.assert_close(site[:, :3], want, rtol=1e-8, atol=1e-8)
 
 
-def test_an_absolute_target_is_about_the_center(rng):
-    qpos, qvel = random_state(rng)
-    center = (0.4, 0.1, 0.3)
-    law = controller(center=center, max_mass=inf)
-    action = torch.from_numpy(rng.uniform(-1.0, 1.0, (ROWS, 3)))
-    _, site = mujoco_acceleration("franka", qpos, qvel, law(action, qpos, qvel))
-    target = qpos.new_tensor(center) + 0.1 * action
-    want = 50.0 * (target - law.site(qpos).position)
-    torch.testing.assert_close(site[:, :3], want, rtol=1e-8, atol=1e-8)
-
-
 @pytest.mark.parametrize("size", [3, 6])
 def test_free_joints_go_home_by_what_does_not_move_the_hand(size, rng):
     """q'' = u + M^-1 J^T F: what is left of u has no part that a force at the hand has."""
@@ -168,7 +157,7 @@ def test_torques_stay_within_the_limits(rng):
 def test_numbers_may_come_as_arrays(rng):
     qpos, qvel = random_state(rng)
     names = {"kp": (50.0,) * 3, "kd": (9.0,) * 3, "home": HOME, "limit": GAIN}
-    names |= {"scale": (0.1,) * 3, "center": (0.4, 0.0, 0.4)}
+    names |= {"scale": (0.1,) * 3}
     arrays = {name: np.array(value) for name, value in names.items()}
     one, other = (controller(**x) for x in (names, arrays))
     action = torch.from_numpy(rng.normal(size=(ROWS, 3)))
@@ -214,8 +203,6 @@ BAD = {
     "3 numbers as kd, got 1": {"kd": (1.0,)},
     "7 numbers as home, got 3": {"home": (0.0,) * 3},
     "7 numbers as limit, got 2": {"limit": (1.0,) * 2},
-    "3 numbers as center, got 1": {"center": (1.0,)},
-    "center with three actions alone, got 6": {"center": (0.0,) * 3, "size": 6},
     "max_mass above 0, got 0": {"max_mass": 0.0},
     "kp of at least 0.0, got nan": {"kp": (1.0, nan, 1.0)},
     "kd of at least 0.0, got -1": {"kd": (1.0, -1.0, 1.0)},
@@ -223,7 +210,7 @@ BAD = {
     "home_kp of at least 0.0, got -1": {"home_kp": -1.0},
     "home_kd of at least 0.0, got nan": {"home_kd": nan},
     "finite numbers as kp, kd, home_kp, home_kd, scale": {"scale": (nan,) * 3},
-    "finite numbers as kp, kd, home_kp, home_kd, scale, home": {"home": (inf,) * 7},
+    "finite numbers as kp, kd, home_kp, home_kd, scale and home": {"home": (inf,) * 7},
     "finite numbers as kp, kd": {"kp": (1.0, inf, 1.0)},
 }
 

@@ -1,12 +1,9 @@
 """Dropped coordinates do not matter to MuJoCo, and kept ones do."""
 
-import copy
-
 import mujoco
 import pytest
 import torch
 from helpers import (
-    HANDMADE,
     every_scene,
     make_scene,
     mujoco_step,
@@ -16,7 +13,7 @@ from helpers import (
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.robots import load_scene
-from torchrl_nerd.scenes.symmetries import base_effects, periodic_hinges
+from torchrl_nerd.scenes.symmetries import periodic_hinges
 from torchrl_nerd.transforms import StateDelta
 
 ROWS = 100
@@ -119,24 +116,6 @@ def test_every_scalar_coordinate_is_moved(scene):
         moved = {effect.address for effect in effects if effect.key == key}
         assert moved == {addresses[number] for addresses in joints}
     assert len(effects) == 2 * len(joints)
-
-
-@every_scene
-def test_where_a_floating_base_stands_and_faces_is_ignored(scene):
-    found = base_effects(scene.model, scene.base, scene.substeps)
-    assert len(found) == 4 * scene.base.is_floating
-    assert all(effect.is_ignored for effect in found)
-
-
-def test_heading_is_about_gravity_wherever_it_leans_and_matters_in_wind(rng):
-    floater = HANDMADE["floater"]
-    model = copy.copy(floater.model)
-    model.opt.gravity[:2] = rng.uniform(1.0, 2.0, 2)
-    places = {"base x", "base y", "base z"}
-    for extra in ({"base heading"}, set()):
-        found = base_effects(model, floater.base, 2)
-        assert {e.name for e in found if e.is_ignored} == places | extra
-        model.opt.wind[:], model.opt.density = (3.0, 1.0, 0.0), 100.0
 
 
 def test_looking_for_symmetries_leaves_the_model_alone(scene, generator):

@@ -217,6 +217,17 @@ def test_whole_numbers_and_statistics_of_nothing_are_refused():
         Normalize({"n": Stats.of(torch.empty(0, 1))})
 
 
+def test_another_width_than_that_of_the_statistics_is_refused():
+    stats = Stats.of(torch.randn(10, 3))
+    transform = Normalize({"x": stats}, in_keys_inv=["x"])
+    narrow = TensorDict({"x": torch.randn(4, 1)}, [4])
+    for call in (transform, transform.inv):
+        with pytest.raises(ValueError, match=r"expected x of width 3, got \[4, 1\]"):
+            call(narrow)
+    with pytest.raises(ValueError, match=r"statistics of one width, got \(3, 1\)"):
+        stats.merge(Stats.of(torch.randn(10, 1)))
+
+
 def test_bounds_of_what_is_seen_are_normalised():
     env = make_env("cartpole/swingup", "nerd", num_envs=3, seed=0, guard="flag")
     stats = {"trust": Stats.of(torch.rand(100, 1))}

@@ -127,11 +127,25 @@ class FreeBodyPenaltyStep(AnalyticStep):
 
     @torch.no_grad()
     def set_values(self, values: dict[str, float]) -> None:
-        """Take over parameters as `values` gives them; those not named stay."""
-        wanted = self.nominal.new_tensor([*(self.values() | values).values()])
-        count = len(SCALED)
-        self.raw[:count] = (wanted[:count] / self.nominal).log() / self.share
-        self.raw[count:] = wanted[count:] / self.shift
+        """Take over parameters as `values` gives them; those not named stay.
+
+        Raises:
+            ValueError: an unknown name, or a number out of its range.
+        """
+        for name, value in values.items():
+            if name not in PARAMETERS:
+                known = ", ".join(PARAMETERS)
+                raise ValueError(f"expected parameters of {known}, got '{name}'")
+            at = PARAMETERS.index(name)
+            if at < len(SCALED):
+                raw = np.log(value / self.nominal[at].item()) if value > 0.0 else np.nan
+                raw /= self.share[at].item()
+            else:
+                raw = value / self.shift[at - len(SCALED)].item()
+            if not np.isfinite(raw):
+                positive = " above 0" if at < len(SCALED) else ""
+                raise ValueError(f"expected a finite {name}{positive}, got {value}")
+            self.raw[at] = raw
 
     def _step(
         self, qpos: Tensor, qvel: Tensor, torque: Tensor | None, ground: Tensor | None

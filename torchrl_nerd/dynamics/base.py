@@ -128,6 +128,9 @@ def warm_up(
             dynamics.step(state, *given)
         else:
             advance(state, then)
+    if ended is not None and ended.any():  # what follows is another episode
+        last = history.unbind(1)[-1].select(QPOS, QVEL, PARAMETERS, strict=False)
+        dynamics.reset(last, ended.reshape(num_envs))
 
 
 class Engine(Dynamics):

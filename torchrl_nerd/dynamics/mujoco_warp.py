@@ -234,9 +234,11 @@ def _import_warp() -> tuple[Any, Any]:
 
 def _most_constraints(model: mujoco.MjModel, contacts: int) -> int:
     """How many scalar constraints an env can have with so many contacts."""
-    condim = int(max(model.geom_condim, default=1))
+    dims = *model.geom_condim, *model.pair_dim
+    condim = int(max(dims, default=1))
     is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     each = max(1, 2 * (condim - 1)) if is_pyramid else condim
     # a limit holds a joint at both ends at worst; friction loss acts on every dof
     others = 2 * (model.njnt + model.ntendon) + model.nv + model.ntendon
+    others += 6 * model.neq  # of a weld, which has the most
     return each * contacts + others

@@ -106,7 +106,7 @@ class SceneEnv(RenderedEnv):
         self.register_buffer("_keys", zeros.long(), persistent=False)
         self.register_buffer("_seed", zeros[0].long())
         self._shown: dict[str, Tensor] = {}  # what was handed out beside the state
-        self._set_seed(secrets.randbits(SEED_BITS) if seed is None else seed)
+        self._set_seed(seed)
         self.eager()
 
     def __repr__(self) -> str:
@@ -169,7 +169,8 @@ class SceneEnv(RenderedEnv):
 
     @unaffected
     def _set_seed(self, seed: int | None) -> None:
-        """Begin each env's stream anew."""
+        """Begin each env's stream anew; without a seed one is drawn."""
+        seed = secrets.randbits(SEED_BITS) if seed is None else seed
         if not isinstance(seed, Integral) or not 0 <= seed < MAX_SEED:
             raise ValueError(f"expected a seed from 0 to {MAX_SEED - 1}, got {seed!r}")
         self._seed = torch.full_like(self._seed, seed)

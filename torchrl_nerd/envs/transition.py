@@ -145,7 +145,8 @@ class Transition:
         then: a torque for each control step, or the ``ctrl`` of the robot's own actuators.
 
         Raises:
-            ValueError: neither action nor ``ctrl`` for actuators whose commands are late.
+            ValueError: neither action nor ``ctrl`` for actuators whose commands are late,
+                or an action of another width.
         """
         has_action, varied = ACTION in history.keys(), self.task.scene.variation
         is_told = has_action or history.get(CTRL, None) is not None
@@ -154,6 +155,11 @@ class Transition:
             if isinstance(self.task.controller, ActuatorController):
                 wanted = "'action' in the history of actuators that are late"
                 raise ValueError(f"expected {wanted}, got none")
+        width = self.task.controller.num_actions
+        if has_action and (got := history[ACTION].shape[-1]) != width:
+            raise ValueError(
+                f"expected 'action' of width {width} in a history, got {got}"
+            )
         warm_up(self.dynamics, history, num_envs, self._repeat if has_action else None)
 
     def _repeat(self, state: TensorDictBase, then: TensorDictBase) -> None:

@@ -24,7 +24,7 @@ from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, ground_geoms, own_contacts
 from torchrl_nerd.scenes.penetration import touching_bodies
-from torchrl_nerd.scenes.symmetries import Effect, base_effects, why_all_kept
+from torchrl_nerd.scenes.symmetries import Effect, why_all_kept
 from torchrl_nerd.scenes.terrain import PLANE
 
 SERVOS = "; servos: the control is held, MuJoCo evaluates their law in every substep"
@@ -53,22 +53,6 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class SolverReport:
-    """What stepping MuJoCo says about a scene."""
-
-    scene: str
-    control_step: float  # s
-    solver: str  # integrator and substeps, see `mujoco_name`
-    effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
-    why_all_kept: str | None  # the reason where hinges and slides are not moved
-    points_found: int  # contact points of the robot's shapes
-    points_merged: int  # of these, how many always coincide with another one
-    points_fixed: int  # of these, how many no joint can move
-    points_thinned: int  # left out beside them, so that few points stand for each body
-    contact_error: float  # m: how far a shape reaches beyond its points at most
-
-
-@dataclass(frozen=True)
 class SelfContact:
     """Two bodies of a robot that can touch, and how often they do in training data."""
 
@@ -82,7 +66,15 @@ class SceneReport:
 
     scene: str
     features: tuple[Feature, ...]  # of the token, in order
-    solver: SolverReport
+    control_step: float  # s
+    solver: str  # integrator and substeps, see `mujoco_name`
+    effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
+    why_all_kept: str | None  # the reason where hinges and slides are not moved
+    points_found: int  # contact points of the robot's shapes
+    points_merged: int  # of these, how many always coincide with another one
+    points_fixed: int  # of these, how many no joint can move
+    points_thinned: int  # left out beside them, so that few points stand for each body
+    contact_error: float  # m: how far a shape reaches beyond its points at most
     contact_bodies: tuple[str, ...]  # body of each contact point that is kept
     self_contacts: tuple[SelfContact, ...]  # of bodies that can touch, most often first
     terrain: str  # the ground, in words
@@ -96,28 +88,28 @@ class SceneReport:
         return sum(feature.width for feature in self.features)
 
     def __str__(self) -> str:
-        solver, bodies = self.solver, Counter(self.contact_bodies).items()
+        bodies = Counter(self.contact_bodies).items()
         lines = [
             f"{self.scene}: {self.token_width} features a step\n",
             f"{'feature':<18}{'width':>6}  meaning",
             *(f"{f.key:<18}{f.width:>6}  {f.meaning}" for f in self.features),
             f"\n{'coordinate moved':<30}{'change of step':>16}  feature",
         ]
-        for effect in solver.effects:
+        for effect in self.effects:
             what = f"{effect.name} {effect.key}[{effect.address}]"
             verdict = DROPPED if effect.is_ignored else "kept"
             lines.append(f"{what:<30}{effect.change:>16.1e}  {verdict}")
-        if solver.why_all_kept is not None:
-            lines.append(f"every hinge and slide is kept: {solver.why_all_kept}")
+        if self.why_all_kept is not None:
+            lines.append(f"every hinge and slide is kept: {self.why_all_kept}")
         lines.append(
-            f"contact points: {solver.points_found} found, {solver.points_merged} merged "
-            f"with one at the same place, {solver.points_fixed} dropped since no joint "
+            f"contact points: {self.points_found} found, {self.points_merged} merged "
+            f"with one at the same place, {self.points_fixed} dropped since no joint "
             f"moves them, {len(self.contact_bodies)} kept"
         )
-        if solver.contact_error:
+        if self.contact_error:
             lines.append(
-                f"contact points thinned: {solver.points_thinned} left out, so shapes "
-                f"reach up to {1e3 * solver.contact_error:.1f} mm beyond the rest; "
+                f"contact points thinned: {self.points_thinned} left out, so shapes "
+                f"reach up to {1e3 * self.contact_error:.1f} mm beyond the rest; "
                 "max_contact_points= of Scene.from_mjcf sets their number"
             )
         if bodies:
@@ -126,7 +118,7 @@ class SceneReport:
         lines += [
             f"self-contacts: {self._touching()}",
             f"terrain: {self.terrain}",
-            f"control step: {solver.control_step:.6g} s, {solver.solver}",
+            f"control step: {self.control_step:.6g} s, {self.solver}",
             f"controller: {self.controller}",
             f"analytic step: {self.analytic_step or f'none: {self.why_no_step}'}",
         ]
@@ -160,23 +152,19 @@ def explain(scene: Scene) -> SceneReport:
     found, kept = scene.contacts.stands_for, len(scene.contacts)
     fixed, controller = found.count(-1), scene.controller
     servos = scene.servos is not None
-    effects = base_effects(model, scene.base, scene.substeps, servos)
     step, reason = analytic_step(scene)
     return SceneReport(
         scene=scene.name,
         features=tuple(Feature(str(k), n, meanings[str(k)]) for k, n in sizes.items()),
-        solver=SolverReport(
-            scene=scene.name,
-            control_step=scene.control_step,
-            solver=mujoco_name(scene),
-            why_all_kept=why_all_kept(model),
-            effects=effects + scene.symmetries.effects,
-            points_found=len(found),
-            points_merged=len(found) - fixed - kept,
-            points_fixed=fixed,
-            points_thinned=scene.contacts.thinned,
-            contact_error=scene.contacts.error,
-        ),
+        control_step=scene.control_step,
+        solver=mujoco_name(scene),
+        why_all_kept=why_all_kept(model),
+        effects=scene.symmetries.effects,
+        points_found=len(found),
+        points_merged=len(found) - fixed - kept,
+        points_fixed=fixed,
+        points_thinned=scene.contacts.thinned,
+        contact_error=scene.contacts.error,
         contact_bodies=tuple(body_label(model, b) for b in scene.contacts.bodies),
         self_contacts=_self_contacts(scene),
         terrain=_terrain(scene, CONTACT_NORMAL in sizes),

@@ -3,7 +3,7 @@
 The MLP has no history (a Markov model); the GRU's history is a hidden state.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from torch import Tensor, nn
 
@@ -11,7 +11,7 @@ from torchrl_nerd.modules.history import History, stored
 from torchrl_nerd.modules.linear import FullLinear
 from torchrl_nerd.modules.symmetric import make_embedding, make_head
 from torchrl_nerd.modules.transformer import FeedForward, TransformerConfig, initialize
-from torchrl_nerd.settings import SettingError, look_up
+from torchrl_nerd.settings import SettingError, expect_count, look_up
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class MLP(nn.Module):
 
     def __init__(self, config: MLPConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
+        expect_count(0, depth=config.depth)
+        expect_count(1, width=config.width, symmetries=config.symmetries)
         self.config = config
         sizes = config.width, config.symmetries
         self.embed = make_embedding(num_inputs, *sizes)
@@ -87,6 +89,7 @@ class GRU(nn.Module):
 
     def __init__(self, config: GRUConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
+        expect_count(1, **asdict(config))
         self.config = config
         self.embed = FullLinear(num_inputs, config.width)
         self.gru = nn.GRU(config.width, config.width, config.layers, batch_first=True)
@@ -113,10 +116,7 @@ class GRU(nn.Module):
 
     def step(self, token: Tensor, memory: HiddenState) -> Tensor:
         """``(rows, F) -> (rows, D)``; advances ``memory``."""
-        inputs = self._embedded(token[:, None])  # (rows, 1, width)
-        output, value = self.gru(inputs, memory.value.transpose(0, 1).contiguous())
-        memory.value = stored(memory.value, value.transpose(0, 1))
-        return self.head(output[:, 0])
+        return self.read(token[:, None], memory)[:, 0]
 
 
 NetworkConfig = TransformerConfig | MLPConfig | GRUConfig

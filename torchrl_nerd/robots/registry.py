@@ -13,6 +13,7 @@ from torchrl_nerd.scenes import Scene, is_import
 from torchrl_nerd.tasks import Task
 
 RESERVED = ("nerd", "hybrid", "analytic", "mujoco", "dm_control", "mujoco_warp")
+PRETRAINED = Path(__file__).parents[1] / "pretrained"  # models of the package
 VARIABLE = "NERD_ROBOTS"
 """Environment variable: modules or files that register robots, separated as in PATH."""
 
@@ -67,6 +68,8 @@ def register(robot: Robot) -> None:
         for name in (name for old in before for name in getattr(old, field)):
             table.pop(name, None)
         table.update(getattr(robot, field))
+    for scene in (scene for old in before for scene in old.scenes):
+        _LAST.pop(scene, None)
     _LAST.update(dict.fromkeys(robot.scenes, robot))
     for listener in _LISTENERS:
         for task in robot.tasks:
@@ -157,3 +160,8 @@ def _check_names(robot: Robot) -> None:
             if name not in names and not name.startswith(starts) or name.endswith("/"):
                 known = ", ".join(listed) or "none"
                 raise ValueError(f"expected {form} ({known}) as {field}, got '{name}'")
+    shipped = [name for name in robot.models if (PRETRAINED / name).exists()]
+    if shipped:
+        raise ValueError(
+            f"'{shipped[0]}' is a model of the package: expected a new name"
+        )

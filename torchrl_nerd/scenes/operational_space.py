@@ -46,8 +46,6 @@ class OperationalSpaceController:
         scale: m (rad) per unit of action.
         home: joint positions ``(nq,)``.
         limit: largest torque of each actuated dof, N m or N; None for none.
-        center: m, world: what the target is relative to, for positions alone; None: the
-            present pose, taken anew at every control step.
         home_kp: stiffness toward home, 1/s^2.
         home_kd: damping of the joints in the null space, 1/s.
         max_mass: kg (kg m^2 for rotations).
@@ -66,14 +64,12 @@ class OperationalSpaceController:
         scale: Row,
         home: Row,
         limit: Row | None = None,
-        center: Row | None = None,
         home_kp: float = 10.0,
         home_kd: float = 6.0,
         max_mass: float = 200.0,
     ) -> None:
         self.kp, self.kd, self.scale, self.home = map(_row, (kp, kd, scale, home))
         self.limit = None if limit is None else _row(limit)
-        self.center = None if center is None else _row(center)
         self.home_kp, self.home_kd, self.max_mass = home_kp, home_kd, max_mass
         self.actuated, base = driven_dofs(model), Base.from_model(model)
         self._check(model)
@@ -103,12 +99,8 @@ class OperationalSpaceController:
             )
         if len(self.scale) not in AXES:
             raise ValueError(f"expected 3 or 6 numbers as scale, got {len(self.scale)}")
-        if self.center is not None and self.num_actions > 3:
-            raise ValueError(
-                f"expected center with three actions alone, got {self.num_actions}"
-            )
         lengths = {"kp": self.num_actions, "kd": self.num_actions, "home": model.nq}
-        lengths |= {"limit": len(self.actuated), "center": 3}
+        lengths |= {"limit": len(self.actuated)}
         for name, length in lengths.items():
             value = getattr(self, name)
             if value is not None and len(value) != length:
@@ -120,11 +112,11 @@ class OperationalSpaceController:
             if value is not None:
                 expect_at_least(0.0, **{name: float(np.min(value))})  # NaN is not
         gains = (*self.kp, *self.kd, self.home_kp, self.home_kd)
-        places = (*self.scale, *self.home, *(self.center or ()))
+        places = (*self.scale, *self.home)
         if not np.isfinite((*gains, *places)).all():
             raise ValueError(
-                "expected finite numbers as kp, kd, home_kp, home_kd, scale, home and "
-                f"center, got {gains} and {places}"
+                "expected finite numbers as kp, kd, home_kp, home_kd, scale and home, "
+                f"got {gains} and {places}"
             )
         if not self.max_mass > 0.0:
             raise ValueError(f"expected max_mass above 0, got {self.max_mass}")
@@ -137,8 +129,6 @@ class OperationalSpaceController:
     def __call__(self, action: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Joint torques ``(*batch, num_actuated)``, N m and N, in the dtype of qpos."""
         offset = action.to(qpos.dtype).clamp(-1.0, 1.0) * constant(qpos, self.scale)
-        if self.center is not None:
-            offset = offset + constant(qpos, self.center) - self.site(qpos).position
         return self.torque(constant(qpos, self.kp) * offset, qpos, qvel)
 
     def torque(self, acceleration: Tensor, qpos: Tensor, qvel: Tensor) -> Tensor:

@@ -14,20 +14,19 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_nerd.geometry.base import Base
+from torchrl_nerd.geometry.base import ancestors
 from torchrl_nerd.geometry.manifold import HINGE, SLIDE, joint_label
-from torchrl_nerd.geometry.rotations import quat_matrix
 from torchrl_nerd.keys import QPOS, QVEL
 from torchrl_nerd.scenes.contact_points import (
     ground_geoms,
     own_contacts,
     terrain_geoms,
 )
-from torchrl_nerd.scenes.support import DISABLE, silence_mujoco, unit_gravity
+from torchrl_nerd.scenes.support import DISABLE, silence_mujoco
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
-LIMIT, CONTACT = int(DISABLE.mjDSBL_LIMIT), int(DISABLE.mjDSBL_CONTACT)
+LIMIT = int(DISABLE.mjDSBL_LIMIT)
 
 AFFINE = int(mujoco.mjtGain.mjGAIN_AFFINE)  # of a gain; the same number of a bias
 
@@ -107,11 +106,8 @@ def seldom_felt(model: mujoco.MjModel) -> set[int]:
 
     Of two shapes of the robot which may touch, those that move one against the other.
     """
-    above: list[set[int]] = [set()]  # joints between each body and the world
-    for body in range(1, model.nbody):
-        first, count = model.body_jntadr[body], model.body_jntnum[body]
-        own = range(first, first + count)
-        above.append(above[model.body_parentid[body]] | {*own})
+    on_way = ancestors(model)[:, model.jnt_bodyid]  # (nbody, njnt)
+    above = [{*np.flatnonzero(row).tolist()} for row in on_way]  # up to the world
     found: set[int] = set()
     for pair in own_contacts(model):
         one, other = (above[model.geom_bodyid[geom]] for geom in pair)
@@ -151,26 +147,6 @@ def periodic_hinges(model: mujoco.MjModel, has_servos: bool = False) -> list[int
     return model.jnt_qposadr[is_periodic].tolist()
 
 
-def base_effects(
-    model: mujoco.MjModel, base: Base, substeps: int, has_servos: bool = False
-) -> tuple[Effect, ...]:
-    """Effect of a floating base's position and heading, measured in its own frame.
-
-    Without contact: distances and normals, features of their own, carry the ground.
-    Empty for a fixed base.
-    """
-    if not base.is_floating:
-        return ()
-    free = _without(model, LIMIT | CONTACT, has_servos)
-    rng, q = np.random.default_rng(0), base.qpos_address
-    moves = [(f"base {x}", q + i, _shift(QPOS, q + i)) for i, x in enumerate("xyz")]
-    moves.append(("base heading", q + 3, _heading(base, unit_gravity(model))))
-    return tuple(
-        Effect(name, QPOS, at, _largest_change(free, substeps, rng, move, base))
-        for name, at, move in moves
-    )
-
-
 def _without(model: mujoco.MjModel, flags: int, has_servos: bool) -> mujoco.MjModel:
     """The model without some forces, and without actuators that are no servos."""
     free = copy.copy(model)
@@ -189,65 +165,32 @@ def _shift(key: str, address: int) -> Move:
     return move
 
 
-def _heading(base: Base, axis: np.ndarray) -> Move:
-    """Turn the robot about gravity, and its velocity with it."""
-    q, v = base.qpos_address + 3, base.dof_address
-
-    def move(data: mujoco.MjData, rng: np.random.Generator) -> None:
-        half = 0.5 * rng.normal()
-        turn, turned = np.append(np.cos(half), np.sin(half) * axis), np.empty(4)
-        mujoco.mju_mulQuat(turned, turn, data.qpos[q : q + 4])
-        data.qpos[q : q + 4] = turned
-        data.qvel[v : v + 3] = quat_matrix(turn) @ data.qvel[v : v + 3]
-
-    return move
-
-
 def _largest_change(
-    model: mujoco.MjModel,
-    substeps: int,
-    rng: np.random.Generator,
-    move: Move,
-    base: Base | None = None,
+    model: mujoco.MjModel, substeps: int, rng: np.random.Generator, move: Move
 ) -> float:
-    """How much a move alters the step's change of velocity, relative, at worst.
-
-    With a floating ``base``, its linear velocity is seen from the base and no force
-    drives it; without one, every dof is driven.
-    """
+    """How much a move alters the step's change of velocity, relative, at worst."""
     changes: list[float] = []
     for _ in range(TRIALS):
         data = mujoco.MjData(model)
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
         data.qvel = rng.normal(size=model.nv)
         data.qfrc_applied = rng.normal(size=model.nv) * model.dof_M0  # any robot's size
-        if base is not None:
-            q, v = base.qpos_address, base.dof_address
-            data.qpos[q : q + 3] = rng.normal(size=3)  # far off, digits are lost
-            # a force in world axes would not turn with the robot
-            data.qfrc_applied[v : v + 3] = 0.0
         if not model.opt.disableflags & DISABLE.mjDSBL_ACTUATION:
             data.ctrl = rng.normal(size=model.nu)
         moved = copy.copy(data)
         move(moved, rng)
         speed = abs(data.qvel).max()
         with silence_mujoco():
-            change = _change(model, data, substeps, base)
-            moved_change = _change(model, moved, substeps, base)
+            change = _change(model, data, substeps)
+            moved_change = _change(model, moved, substeps)
         if not (data.warning.number.any() or moved.warning.number.any()):
             size = speed + abs(change).max()
             changes.append(float(abs(change - moved_change).max() / size))
     return max(changes, default=1.0)  # MuJoCo resets what it warns of: not comparable
 
 
-def _change(
-    model: mujoco.MjModel, data: mujoco.MjData, substeps: int, base: Base | None
-) -> np.ndarray:
-    """Change of velocity ``(nv,)`` over one control step, in the base's axes at first."""
-    velocity, pose = data.qvel.copy(), data.qpos.copy()
+def _change(model: mujoco.MjModel, data: mujoco.MjData, substeps: int) -> np.ndarray:
+    """Change of velocity ``(nv,)`` over one control step."""
+    velocity = data.qvel.copy()
     mujoco.mj_step(model, data, substeps)
-    change = data.qvel - velocity
-    if base is not None:
-        q, v = base.qpos_address + 3, base.dof_address
-        change[v : v + 3] = quat_matrix(pose[q : q + 4]).T @ change[v : v + 3]
-    return change
+    return data.qvel - velocity

@@ -37,8 +37,9 @@ from torchrl_nerd.scenes.terrain import TerrainDistance
 from torchrl_nerd.transforms.base import FeatureTransform
 from torchrl_nerd.transforms.predicted_contact import (
     AlongUnconstrainedMotion,
-    AtConstantVelocity,
     PredictedForce,
+    depth_at_constant_velocity,
+    parabola,
     times_of,
 )
 
@@ -60,13 +61,14 @@ class ContactFeatures(FeatureTransform):
       contacts over the step, N and N m, see `PredictedForce` | nv |
     | ``contact_normal`` | g * n; only where pose and gravity do not tell it | 3 P |
 
-    The K = min(substeps, 5) times are those of `AtConstantVelocity`. A scene without
+    The K = min(substeps, 5) times are those of `times_of`. A scene without
     contact gives no keys at all. ``features`` adds predictions; none by default.
     """
 
     why_no_inverse = "distances do not determine a pose"
     radii: Tensor
     margins: Tensor
+    parabola: Tensor
 
     def __init__(self, scene: Scene, features: FeatureConfig = NO_PREDICTIONS) -> None:
         count, terrain = len(scene.contacts), scene.terrain
@@ -107,11 +109,12 @@ class ContactFeatures(FeatureTransform):
         self.count = count
         self.ground = TerrainDistance(terrain, float(points.margins.max()))
         self.pose = BasePose(scene.model, scene.base)
-        self.layout, self.at_constant_velocity = scene.layout, AtConstantVelocity(scene)
+        self.layout = scene.layout
         if self.rigid_body is not None:
             given = scene, self.ground, self.pose
             self.along_unconstrained_motion = AlongUnconstrainedMotion(*given)
-        keep_constants(self, radii=points.radii, margins=points.margins)
+        own = parabola(times_of(scene))
+        keep_constants(self, radii=points.radii, margins=points.margins, parabola=own)
 
     def contact_features(
         self,
@@ -151,7 +154,8 @@ class ContactFeatures(FeatureTransform):
         sliding = velocity - speed[..., None] * normal
         if self.rigid_body is None:
             depths = self.radii - distances  # (2, *batch, P)
-            penetration = self.at_constant_velocity(depths[0], speed, depths[1])
+            motion = depths[0], -self.step_size * speed, depths[1]
+            penetration = depth_at_constant_velocity(self.parabola, *motion)
         else:
             torque = None if drive is None else drive[..., : self.num_torques]
             given = qpos, qvel, torque, rotation, places, self.step_size

@@ -48,9 +48,15 @@ class Stats:
         return cls(1, torch.zeros(size).double(), torch.ones(size).double())
 
     def merge(self, other: "Stats") -> "Stats":
-        """Statistics of both sets of samples together; either may be empty."""
+        """Statistics of both sets of samples together; either may be empty.
+
+        Raises ValueError for samples of another width.
+        """
         if not (self.count and other.count):
             return self if self.count else other
+        if self.mean.shape != other.mean.shape:
+            sizes = len(self.mean), len(other.mean)
+            raise ValueError(f"expected statistics of one width, got {sizes}")
         count = self.count + other.count
         shift = other.mean - self.mean
         share = other.count / count
@@ -144,7 +150,7 @@ class Normalize(StateTransform):
                     raise ValueError(
                         f"expected {key} of floating-point numbers, got {x.dtype}"
                     )
-                next_tensordict.set(key, self.normalize(key, x))
+                next_tensordict.set(key, self.normalize(key, self._fitting(key, x)))
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
@@ -171,5 +177,13 @@ class Normalize(StateTransform):
         for key in self.in_keys_inv:
             x = tensordict.get(key, None)
             if x is not None:
-                tensordict.set(key, self.denormalize(key, x))
+                tensordict.set(key, self.denormalize(key, self._fitting(key, x)))
         return tensordict
+
+    def _fitting(self, key: NestedKey, x: Tensor) -> Tensor:
+        """``x``; a ValueError if it is wider or narrower than the statistics."""
+        if x.shape[-1:] != (shape := self.mean(key).shape):
+            raise ValueError(
+                f"expected {key} of width {len(shape) and shape[0]}, got {[*x.shape]}"
+            )
+        return x

@@ -20,32 +20,6 @@ MAX_TIMES = 5  # within a step
 MIN_SLIP = 1e-9  # m/s: keeps the direction of slip defined at rest
 
 
-class AtConstantVelocity(nn.Module):
-    """Predicted penetration at K times of the step, if every point keeps its velocity.
-
-    The K = min(substeps, 5) times are spaced evenly from the step's start on: with few
-    substeps they are those at which MuJoCo evaluates collision.
-    """
-
-    parabola: Tensor
-
-    def __init__(self, scene: Scene) -> None:
-        super().__init__()
-        self.period = scene.control_step
-        keep_constants(self, parabola=parabola(times_of(scene)))
-
-    def forward(self, depth: Tensor, speed: Tensor, later: Tensor) -> Tensor:
-        """Penetrations ``(*batch, P, K)``, m, at least zero.
-
-        The parabola through the depth and its rate now and the depth after the step. Of
-        every point ``depth`` and ``later`` are the two ``(*batch, P)``, m, and ``speed
-        (*batch, P)`` is that along its normal now, m/s.
-        """
-        ends = depth, -self.period * speed, later
-        # (*batch, P, 3) @ (3, K)
-        return (torch.stack(ends, -1) @ self.parabola).clamp_min(0.0)
-
-
 class AlongUnconstrainedMotion(nn.Module):
     """Predicted penetration at the same K times, if no contact changes the motion.
 
@@ -99,9 +73,25 @@ class AlongUnconstrainedMotion(nn.Module):
 
 
 def times_of(scene: Scene) -> np.ndarray:
-    """The predicted times as shares of the step, ``(K,)``."""
+    """The predicted times as shares of the step, ``(K,)``.
+
+    The K = min(substeps, 5) times are spaced evenly from the step's start on: with few
+    substeps they are those at which MuJoCo evaluates collision.
+    """
     count = min(scene.substeps // scene.reference_ratio, MAX_TIMES)
     return np.arange(count) / count
+
+
+def depth_at_constant_velocity(
+    parabola: Tensor, depth: Tensor, change: Tensor, later: Tensor
+) -> Tensor:
+    """Penetrations ``(*batch, P, K)``, m, at least zero, if every point keeps its velocity.
+
+    The parabola through the ``depth (*batch, P)``, m, its ``change`` over the step at
+    today's speed and what it is ``later``, after the step; at the K times of `times_of`.
+    """
+    # (*batch, P, 3) @ (3, K)
+    return (torch.stack((depth, change, later), -1) @ parabola).clamp_min(0.0)
 
 
 def parabola(times: np.ndarray) -> np.ndarray:

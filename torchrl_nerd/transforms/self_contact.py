@@ -14,7 +14,11 @@ from torchrl_nerd.scenes.scene import Scene
 from torchrl_nerd.scenes.self_contacts import capsule_pairs
 from torchrl_nerd.transforms.base import FeatureTransform
 from torchrl_nerd.transforms.contact_features import FADE
-from torchrl_nerd.transforms.predicted_contact import parabola, times_of
+from torchrl_nerd.transforms.predicted_contact import (
+    depth_at_constant_velocity,
+    parabola,
+    times_of,
+)
 
 TOUCHING = 1e-9  # m: axes closer than this have no direction between them
 
@@ -33,7 +37,7 @@ class SelfContactFeatures(FeatureTransform):
       first, at the axes of their capsules, m/s | 4 P |
     | depth | g * penetration at K times of the step at constant velocity, m | K P |
 
-    The K times are those of `AtConstantVelocity`. No keys at all where no shapes come
+    The K times are those of `times_of`. No keys at all where no shapes come
     near each other, or where the model's `FeatureConfig` does not ask for them.
     """
 
@@ -77,7 +81,7 @@ class SelfContactFeatures(FeatureTransform):
         gate = (-beyond / (FADE * self.margins)).clamp(0.0, 1.0)[..., None]
         speed = (velocity * normal).sum(-1, keepdim=True)
         motion = -distance[0], -self.period * speed[..., 0], -distance[1]
-        depth = (torch.stack(motion, -1) @ self.parabola).clamp_min(0.0)
+        depth = depth_at_constant_velocity(self.parabola, *motion)
         # (*batch, P, 7 + K)
         gated = gate * torch.cat((normal, speed, velocity - speed * normal, depth), -1)
         return [torch.cat((beyond.clamp_max(0.0), gated.flatten(-2)), -1)]

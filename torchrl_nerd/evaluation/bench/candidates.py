@@ -8,7 +8,6 @@ from typing import Any
 import mujoco
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from torchrl_nerd.analytic import STEPS, default_step, make_step
 from torchrl_nerd.checkpoint import from_pretrained, shipped_models
@@ -46,13 +45,7 @@ class NoMotion(Dynamics):
 
     kind = "baseline"
 
-    def step(
-        self,
-        state: TensorDictBase,
-        joint_torque: Tensor,
-        terrain: Tensor | None = None,
-        ctrl: Tensor | None = None,
-    ) -> TensorDictBase:
+    def step(self, state: TensorDictBase, *given: Any, **more: Any) -> TensorDictBase:
         """The same state."""
         return state.select(QPOS, QVEL)
 
