@@ -115,7 +115,7 @@ def compare(
             said.append(f"{name} is only {where}: write a new baseline.")
             continue
         now, before = found[name], baseline[name]
-        if now.value * (1.0 + now.spread) < before * (1.0 - tolerance):
+        if not now.value * (1.0 + now.spread) >= before * (1.0 - tolerance):  # NaN is
             said.append(
                 f"{name} fell from {before:.3g} to {now.value:.3g} "
                 f"(+-{now.spread:.0%}), by more than {tolerance:.0%}."

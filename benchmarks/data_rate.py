@@ -26,6 +26,7 @@ from torchrl_nerd.robots import load_scene
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.sampling import sample_commands
 from torchrl_nerd.seeds import fold_in
+from torchrl_nerd.settings import expect_at_least
 
 CONTROL = int(  # applied force, and where the ground is
     mujoco.mjtState.mjSTATE_QFRC_APPLIED
@@ -85,6 +86,7 @@ def seconds_of_generate(
 
 def main(options: Options) -> float:
     """Print both rates and return their ratio, the median over rounds."""
+    expect_at_least(2, rounds=options.rounds)  # the first one does not count
     scene, threads = load_scene(options.scene), os.cpu_count() or 1
     bare, whole = [], []
     for index in range(options.rounds):

@@ -88,6 +88,7 @@ class Learner:
                 frames_per_batch=self.frames,
                 total_frames=-1,
                 track_traj_ids=False,
+                auto_register_policy_transforms=False,
             )
         )
 

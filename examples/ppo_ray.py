@@ -17,7 +17,7 @@ from functools import partial
 import ppo
 import ray
 import torch
-from ray.exceptions import RayError
+from ray.exceptions import RayError, RayTaskError
 from tensordict import TensorDictBase
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
@@ -88,6 +88,8 @@ def collect(
                     yield batch.flatten(0, 1)
                     done += batch.numel()
                     collector.update_policy_weights_(actor)
+            except RayTaskError as error:  # the worker's own code
+                raise error.cause from None
             except RayError as error:
                 start += 1
                 print(f"a worker was lost ({type(error).__name__}): all begin anew")

@@ -26,6 +26,7 @@ from tqdm import tqdm
 from torchrl_nerd import make_env
 from torchrl_nerd.evaluation.policy import Policy, make_actor
 from torchrl_nerd.evaluation.policy_transfer import transfer, transfer_table
+from torchrl_nerd.settings import expect_at_least
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 
@@ -109,7 +110,8 @@ def train(cfg: Config) -> tuple[Agent, TensorDictReplayBuffer]:
         storage=LazyTensorStorage(cfg.frames), batch_size=cfg.batch_size
     )
     collectors = make_collectors(cfg, agent)
-    rounds = cfg.frames // (cfg.num_envs * cfg.horizon)
+    expect_at_least(each := cfg.num_envs * cfg.horizon, frames=cfg.frames)
+    rounds = cfg.frames // each
     for _ in tqdm(range(rounds), unit="round"):
         for dynamics, collector in collectors.items():
             buffer.extend(transitions(next(collector), dynamics == "mujoco"))

@@ -80,7 +80,7 @@ def error_curves(
 def main(options: Options) -> dict[str, float]:
     """Print a line for each quantity."""
     protocol = protocol_of(load_scene(options.scene))
-    ((case, source),) = protocol.cases.items()
+    case, source = next(iter(protocol.cases.items()))
     scene, steps = scene_of(source), max(protocol.horizons)
     model = from_pretrained(options.model or options.scene, scene)
     learned = dynamics_of(model.double() if options.double else model)

@@ -50,6 +50,7 @@ from torchrl_nerd.evaluation.bench.report import pareto_front
 from torchrl_nerd.evaluation.policy import load_policy, make_actor, policy_task
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import open_loop
+from torchrl_nerd.files import folder_name
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, protocol_of
@@ -91,7 +92,7 @@ class Config:
     @property
     def folder(self) -> Path:
         """Of the model."""
-        return self.out / Path(self.robot).stem
+        return self.out / folder_name(self.robot)
 
 
 def along_policy(

@@ -90,7 +90,8 @@ def summaries(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         returns = {key: mean(row[key] for row in own) for key in ("return", "promised")}
         shares = [row["share"] for row in own]
         about = {"model": name, "kind": own[0]["kind"], "policies": len(own)}
-        both = {"difference": returns["promised"] / returns["return"] - 1.0}
+        gap = returns["promised"] - returns["return"]
+        both = {"difference": gap / abs(returns["return"])}
         found.append(about | returns | both | {"worst": max(shares, key=abs)})
     return found
 

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import passive_errors
 from torchrl_nerd.files import read_json, write_json
 from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import PPO_CONFIGS, PRESETS, make_task
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.tasks import Task
@@ -124,7 +126,7 @@ class Options:
     """What the policies do; the task of the scene's preset by default."""
     transitions: int = 200_000
     """Of each data set, at 100 steps a trajectory."""
-    network: str = "mlp"
+    network: str = "mlp-4x64"
     updates: int = 4_000
     """On 1,024 single states each."""
     seeds: tuple[int, ...] = (0,)
@@ -170,13 +172,16 @@ class Study:
     folder: Path
     task_id: str
     policy: Path | None
+    explorer: str | None  # hash of its weights
 
     def model(self, name: str, draw: Draw, seed: int) -> Path:
         """Checkpoint of a strategy's model, made as far as it is not there."""
         options, scene = self.options, make_task(self.task_id).scene
         folder = self.folder / name / str(seed)
         config = DataConfig(trajectories=options.transitions // 100, seed=seed)
-        generate(scene, config, folder / "data", strategy=(name, draw))
+        # data along another policy are others, and refused in the same folder
+        its = name if self.explorer is None else f"{name} {self.explorer}"
+        generate(scene, config, folder / "data", strategy=(its, draw))
         train = TrainConfig(
             network=options.network,
             steps=options.updates,
@@ -218,7 +223,7 @@ class Study:
             results["transfer"] = asdict(transfer)
         if options.learn_frames:
             where = (self.task_id, str(model), seed, options.learn_frames)
-            learned_there = learned_policy(model.parent / "policy", *where)
+            learned_there = learned_policy(model.parent / f"policy_{where[-1]}", *where)
             there, ground_truth = (
                 self.returns(learned_there, d) for d in (model, "mujoco")
             )
@@ -233,20 +238,25 @@ def run(options: Options) -> Iterator[dict[str, Any]]:
     if options.scene not in PRESETS:
         known = ", ".join(PRESETS)
         raise ValueError(f"expected a scene of {known}, got '{options.scene}'")
+    network_config(options.network)  # refuses what is none before hours of policies
     task_id = str(options.task or PRESETS[options.scene].task)
     task, folder = make_task(task_id), options.out / options.scene
     policy, explorer = options.policy, options.explorer
     if task_id in PPO_CONFIGS and options.policy_frames:
         where = (task_id, "mujoco")
         sizes = options.policy_frames
-        policy = policy or learned_policy(folder / "measured", *where, 0, sizes)
-        explorer = explorer or learned_policy(folder / "explorer", *where, 1, sizes)
+        for_tests, for_data = (
+            folder / f"{x}_{sizes}" for x in ("measured", "explorer")
+        )
+        policy = policy or learned_policy(for_tests, *where, 0, sizes)
+        explorer = explorer or learned_policy(for_data, *where, 1, sizes)
     actor = make_actor(load_policy(explorer, task)) if explorer else None
     known = strategies(task.scene, task, actor)
     for name in options.only or known:
         if name not in known:
             raise ValueError(f"expected a strategy of {', '.join(known)}, got '{name}'")
-    study = Study(options, folder, task_id, policy)
+    explored = explorer and sha256((explorer / WEIGHTS).read_bytes()).hexdigest()
+    study = Study(options, folder, task_id, policy, explored)
     for name in options.only or known:
         for seed in options.seeds:
             path = folder / name / str(seed) / "results.json"

@@ -59,7 +59,9 @@ def measure(
     """Results of one training, made as far as they are not there."""
     name = f"{network}_{trajectories}_{updates}_{options.seed}"
     folder = options.out / options.scene / name
+    # all data are the first ones of one draw, whose random numbers its size decides
     settings = {"rows": options.rows, "horizons": list(options.horizons)}
+    settings |= {"drawn": max(options.trajectories)}
     path = folder / "results.json"
     if path.exists() and read_json(path)["settings"] == settings:
         return read_json(path)

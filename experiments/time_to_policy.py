@@ -136,7 +136,7 @@ def time_to(curve: list[dict[str, Any]], wanted: float) -> float | None:
     """Seconds until a curve reaches a return and stays there; None: it does not."""
     found = None
     for point in curve:
-        if point["return"] < wanted:
+        if not point["return"] >= wanted:  # NaN is not
             found = None
         elif found is None:
             found = point["seconds"]

@@ -192,6 +192,9 @@ def test_a_dry_run_sees_what_is_there(tmp_path, monkeypatch, capsys):
     assert "use the data in datasets/cartpole" in text
     assert "resume the run in runs/cartpole" in text
     for dry in ([], ["--dry-run"]):
+        assert "holds data with config.steps 20, asked for 30" in refusal(
+            capsys, *draw[:-2], "30", *dry
+        )
         assert "holds a run with config.seed 0" in refusal(
             capsys, *learn, "--seed", "5", *dry
         )
@@ -230,6 +233,11 @@ def test_a_dry_run_refuses_what_the_run_would(command, capsys):
         ("play cartpole/swingup --slowdown -1", "slowdown above 0, got -1.0"),
         ("play cartpole/swingup --policy x --actions zero", "or --actions, got both"),
         ("explain unicorn", "'unicorn'"),
+        ("train cartpole --clip 0", "clip above 0, got 0"),
+        ("train cartpole --lr inf", "lr of at least 0, got inf"),
+        ("data cartpole --out {log}/x", "{log}"),
+        ("finetune cube --from {log} --out {log}/x", "{log}"),
+        ("explain cartpole --json {log}/x.json", "{log}"),
         ("train cartpole --threads 0", "threads of at least 1, got 0"),
         ("train cartpole --sequence-length 500", "at least 500 steps, got"),
         ("data cube --from {log} --trajectories 3", "--from without options that draw"),
@@ -247,7 +255,20 @@ def test_bad_input_is_refused_with_and_without_a_dry_run(
     argv, said, dry, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    assert said in refusal(capsys, *argv.format(log=EXCERPT).split(), *dry)
+    argv, said = (text.format(log=EXCERPT) for text in (argv, said))
+    assert said in refusal(capsys, *argv.split(), *dry)
+
+
+def test_a_robot_may_be_named_behind_what_takes_several_words(capsys):
+    """It has its preset, and is no further word of that option."""
+    vary = ["--vary", "mass:pole=0.3:3.0"]
+    drawn = []
+    for words in (["cartpole", *vary], [*vary, "cartpole"]):
+        assert main(["data", *words, "--dry-run"]) == 0
+        drawn.append(capsys.readouterr().out)
+    assert drawn[0] == drawn[1] and "trajectories of cartpole" in drawn[0]
+    argv = ["train", "--data", "X", "cartpole", "--dry-run"]
+    assert "expected a data set in X, found" in refusal(capsys, *argv)
 
 
 def test_a_range_beside_the_preset_counts():

@@ -183,7 +183,7 @@ def test_settings_that_cannot_be_are_refused(generator, tmp_path, capsys):
     argv = ["eval", "cartpole", "--data", str(log), "--states", "1"]
     assert "expected states of at least 2, got 1" in refusal(capsys, *argv)
     argv = ["finetune", "cartpole", "--from", str(log), "--epochs", "inf"]
-    assert "expected a finite number of epochs" in refusal(capsys, *argv)
+    assert "expected epochs of at least 0, got inf" in refusal(capsys, *argv)
 
 
 def test_a_robot_of_a_file_stays_in_the_folder_of_data_sets(

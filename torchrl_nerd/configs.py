@@ -1,10 +1,15 @@
 """Configurations of data, training, fine-tuning and policy learning: pure data."""
 
-from dataclasses import asdict, dataclass
-from math import inf
+from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
-from torchrl_nerd.settings import SettingError, expect_at_least, expect_share
+from torchrl_nerd.settings import (
+    SettingError,
+    expect_above_zero,
+    expect_at_least,
+    expect_count,
+    expect_share,
+)
 
 COUNTS = (
     *("batch_size", "sequence_length", "rollout_batch_size", "rollout_length"),
@@ -79,7 +84,9 @@ class DataConfig:
     seed: int = 0  # of initial states and torques
 
     def __post_init__(self) -> None:
-        expect_at_least(1, trajectories=self.trajectories, steps=self.steps)
+        sizes = {"trajectories": self.trajectories, "steps": self.steps}
+        expect_at_least(1, **sizes)
+        expect_count(1, **sizes)
 
 
 @dataclass(frozen=True)
@@ -125,9 +132,14 @@ class TrainConfig:
     seed: int = 0  # of weights and batches
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not isinstance(value, str | None):
-                expect_at_least(1 if name in COUNTS else 0, **{name: value})
+        for setting in fields(self):
+            named = {setting.name: getattr(self, setting.name)}
+            least = 1 if setting.name in COUNTS else 0
+            if setting.type in (int, float):
+                expect_at_least(least, **named)
+            if setting.type is int:
+                expect_count(least, **named)
+        expect_above_zero(clip=self.clip, loss_eps=self.loss_eps)
         fractions = "single_step_fraction", "bf16_fraction", "ema"
         expect_share(**{name: getattr(self, name) for name in fractions})
         if not self.total_steps:
@@ -195,8 +207,6 @@ class FinetuneConfig:
             known = ", ".join(get_args(Update))
             raise SettingError(f"expected update of {known}, got '{self.update}'")
         expect_at_least(2, states=self.states)
-        if self.epochs == inf:
-            raise SettingError(f"expected a finite number of epochs, got {self.epochs}")
         counts = ("evaluations", "batch_size", "sequence_length")
         counts = (*counts, "validate_every", "patience")
         numbers = ("epochs", "lr", "clip")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
+from math import inf
 from numbers import Integral
 from typing import TypeVar
 
@@ -17,8 +18,15 @@ class SettingError(ValueError):
 def expect_at_least(least: float, **settings: float) -> None:
     """Raise a SettingError that names the first setting below ``least``."""
     for name, value in settings.items():
-        if not value >= least:  # NaN is not either
+        if not least <= value < inf:  # NaN is not either
             raise SettingError(f"expected {name} of at least {least}, got {value}")
+
+
+def expect_above_zero(**settings: float) -> None:
+    """Raise a SettingError that names the first setting that is not above zero."""
+    for name, value in settings.items():
+        if not 0.0 < value < inf:
+            raise SettingError(f"expected {name} above 0, got {value}")
 
 
 def expect_share(**settings: float) -> None:

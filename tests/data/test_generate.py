@@ -274,6 +274,13 @@ def test_hidden_parameters_change_once_between_two_segments(seed):
             assert torch.equal(state[key], data[:, t]["next", key])
 
 
+def test_robots_that_change_need_two_segments(seed):
+    with pytest.raises(
+        ValueError, match="of more than 16 steps for robots that change"
+    ):
+        strategy(SCENE.vary(RANGES), "changing")(4, SEGMENT, fold_in(seed, 0))
+
+
 def test_data_of_other_parameters_are_refused(tmp_path):
     varied, config = SCENE.vary(RANGES), DataConfig(trajectories=2, steps=2)
     generate(varied, config, tmp_path / "varied", quiet=True)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import EXCERPT, simulated
+from tensordict import TensorDict
 
 from torchrl_nerd import load_scene
 from torchrl_nerd.data.log_files import load_recording, read_log, write_recording
@@ -17,6 +18,7 @@ from torchrl_nerd.data.recorded import (
     free_fall,
     split_trajectories,
 )
+from torchrl_nerd.data.simulate import as_transitions
 from torchrl_nerd.data.store import chunk_path, read_chunk
 from torchrl_nerd.geometry.manifold import integrate_pos
 from torchrl_nerd.scenes import Scene
@@ -241,6 +243,8 @@ def test_other_columns_of_a_csv_are_ignored(generator, tmp_path):
     [
         (("trajectory", *CARTPOLE[:4], "joint_torque_1"), "none named joint_torque_0"),
         (("Trajectory", *CARTPOLE), "a column 'trajectory' .* got 'Trajectory'"),
+        (("trajectory", *CARTPOLE[:4], "qpos_0"), "one column 'qpos_0' .* got several"),
+        (("trajectory_offsets", *CARTPOLE), "'trajectory' .* got 'trajectory_offsets'"),
         (("trajectory", *CARTPOLE[:4], "torque_0"), "of 'joint_torque' .* 'torque_0'"),
     ],
 )
@@ -353,5 +357,11 @@ def test_a_control_beyond_its_range_is_clipped_as_mujoco_does(tmp_path):
     frames = {"offsets": torch.tensor([0, 3]), "frame": scene.control_step}
     log = Recording(zero, zero, zero, **frames, ctrl=zero + 3.0)
     found = complete(log, scene)
+    still = TensorDict({"qpos": zero[None, :2], "qvel": zero[None, :2]}, [1, 2])
+    drawn = as_transitions(scene, [still], [torch.full((1, 1, 1), 3.0).double()], None)
+    assert (
+        drawn["next", "ctrl"].item() == 1.0
+        and drawn["next", "joint_torque"].item() == 10.0
+    )
     torch.testing.assert_close(found.joint_torque, zero + 10.0)
     torch.testing.assert_close(found.ctrl, zero + 1.0)

@@ -467,8 +467,8 @@ def test_a_control_step_is_a_length_of_time(control_step, tmp_path):
         ({"qpos_low": (0.0, 0.0, 0.0)}, "qpos_low of length 1, got 3"),
         ({"qvel_high": ()}, "qvel_high of length 1, got 0"),
         ({"torque": (1.0, 1.0)}, "torque of length 0, got 2"),
-        ({"qpos_low": (9.0,)}, "qpos_low up to qpos_high, got 9.0 and"),
-        ({"qvel_high": (float("nan"),)}, "qvel_low up to qvel_high, got .* and nan"),
+        ({"qpos_low": (9.0,)}, "qpos from low to high, got 9.0 and"),
+        ({"qvel_high": (float("nan"),)}, "qvel from low to high, got .* and nan"),
         ({"max_contact_points": 0}, "max_contact_points.* at least 1, got 0"),
     ],
 )
@@ -476,6 +476,24 @@ def test_ranges_that_cannot_be_are_refused(ranges, why, tmp_path):
     with pytest.raises(ValueError, match=why) as error:
         Scene.from_mjcf(write(tmp_path, BODY), **ranges)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"torque": (-1.0,) * 8}, "torque from low to high, got 0.0 and -1.0"),
+        ({"ctrl": ((1.0,), (-1.0,))}, "ctrl from low to high, got 1.0 and -1.0"),
+        ({"tilt": float("nan")}, "base.tilt from low to high, got 0.0 and nan"),
+        ({"low": (0.0, 0.0)}, "base of three numbers, got"),
+        ({"low": (0.0, 0.0, 9.0)}, "base from low to high, got 9.0 and"),
+    ],
+)
+def test_ranges_of_a_base_and_of_what_drives_are_in_order(changes, why):
+    sampling = load_scene("ant").sampling
+    if changes.keys() & {"tilt", "low"}:
+        changes = {"base": replace(sampling.base, **changes)}
+    with pytest.raises(ValueError, match=why):
+        replace(load_scene("ant"), sampling=replace(sampling, **changes))
 
 
 @pytest.mark.parametrize("name", [None, 5, ["ant"], ("ant",)])

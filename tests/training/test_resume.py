@@ -18,7 +18,7 @@ from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.files import read_json
 from torchrl_nerd.modules.nerd import NeRD
-from torchrl_nerd.robots import load_scene, make_task
+from torchrl_nerd.robots import Source, load_scene, make_task
 from torchrl_nerd.training.trainer import Trainer
 
 SCENE, TASK = "cartpole", "cartpole/swingup"
@@ -99,10 +99,14 @@ def data() -> TensorDict:
 
 
 def make_trainer(
-    folder: Path, init_from: NeRD | None = None, horizons: tuple[int, ...] = (2, 4)
+    folder: Path,
+    init_from: NeRD | None = None,
+    horizons: tuple[int, ...] = (2, 4),
+    source: Source | None = None,
 ) -> Trainer:
     how = {"horizons": horizons, "quiet": True, "init_from": init_from}
-    return Trainer(load_scene(SCENE), data(), make_task(TASK), CONFIG, folder, **how)
+    source = source or make_task(TASK)
+    return Trainer(load_scene(SCENE), data(), source, CONFIG, folder, **how)
 
 
 @pytest.fixture(scope="module")
@@ -216,6 +220,8 @@ def test_a_run_is_not_continued_with_other_validations(whole):
     """Its table would have other columns, its best model another measure."""
     with pytest.raises(ValueError, match="holds a run with validation"):
         make_trainer(whole, horizons=(3,))
+    with pytest.raises(ValueError, match="holds a run with validation"):
+        make_trainer(whole, source=load_scene(SCENE))
 
 
 def test_two_runs_of_one_seed_agree_whatever_else_is_random(whole, tmp_path):

@@ -14,15 +14,15 @@ from torchrl_nerd.data.cluster import ray_map
 from torchrl_nerd.data.generate import (
     CARD,
     Draw,
-    counted,
     draw_chunk,
     expect_few_dropped,
     generate,
+    open_card,
 )
 from torchrl_nerd.data.log_files import load_recording, write_recording
 from torchrl_nerd.data.simulate import SEGMENT, simulate
 from torchrl_nerd.data.strategies import Strategy, preset_strategy, strategy
-from torchrl_nerd.files import folder_name, read_json
+from torchrl_nerd.files import check_writable, folder_name, read_json
 from torchrl_nerd.robots import preset_of
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import expect_at_least
@@ -113,14 +113,11 @@ class Data(SceneOptions, Command):
         if self.recorded is not None:
             recording, _ = load_recording(self.recorded, scene)
             return [f"convert {len(recording)} recorded trajectories"]
-        _, draw = strategy or (None, partial(simulate, scene))
-        out = self.folder
+        name, draw = strategy or (None, partial(simulate, scene))
+        out, wanted = self.folder, self.config.trajectories
+        existing = open_card(scene, self.config, out, name)["trajectories"]
+        check_writable(out / CARD)
         size = draw_chunk(draw, self.config, (0, 1)).bytes()
-        wanted, existing = self.config.trajectories, 0
-        if (out / CARD).exists():
-            card = read_json(out / CARD)
-            counted(card, out)
-            existing = card["trajectories"]
         return [
             f"draw {wanted} trajectories of {scene.name}, {size * wanted / 1e9:.2g} GB, "
             f"in {out}, where {existing} exist"

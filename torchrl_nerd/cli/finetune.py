@@ -40,9 +40,18 @@ class Finetune(DeviceCommand):
     physical parameters); default analytic for the cube, else the robot's model."""
     config: Flat[FinetuneConfig] = field(default_factory=FinetuneConfig)
 
+    @property
+    def folder(self) -> Path:
+        """Of the new model."""
+        name = folder_name(recorded_scene(self.scene).name)
+        return self.out or Path("runs") / f"{name}_finetuned"
+
     def inputs(self) -> tuple[Recording, dict[str, Tensor], Model]:
         """The log, its trajectories for each purpose, and the model to begin with."""
-        scene = recorded_scene(self.scene)
+        scene, out = recorded_scene(self.scene), self.folder
+        if (out / CARD).exists():
+            raise ValueError(f"{out} already holds a model: choose another --out")
+        check_writable(out / CARD)
         recording, split = load_recording(self.recorded, scene)
         return recording, split, start_model(scene, self.model).to(self.device)
 
@@ -58,12 +67,8 @@ class Finetune(DeviceCommand):
 
         The folder gets its checkpoint and the validation errors, ``curve.json``.
         """
-        scene = recorded_scene(self.scene)
-        out = self.out or Path("runs") / f"{folder_name(scene.name)}_finetuned"
-        if (out / CARD).exists():
-            raise ValueError(f"{out} already holds a model: choose another --out")
-        check_writable(out / CARD)
         recording, split, model = self.inputs()
+        scene, out = model.scene, self.folder
         made = {
             "start": self.model or (ANALYTIC if model.kind == ANALYTIC else scene.name),
             "device": self.device,
@@ -84,7 +89,7 @@ class Finetune(DeviceCommand):
         card = read_json(out / CARD)
         results, prefix = card["finetuning"], "validation_"
         errors = ", ".join(
-            f"{name.removeprefix(prefix)} {value:.4f}"
+            f"{name.removeprefix(prefix)} {value:.3g}"
             for name, value in results.items()
             if name.startswith(prefix)
         )

@@ -52,11 +52,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     kind = COMMANDS[argv[0]]
     try:
         command = _parse(kind, argv)
+        if command.record is not None:  # refuse it before any work
+            check_writable(command.record)
         if command.dry_run:
             print("\n".join((*command.plan(), *command.settings())))
             return 0
-        if command.record is not None:  # refuse it before any work
-            check_writable(command.record)
         command.keep(command.run())
         sys.stdout.flush()
     except BrokenPipeError:  # who read its output, such as `head`, has seen enough
@@ -79,6 +79,7 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
     name, *args = argv
     try:
         with redirect_stderr(said), redirect_stdout(shown), REGISTRY:
+            args = _with_scene_first(kind, args)
             default = _default(kind, args)
             return tyro.cli(kind, prog=f"nerd {name}", args=args, default=default)
     except SystemExit as stop:
@@ -92,8 +93,10 @@ def _parse(kind: type[Command], argv: list[str]) -> Command:
 
 
 def _default(kind: type[Command], args: list[str]) -> Any:
-    """Defaults of ``data`` and ``train``: the preset of the scene that is named."""
-    if kind not in (Data, Train) or (scene := _scene_in(kind, args)) is None:
+    """Defaults of ``data`` and ``train``: the preset of the scene that is named first."""
+    if kind not in (Data, Train) or not args or args[0].startswith("-"):
+        return tyro.MISSING_NONPROP
+    if not ((scene := args[0]) in SCENES or is_import(scene)):
         return tyro.MISSING_NONPROP
     preset = preset_of(scene)
     if kind is Data:
@@ -104,16 +107,21 @@ def _default(kind: type[Command], args: list[str]) -> Any:
     return Train(scene=scene, config=preset.train)
 
 
-def _scene_in(kind: type[Data | Train], args: list[str]) -> str | None:
-    """The first word that names a robot and is no option's value."""
+def _with_scene_first(kind: type[Command], args: list[str]) -> list[str]:
+    """Arguments with the robot before all options, of which one may take several words.
+
+    It is the first word that names a robot and is no option's one value.
+    """
+    if kind not in (Data, Train):
+        return args
     options = *fields(kind), *fields(DataConfig if kind is Data else TrainConfig)
     flags = [x.name for x in options if isinstance(x.default, bool)]
-    for before, word in pairwise(["", *args]):
+    for at, (before, word) in enumerate(pairwise(["", *args])):
         name = before.removeprefix("--").replace("-", "_").removeprefix("no_")
         is_value = before.startswith("--") and "=" not in before and name not in flags
         if not is_value and (word in SCENES or is_import(word)):
-            return word
-    return None
+            return [word, *args[:at], *args[at + 1 :]]
+    return args
 
 
 def _fail(sentence: str, status: int = 2) -> int:

@@ -127,7 +127,9 @@ class Train(SceneOptions, DeviceCommand):
             )
 
     def expect_own(self, out: Path, scene: Scene) -> None:
-        """Refuse a folder that holds a run of other settings."""
+        """Refuse a folder that cannot be written, or holds a run of other settings."""
+        for folder in filter(None, (out, self.export)):
+            check_writable(folder / "card.json")
         if (out / STATE).exists():
             asked = {"config": asdict(self.config), "scene_hash": scene.hash}
             expect_same(f"{out} holds a run", read_json(out / STATE), asked)
@@ -136,11 +138,9 @@ class Train(SceneOptions, DeviceCommand):
         """Train and return the card of the checkpoint that the preset chooses."""
         scene, preset = self.load(), preset_of(self.scene)
         (out, folders), initial = self.folders, self.initial(scene)
-        for folder in filter(None, (out, self.export)):
-            check_writable(folder / "card.json")
+        self.expect_own(out, scene)
         self.untrained(scene, initial)  # refuses before data are drawn, or read
         if self.is_to_draw(folders):
-            self.expect_own(out, scene)
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads is not None:

@@ -70,7 +70,9 @@ def generate(
         ValueError: the folder cannot be written or holds data of another card.
     """
     name, draw = strategy or (None, partial(simulate, scene))
-    card = _open_card(scene, config, writable_folder(folder), name)
+    card = open_card(scene, config, folder, name)
+    if not (writable_folder(folder) / CARD).exists():
+        write_json(folder / CARD, card)  # before any chunk, which needs a card
     sizes = [CHUNK] * (config.trajectories // CHUNK)
     sizes += [config.trajectories % CHUNK] * (config.trajectories % CHUNK > 0)
     chunks = list(enumerate(sizes))[card["chunks_done"] :]
@@ -185,9 +187,14 @@ def _load_chunks(scene: Scene, folder: Path) -> list[TensorDict]:
     return chunks
 
 
-def _open_card(
+def open_card(
     scene: Scene, config: DataConfig, folder: Path, strategy: str | None
 ) -> dict[str, Any]:
+    """The card of the data in a folder, or that of data which are yet to be drawn.
+
+    Raises:
+        ValueError: the folder holds data of another card.
+    """
     fresh = {
         "scene": scene.name,
         "scene_hash": scene.hash,
@@ -202,7 +209,6 @@ def _open_card(
     fresh = json.loads(json.dumps(fresh))  # as it will be read: tuples become lists
     path = folder / CARD
     if not path.exists():
-        write_json(path, fresh)  # before any chunk, which never exists without a card
         return fresh
     card = read_json(path)
     identity = ("scene_hash", "config", "strategy", "ranges", "variation")

@@ -176,6 +176,15 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         said = " ".join(str(error).split())
         raise ValueError(f"expected a CSV table in {path}: {said}") from None
     names: set[str] = set(table.dtype.names or ())
+    with path.open(encoding="utf-8-sig") as file:
+        head = [name.strip() for name in file.readline().lstrip("#").split(",")]
+    if twice := next((name for name in head if head.count(name) > 1), None):
+        raise ValueError(f"expected one column '{twice}' in {path}, got several")
+    if "trajectory_offsets" in names:
+        raise ValueError(
+            f"expected a column 'trajectory' in {path}, got 'trajectory_offsets', which "
+            "is an array of npz files"
+        )
     columns = dict(FREE_BODY)
     for array in (QPOS, QVEL, TORQUE, CONTROL, TERRAIN):
         start = f"{array}_"

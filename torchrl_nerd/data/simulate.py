@@ -65,9 +65,16 @@ def change_once(own: Tensor, other: Tensor, generator: Generator) -> None:
 
     Each trajectory does so at a random time, after a whole number of segments. It takes
     over each of ``other (trajectories, size)`` with a chance of a half.
+
+    Raises:
+        ValueError: trajectories of a single segment.
     """
     trajectories, steps, size = own.shape
-    last = max(1, (steps - 1) // SEGMENT)
+    if not (last := (steps - 1) // SEGMENT):
+        raise ValueError(
+            f"expected trajectories of more than {SEGMENT} steps for robots that change, "
+            f"got {steps}"
+        )
     begin = SEGMENT * torch.randint(1, last + 1, (trajectories, 1), generator=generator)
     is_late = torch.arange(steps) >= begin  # (trajectories, steps)
     is_other = torch.rand(trajectories, size, generator=generator) < 0.5

@@ -53,7 +53,7 @@ def expect_layout(data: TensorDictBase, scene: Scene, steps: int, path: Path) ->
     if scene.variation is not None:
         sizes |= {"parameters": scene.variation.size}
     found = dict(data.flatten_keys("/").items())
-    for key in sizes.keys() | found.keys():
+    for key in sorted(sizes.keys() | found.keys()):
         value = found.get(key)
         got = value is not None and (tuple(value.shape), value.dtype)
         expected = (len(data), steps, sizes[key]) if key in sizes else None

@@ -25,7 +25,10 @@ MAX_CORRELATION_TIME = 1.0  # s; the shortest is one control step
 
 @dataclass(frozen=True)
 class SettledStates:
-    """States in which the robot has come to rest: the ends of passive trajectories."""
+    """States in which the robot has come to rest: the ends of passive trajectories.
+
+    Of a varied scene they are those of the robot of the file.
+    """
 
     scene: Scene  # the robot, whose sampling gives the initial states
     seconds: float = 3.0  # length of the trajectories

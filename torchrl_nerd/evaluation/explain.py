@@ -24,7 +24,7 @@ from torchrl_nerd.modules.nerd import SceneFeatures
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import body_label, ground_geoms, own_contacts
 from torchrl_nerd.scenes.penetration import touching_bodies
-from torchrl_nerd.scenes.symmetries import Effect, why_all_kept
+from torchrl_nerd.scenes.symmetries import Effect, periodic_hinges, why_all_kept
 from torchrl_nerd.scenes.terrain import PLANE
 
 SERVOS = "; servos: the control is held, MuJoCo evaluates their law in every substep"
@@ -198,7 +198,8 @@ def _self_contacts(scene: Scene) -> tuple[SelfContact, ...]:
 def _state_meaning(scene: Scene) -> str:
     """Parts of ``robot_state``, see `RobotCentric`."""
     parts = ["base velocity and gravity in the base frame"] * scene.base.is_floating
-    parts.append("joint positions (sine and cosine of a hinge without limits)")
+    turns = " (sine and cosine of a hinge without limits)"
+    parts.append("joint positions" + turns * bool(periodic_hinges(scene.model)))
     parts.append("joint velocities")
     parts += ["gaps to joint limits"] * bool(scene.model.jnt_limited.any())
     return ", ".join(parts)

@@ -58,7 +58,10 @@ class Standardize(nn.Module):
 
     @torch.no_grad()
     def fit(self, observations: Tensor) -> "Standardize":
-        """Mean and deviation of all that were ever given, these ``(*batch, size)`` too."""
+        """Mean and deviation of all that were ever given, these ``(*batch, size)`` too.
+
+        One that was loaded from a file begins anew: its file has no count of them.
+        """
         samples = self._last_and_changes(observations.flatten(0, -2).double())
         self.count += len(samples)
         share = len(samples) / self.count

@@ -9,7 +9,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_nerd.keys import CTRL, JOINT_TORQUE
-from torchrl_nerd.scenes.controllers import ActuatorController, Controller
+from torchrl_nerd.scenes.controllers import (
+    ActuatorController,
+    Controller,
+    clipped_ctrl,
+)
 from torchrl_nerd.scenes.scene import Scene
 
 Drive = tuple[Tensor, Tensor | None]
@@ -27,10 +31,11 @@ def actuate(
 
 
 def drive(scene: Scene, command: Tensor, qpos: Tensor, qvel: Tensor) -> Drive:
-    """What a command ``(*batch, m)`` does in a state."""
+    """What a command ``(*batch, m)`` does in a state: controls within their range."""
     if scene.servos is None:
         return command, None
-    return scene.servos.torque(command, qpos, qvel), command
+    ctrl = clipped_ctrl(scene.model, command)
+    return scene.servos.torque(ctrl, qpos, qvel), ctrl
 
 
 def drive_of(

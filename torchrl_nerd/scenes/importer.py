@@ -155,7 +155,7 @@ def gymnasium_file(env_id: str) -> tuple[Path, int]:
     spec = registry[env_id]
     settings, source = _constructor_defaults(str(spec.entry_point))
     settings |= spec.kwargs
-    if not {"xml_file", "frame_skip"} <= settings.keys():
+    if not isinstance(settings.get("xml_file"), str) or "frame_skip" not in settings:
         wanted = "an environment of Gymnasium with an xml_file and a frame_skip"
         raise ValueError(
             f"expected {wanted}, as those of version 5 have, got '{env_id}'"

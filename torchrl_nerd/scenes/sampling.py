@@ -105,18 +105,34 @@ class Sampling:
         """Raise a ValueError where a range is not one number for each entry, in order."""
         free_q, free_v = (7, 6) if self.base is not None else (0, 0)
         sizes = {"torque": num_actuated}
+        self._expect_order()
         if self.starts is None:
             sizes |= dict.fromkeys(("qpos_low", "qpos_high"), layout.nq - free_q)
             sizes |= dict.fromkeys(("qvel_low", "qvel_high"), layout.nv - free_v)
         for name, size in sizes.items():
             if (count := len(getattr(self, name))) != size:
                 raise ValueError(f"expected {name} of length {size}, got {count}")
-        for name in ("qpos", "qvel"):
-            ends = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
+
+    def _expect_order(self) -> None:
+        """Raise a ValueError for a range whose low end is not below its high one."""
+        ranges = [("torque", (0.0,) * len(self.torque), self.torque)]
+        ranges += [("qpos", self.qpos_low, self.qpos_high)]
+        ranges += [("qvel", self.qvel_low, self.qvel_high)]
+        if self.ctrl is not None:
+            ranges += [("ctrl", *self.ctrl)]
+        if (base := self.base) is not None:
+            three = [("base", base.low, base.high)]
+            three += [("base.linear", base.linear_low, base.linear_high)]
+            three += [("base.angular", base.angular_low, base.angular_high)]
+            for name, *ends in three:
+                if [*map(len, ends)] != [3, 3]:
+                    raise ValueError(f"expected {name} of three numbers, got {ends}")
+            ranges += [*three, ("base.tilt", (0.0,), (base.tilt,))]
+        for name, *ends in ranges:
             for low, high in zip(*ends, strict=False):  # not read beside ``starts``
                 if not low <= high:
                     raise ValueError(
-                        f"expected {name}_low up to {name}_high, got {low} and {high}"
+                        f"expected {name} from low to high, got {low} and {high}"
                     )
 
     @property

@@ -156,7 +156,7 @@ class FineTuner:
     def _descend(self) -> None:
         """The chosen weights, along the gradient of rollouts."""
         config, waited = self.config, 0
-        total = round(config.epochs * self.updates_per_epoch)
+        total = round(config.epochs * self.updates_per_epoch) or bool(config.epochs)
         generator = Generator().manual_seed(config.seed)
         batches: list[Tensor] = []
         with self._bar(total, self.updates_per_epoch) as bar:
@@ -209,7 +209,7 @@ class FineTuner:
     @property
     def _last(self) -> str:
         """The errors of the curve's last point, for the progress bar."""
-        return ", ".join(f"{k} {v:.4f}" for k, v in errors_of(self.curve[-1]).items())
+        return ", ".join(f"{k} {v:.3g}" for k, v in errors_of(self.curve[-1]).items())
 
     @torch.no_grad()
     def errors(self, starts: Tensor) -> Errors:

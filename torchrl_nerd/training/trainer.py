@@ -114,7 +114,7 @@ class Trainer:
             "scene_hash": scene.hash,
             "init_from": self.init_from,
             "data": data_fingerprint(data),
-            "validation": [self.horizons, random_actions],
+            "validation": [self.horizons, random_actions, type(source).__name__],
         }
         self.optimizers = self.make_optimizers()
         weights = self.model.network.named_parameters()
