@@ -47,7 +47,10 @@ class Finetune(DeviceCommand):
         return self.out or Path("runs") / f"{name}_finetuned"
 
     def inputs(self) -> tuple[Recording, dict[str, Tensor], Model]:
-        """The log, its trajectories for each purpose, and the model to begin with."""
+        """The log, its trajectories for each purpose, and the model to begin with.
+
+        Raises ValueError for a folder that holds a model or cannot be written.
+        """
         scene, out = recorded_scene(self.scene), self.folder
         if (out / CARD).exists():
             raise ValueError(f"{out} already holds a model: choose another --out")
