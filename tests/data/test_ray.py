@@ -120,7 +120,7 @@ def test_where_ray_is_missing_the_extra_is_named(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().err
     assert said == (
         "nerd: this needs the package ray, which is not installed: "
-        "pip install 'torchrl-nerd[ray]'\n"
+        "in the clone, pip install -e '.[ray]'\n"
     )
 
 

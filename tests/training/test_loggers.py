@@ -131,7 +131,7 @@ def test_where_a_library_is_missing_the_extra_is_named(tmp_path, monkeypatch, ca
     assert main([*argv, "--logger", "wandb"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("nerd: --logger wandb needs the package wandb")
-    assert said.endswith("pip install 'torchrl-nerd[wandb]'\n")
+    assert said.endswith("in the clone, pip install -e '.[wandb]'\n")
     assert said.count("\n") == 1
     assert not (tmp_path / "run").exists()
 

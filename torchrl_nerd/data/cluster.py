@@ -33,7 +33,7 @@ def ray_map(
     if find_spec("ray") is None:
         raise ModuleNotFoundError(
             "this needs the package ray, which is not installed: "
-            "pip install 'torchrl-nerd[ray]'"
+            "in the clone, pip install -e '.[ray]'"
         )
     import ray
 

@@ -219,7 +219,7 @@ def _import_warp() -> tuple[Any, Any]:
     if not is_warp_installed():
         raise ModuleNotFoundError(
             "dynamics 'mujoco_warp' needs the package mujoco-warp, which is not "
-            "installed: pip install 'torchrl-nerd[warp]'"
+            "installed: in the clone, pip install -e '.[warp]'"
         )
     is_first = "warp" not in sys.modules
     import warp

@@ -122,7 +122,8 @@ def check_video(path: Path) -> None:
         raise ValueError(f"expected a file named .gif or .mp4, got '{path}'")
     if not all(map(find_spec, ("imageio", "imageio_ffmpeg"))):
         raise ModuleNotFoundError(
-            "videos need imageio and imageio-ffmpeg: pip install 'torchrl-nerd[examples]'"
+            "videos need imageio and imageio-ffmpeg: in the clone, "
+            "pip install -e '.[examples]'"
         )
     check_writable(path)
 

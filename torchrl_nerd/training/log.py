@@ -105,7 +105,7 @@ def open_logger(
     if is_missing:
         raise ModuleNotFoundError(
             f"--logger {name} needs the package {name}, which is not installed: "
-            f"pip install 'torchrl-nerd[{name}]'"
+            f"in the clone, pip install -e '.[{name}]'"
         )
     from wandb.errors import UsageError
 
