@@ -41,7 +41,7 @@ def test_a_command_of_servos_is_their_control(tmp_path, generator):
     here = states(scene, generator)
     command = torch.rand(5, 2, generator=generator).double()
     torque, ctrl = drive(scene, command, *here)
-    assert ctrl is command and held(scene, command) == (None, command)
+    assert torch.equal(ctrl, command) and held(scene, command) == (None, command)
     assert torch.equal(torque, scene.servos.torque(command, *here))
     assert torch.equal(idle(scene, 1), torch.tensor([[0.0, 0.25]]).double())
     data = TensorDict({JOINT_TORQUE: torque, CTRL: command}, [5])

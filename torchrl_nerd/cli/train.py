@@ -96,6 +96,7 @@ class Train(SceneOptions, DeviceCommand):
             for folder in folders:
                 self.expect_long(read_card(scene, folder)[1])
             data = f"use the data in {', '.join(map(str, folders))}"
+        self.expect_writable(out)
         self.expect_own(out, scene)
         model = self.untrained(scene, self.initial(scene))
         weights = sum(weight.numel() for weight in model.network.parameters())
@@ -126,10 +127,13 @@ class Train(SceneOptions, DeviceCommand):
                 f"{data.steps}: draw them with `nerd data {self.scene} --steps`"
             )
 
-    def expect_own(self, out: Path, scene: Scene) -> None:
-        """Refuse a folder that cannot be written, or holds a run of other settings."""
+    def expect_writable(self, out: Path) -> None:
+        """Refuse folders of the run and of ``--export`` that cannot be written."""
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
+
+    def expect_own(self, out: Path, scene: Scene) -> None:
+        """Refuse a folder that holds a run of other settings."""
         if (out / STATE).exists():
             asked = {"config": asdict(self.config), "scene_hash": scene.hash}
             expect_same(f"{out} holds a run", read_json(out / STATE), asked)
@@ -138,9 +142,10 @@ class Train(SceneOptions, DeviceCommand):
         """Train and return the card of the checkpoint that the preset chooses."""
         scene, preset = self.load(), preset_of(self.scene)
         (out, folders), initial = self.folders, self.initial(scene)
-        self.expect_own(out, scene)
+        self.expect_writable(out)
         self.untrained(scene, initial)  # refuses before data are drawn, or read
         if self.is_to_draw(folders):
+            self.expect_own(out, scene)
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads is not None:

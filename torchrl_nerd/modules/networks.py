@@ -37,7 +37,7 @@ class MLP(nn.Module):
     def __init__(self, config: MLPConfig, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
         expect_count(0, depth=config.depth)
-        expect_count(1, width=config.width, symmetries=config.symmetries)
+        expect_count(1, width=config.width)
         self.config = config
         sizes = config.width, config.symmetries
         self.embed = make_embedding(num_inputs, *sizes)
