@@ -262,9 +262,14 @@ def _register(env_id: str, horizon: int | None = None, **kwargs: str) -> None:
     )
 
 
+def _follow(task: str) -> None:
+    """Register a task, or forget one that is gone."""
+    if task in TASKS:
+        horizon = getattr(TASKS[task], "horizon", None)
+        _register(gymnasium_id(task), horizon, task=task)
+    else:
+        gymnasium.registry.pop(gymnasium_id(task), None)
+
+
 _register("TorchrlNerd/Task-v0")  # any task, by its id as the argument ``task``
-for_each_task(
-    lambda task: _register(
-        gymnasium_id(task), getattr(TASKS[task], "horizon", None), task=task
-    )
-)
+for_each_task(_follow)

@@ -46,6 +46,7 @@ ROBOT = Robot(
 )
 
 
+KNOWN = "stay", "wait"
 TOSSES = dict.fromkeys(("tasks", "presets", "ppo", "policies"), {})
 TOSSES |= {"scenes": {"cube_tosses": lambda: CART}, "models": {"cube_tosses": "runs"}}
 
@@ -125,6 +126,8 @@ def test_a_module_that_is_loaded_again_replaces_its_robot(tmp_path, monkeypatch)
     importlib.reload(module)
     assert make_task("cart/wait").horizon == 100
     assert [task for task in TASKS if task.startswith("cart/")] == ["cart/wait"]
+    known = [gymnasium_id(f"cart/{task}") in gymnasium.registry for task in KNOWN]
+    assert known == [False, True]
 
 
 def test_robots_that_share_a_scene_s_name_in_turn_leave_each_other_alone():

@@ -71,13 +71,17 @@ def register(robot: Robot) -> None:
     for scene in (scene for old in before for scene in old.scenes):
         _LAST.pop(scene, None)
     _LAST.update(dict.fromkeys(robot.scenes, robot))
+    told = dict.fromkeys(task for each in (*before, robot) for task in each.tasks)
     for listener in _LISTENERS:
-        for task in robot.tasks:
+        for task in told:
             listener(task)
 
 
 def for_each_task(function: Callable[[str], object]) -> None:
-    """Call a function with the id of every task, of those that are registered later too."""
+    """Call a function with the id of every task, of those that are registered later too.
+
+    It is called once more with the id of a task that is gone from `TASKS`.
+    """
     _LISTENERS.append(function)
     for task in TASKS:
         function(task)
