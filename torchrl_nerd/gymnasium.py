@@ -231,7 +231,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 def _shortened(task: str | Path | Scene | Task, steps: int | None) -> Task:
     """The task, or a copy of it with that horizon where its own is longer."""
-    task = task if isinstance(task, Task) else make_task(task)
+    task = make_task(task)
     if steps is not None:
         expect_count(1, max_episode_steps=steps)
     if steps is None or steps >= task.horizon:

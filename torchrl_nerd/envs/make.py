@@ -63,7 +63,7 @@ class GroundTruthEnv(SceneEnv):
         state_dtype: torch.dtype = torch.float64,
     ) -> None:
         make = look_up("engine", engine, ENGINES)
-        task = task if isinstance(task, Task) else make_task(task)
+        task = make_task(task)
         dynamics = make(task.scene, expect_device(str(device), state_dtype))
         super().__init__(task, dynamics, num_envs, seed, device, dump_dir, state_dtype)
 
@@ -111,7 +111,7 @@ class NeRDEnv(SceneEnv):
         differentiable: bool = False,
         state_dtype: torch.dtype = torch.float64,
     ) -> None:
-        task = task if isinstance(task, Task) else make_task(task)
+        task = make_task(task)
         name = type(model).__name__
         if not isinstance(model, Model):
             given, model = model, from_pretrained(model, task.scene)

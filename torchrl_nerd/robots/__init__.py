@@ -74,16 +74,19 @@ def load_scene(name: str | Path) -> Scene:
     raise _unknown("scene", name, SCENES)
 
 
-def make_task(name: str | Path | Scene) -> Task:
+def make_task(name: str | Path | Scene | Task) -> Task:
     """The task of that id: a registered one or ``dm_control/DOMAIN-TASK``.
 
     So is ``gymnasium/ID`` where the environment runs along x, see `LocomotionTask`. Other
     ids of Gymnasium, MJCF files and scenes are a robot alone, which becomes a `SceneTask`.
+    A task is returned as it is.
 
     Raises:
         ValueError: no such task, one registered as something else, or a robot with
             something not supported (named).
     """
+    if isinstance(name, Task):
+        return name
     if isinstance(name, Scene):
         return SceneTask(name)
     name = str(name) if isinstance(name, Path) else name

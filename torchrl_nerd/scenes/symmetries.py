@@ -22,7 +22,7 @@ from torchrl_nerd.scenes.contact_points import (
     own_contacts,
     terrain_geoms,
 )
-from torchrl_nerd.scenes.support import DISABLE, silence_mujoco
+from torchrl_nerd.scenes.support import DISABLE, ON_JOINT, silence_mujoco
 
 TOLERANCE = 1e-9  # relative change of the step; rounding leaves about 1e-13
 TRIALS = 8
@@ -138,8 +138,7 @@ def periodic_hinges(model: mujoco.MjModel, has_servos: bool = False) -> list[int
     for ends in (model.eq_obj1id[is_coupling], model.eq_obj2id[is_coupling]):
         is_periodic[ends[ends >= 0]] = False
     if has_servos:
-        transmissions = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
-        for i in np.flatnonzero(np.isin(model.actuator_trntype, transmissions)):
+        for i in np.flatnonzero(np.isin(model.actuator_trntype, ON_JOINT)):
             laws = model.actuator_gaintype[i], model.actuator_biastype[i]
             places = model.actuator_gainprm[i, 1], model.actuator_biasprm[i, 1]
             if max(laws) > AFFINE or any(places):  # another law may read anything
