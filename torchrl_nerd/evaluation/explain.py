@@ -68,7 +68,7 @@ class SceneReport:
     features: tuple[Feature, ...]  # of the token, in order
     control_step: float  # s
     solver: str  # integrator and substeps, see `mujoco_name`
-    effects: tuple[Effect, ...]  # of hinges, slides and a floating base's pose
+    effects: tuple[Effect, ...]  # of hinges and slides
     why_all_kept: str | None  # the reason where hinges and slides are not moved
     points_found: int  # contact points of the robot's shapes
     points_merged: int  # of these, how many always coincide with another one
