@@ -7,7 +7,7 @@ import pytest
 from torchrl_nerd import load_scene, make_env
 from torchrl_nerd.dynamics import MujocoWarpDynamics
 
-SENTENCE = r"needs the package mujoco-warp.*: pip install 'torchrl-nerd\[warp\]'"
+SENTENCE = r"needs the package mujoco-warp.*in the clone, pip install -e '.\[warp\]'"
 
 
 def test_a_refusal_lists_it_installed_or_not():
