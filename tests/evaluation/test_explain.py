@@ -102,3 +102,13 @@ def test_merged_and_fixed_contact_points_are_counted():
     report = explain(load_scene("double_pendulum"))
     assert (report.points_found, report.points_merged, report.points_fixed) == (4, 1, 1)
     assert "4 found, 1 merged" in str(report)
+
+
+def test_a_hinge_that_a_servo_holds_is_no_sine_and_cosine(tmp_path):
+    for actuator, words in (("motor", True), ("position", False)):
+        path = tmp_path / f"{actuator}.xml"
+        path.write_text(f"""<mujoco><worldbody><body><joint name="j"/>
+          <geom size="0.1" pos="0.2 0 0"/></body></worldbody><actuator>
+          <{actuator} joint="j" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+          </mujoco>""")
+        assert ("sine and cosine" in str(explain(load_scene(str(path))))) == words

@@ -198,8 +198,9 @@ def _self_contacts(scene: Scene) -> tuple[SelfContact, ...]:
 def _state_meaning(scene: Scene) -> str:
     """Parts of ``robot_state``, see `RobotCentric`."""
     parts = ["base velocity and gravity in the base frame"] * scene.base.is_floating
+    periodic = periodic_hinges(scene.model, scene.servos is not None)
     turns = " (sine and cosine of a hinge without limits)"
-    parts.append("joint positions" + turns * bool(periodic_hinges(scene.model)))
+    parts.append("joint positions" + turns * bool(periodic))
     parts.append("joint velocities")
     parts += ["gaps to joint limits"] * bool(scene.model.jnt_limited.any())
     return ", ".join(parts)

@@ -99,8 +99,8 @@ class OperationalSpaceController:
             )
         if len(self.scale) not in AXES:
             raise ValueError(f"expected 3 or 6 numbers as scale, got {len(self.scale)}")
-        lengths = {"kp": self.num_actions, "kd": self.num_actions, "home": model.nq}
-        lengths |= {"limit": len(self.actuated)}
+        lengths = {"kp": self.num_actions, "kd": self.num_actions}
+        lengths |= {"home": model.nq, "limit": len(self.actuated)}
         for name, length in lengths.items():
             value = getattr(self, name)
             if value is not None and len(value) != length:

@@ -78,7 +78,7 @@ def find_symmetries(
     """
     if why_all_kept(model):
         return Symmetries(())
-    free, rng = _without(model, LIMIT, has_servos), np.random.default_rng(0)
+    free, rng = _without_limits(model, has_servos), np.random.default_rng(0)
     seldom = seldom_felt(model)
     effects: list[Effect] = []
     for joint in np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE))).tolist():
@@ -124,7 +124,7 @@ def seldom_felt(model: mujoco.MjModel) -> set[int]:
     return found
 
 
-def periodic_hinges(model: mujoco.MjModel, has_servos: bool = False) -> list[int]:
+def periodic_hinges(model: mujoco.MjModel, has_servos: bool) -> list[int]:
     """Addresses in ``qpos`` of hinges of which a whole turn changes nothing.
 
     They have no limits and no spring, and no fixed tendon, equality constraint or servo
@@ -146,10 +146,10 @@ def periodic_hinges(model: mujoco.MjModel, has_servos: bool = False) -> list[int
     return model.jnt_qposadr[is_periodic].tolist()
 
 
-def _without(model: mujoco.MjModel, flags: int, has_servos: bool) -> mujoco.MjModel:
-    """The model without some forces, and without actuators that are no servos."""
+def _without_limits(model: mujoco.MjModel, has_servos: bool) -> mujoco.MjModel:
+    """The model without joint limits, and without actuators that are no servos."""
     free = copy.copy(model)
-    free.opt.disableflags |= flags
+    free.opt.disableflags |= DISABLE.mjDSBL_LIMIT
     if not has_servos:
         free.opt.disableflags |= DISABLE.mjDSBL_ACTUATION
     return free

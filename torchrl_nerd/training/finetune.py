@@ -156,7 +156,10 @@ class FineTuner:
     def _descend(self) -> None:
         """The chosen weights, along the gradient of rollouts."""
         config, waited = self.config, 0
-        total = round(config.epochs * self.updates_per_epoch) or bool(config.epochs)
+        # a share of an epoch is one update at least
+        total = max(
+            round(config.epochs * self.updates_per_epoch), int(config.epochs > 0)
+        )
         generator = Generator().manual_seed(config.seed)
         batches: list[Tensor] = []
         with self._bar(total, self.updates_per_epoch) as bar:

@@ -182,8 +182,6 @@ class Normalize(StateTransform):
 
     def _fitting(self, key: NestedKey, x: Tensor) -> Tensor:
         """``x``; a ValueError if it is wider or narrower than the statistics."""
-        if x.shape[-1:] != (shape := self.mean(key).shape):
-            raise ValueError(
-                f"expected {key} of width {len(shape) and shape[0]}, got {[*x.shape]}"
-            )
+        if x.shape[-1:] != (width := self.mean(key).shape):
+            raise ValueError(f"expected {key} of width {width[0]}, got {[*x.shape]}")
         return x
