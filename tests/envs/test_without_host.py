@@ -28,7 +28,8 @@ QUICK = {("ant/run", "streaming"), ("anymal/forward", "analytic")}
 QUICK |= {("double_pendulum/passive", "hybrid")}
 CASES = [(task, kind) for task in TASKS for kind in MODELS]
 
-TRACED = {("cartpole/swingup", "hybrid")}  # streaming ones: see test_compile.py
+# a robot of slides and hinges, and one that turns freely
+TRACED = {("cartpole/swingup", "hybrid"), ("ant/run", "streaming")}
 
 each_case = pytest.mark.parametrize(("task_id", "kind"), slow_but(QUICK, CASES))
 each_traced = pytest.mark.parametrize(("task_id", "kind"), slow_but(TRACED, CASES))

@@ -92,7 +92,7 @@ def integrate_pos(layout: JointLayout, qpos: Tensor, tangent: Tensor) -> Tensor:
     for q, v in layout.rotations:
         turned = quat_multiply(qpos[..., q : q + 4], quat_exp(tangent[..., v : v + 3]))
         parts[q] = quat_normalize(turned)
-    return torch.cat([part for _, part in sorted(parts.items())], -1)
+    return torch.cat([parts[first] for first in sorted(parts)], -1)
 
 
 def normalize_pos(layout: JointLayout, qpos: Tensor) -> Tensor:
@@ -116,4 +116,4 @@ def differentiate_pos(layout: JointLayout, start: Tensor, end: Tensor) -> Tensor
     for q, v in layout.rotations:
         turn = quat_multiply(quat_conjugate(start[..., q : q + 4]), end[..., q : q + 4])
         parts[v] = quat_log(turn)
-    return torch.cat([part for _, part in sorted(parts.items())], -1)
+    return torch.cat([parts[first] for first in sorted(parts)], -1)
