@@ -37,6 +37,8 @@ CONFIGS = {
     "transformer": TransformerConfig(2, 16, 2, 3),
     "wide band": TransformerConfig(2, 16, 2, 17),
     "pairs": TransformerConfig(2, 16, 2, 3, pairs=True),
+    "products": TransformerConfig(2, 16, 2, 3, pairs=True, products=True),
+    "mlp with products": MLPConfig(2, 16, products=True),
 }
 # three mirrors that commute: two swap entries, and each flips others
 MIRRORS = (

@@ -58,6 +58,8 @@ class HybridNeRD(NeRD):
         last = [m for m in self.network.head.modules() if isinstance(m, nn.Linear)][-1]
         for weight in last.parameters():
             nn.init.zeros_(weight)
+        if hasattr(self.network, "products"):  # a GRU has none
+            self.network.products.silence()
 
     @property
     def token_size(self) -> int:

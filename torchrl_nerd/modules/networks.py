@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.modules.history import History, stored
 from torchrl_nerd.modules.linear import FullLinear
+from torchrl_nerd.modules.products import make_products
 from torchrl_nerd.modules.symmetric import make_embedding, make_head
 from torchrl_nerd.modules.transformer import FeedForward, TransformerConfig, initialize
 from torchrl_nerd.settings import SettingError, expect_count, look_up
@@ -20,6 +21,7 @@ class MLPConfig:
 
     depth: int = 4
     width: int = 64
+    products: bool = False  # of features, see `products`
     symmetries: int = 1  # mirrors of the robot and their products; see `symmetric`
 
     def build(self, num_inputs: int, num_outputs: int) -> "MLP":
@@ -43,14 +45,16 @@ class MLP(nn.Module):
         self.embed = make_embedding(num_inputs, *sizes)
         self.blocks = nn.ModuleList(FeedForward(*sizes) for _ in range(config.depth))
         self.head = make_head(config.width, num_outputs, config.symmetries)
+        self.products = make_products(config.products, num_inputs, num_outputs, *sizes)
         initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """``(*batch, F) -> (*batch, D)``."""
-        x = self.embed(tokens)  # (*batch, *hidden)
+        # (*batch, *hidden) both
+        x, factors = self.products.enter(self.embed(tokens), tokens)
         for block in self.blocks:
             x = block(x)
-        return self.head(x)
+        return self.products.leave(self.head(x), x, factors)
 
     def read(self, tokens: Tensor, memory: NoMemory) -> Tensor:
         """``(rows, T, F) -> (rows, T, D)``."""
@@ -126,6 +130,7 @@ TRANSFORMERS = {
     "transformer-2x96": TransformerConfig(2, 96, 4),
     "adaptive-4x64": TransformerConfig(4, 64, 4, band=64, pairs=True),
     "transformer-4x128": TransformerConfig(4, 128, 4),
+    "transformer-4x128-products": TransformerConfig(4, 128, 4, products=True),
     "paper": TransformerConfig(6, 192, 12),
     "paper-large": TransformerConfig(6, 384, 12),
 }
@@ -133,6 +138,7 @@ MLPS = (1, 16), (1, 32), (2, 32), (2, 64), (4, 64), (4, 120), (4, 128), (4, 160)
 NETWORKS: dict[str, NetworkConfig] = {
     **TRANSFORMERS,
     **{f"mlp-{depth}x{width}": MLPConfig(depth, width) for depth, width in MLPS},
+    "mlp-4x128-products": MLPConfig(4, 128, products=True),
     "gru": GRUConfig(),
 }
 """Kind, then depth x width; ``adaptive``: a transformer for hidden parameters."""

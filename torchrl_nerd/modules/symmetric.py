@@ -14,7 +14,7 @@ the diagonal, and so a K-th of the products. Activation functions act on the par
 Ordonez-Apraez et al., https://arxiv.org/abs/2402.15552, on symmetries of robots.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -81,25 +81,32 @@ def block_product(x: Tensor, weight: Tensor) -> Tensor:
 
 
 class Activation(nn.Module):
-    """An activation function of the parts, given and giving characters."""
+    """A function of the parts, of one hidden vector or of two, in characters.
+
+    An activation function, or a product.
+    """
 
     signs: Tensor
 
-    def __init__(self, function: nn.Module, symmetries: int) -> None:
+    def __init__(self, function: Callable[..., Tensor], symmetries: int) -> None:
         super().__init__()
         self.function = function
         self.register_buffer("signs", walsh_signs(symmetries), persistent=False)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor:
         """``(*batch, K, n)``: `transform`, the function, and `transform` once more."""
-        first = x.movedim(-2, 0)  # (K, *batch, n)
+        firsts = [x.movedim(-2, 0) for x in inputs]  # (K, *batch, n)
+        scale = len(self.signs) ** -0.5
         if torch.compiler.is_compiling():  # one loop for all three
-            parts = walsh_sums([x * len(first) ** -0.5 for x in first.unbind()])
-            after = walsh_sums([self.function(x) for x in parts])
-            return torch.stack([x * len(first) ** -0.5 for x in after], -2)
-        mixing = walsh_matrix(self.signs, x.dtype)
-        parts = mixing @ first.flatten(1)  # (K, batch * n): fast for the function
-        return (mixing @ self.function(parts)).view(first.shape).movedim(0, -2)
+            parts = [
+                walsh_sums([x * scale for x in first.unbind()]) for first in firsts
+            ]
+            after = walsh_sums([self.function(*x) for x in zip(*parts, strict=True)])
+            return torch.stack([x * scale for x in after], -2)
+        mixing = walsh_matrix(self.signs, inputs[0].dtype)
+        # (K, batch * n): fast for the function
+        after = mixing @ self.function(*(mixing @ first.flatten(1) for first in firsts))
+        return after.view(firsts[0].shape).movedim(0, -2)
 
 
 class BlockLinear(InnerLinear):
@@ -194,6 +201,20 @@ class Readout(Mirrored):
         return F.linear(x.flatten(-2), weight.transpose(0, 1).flatten(0, 1).mT, bias)
 
 
+class DirectReadout(Readout):
+    """Predictions from characters."""
+
+    signs: Tensor
+
+    def __init__(self, width: int, num_outputs: int, symmetries: int) -> None:
+        super().__init__(width, num_outputs, symmetries)
+        self.register_buffer("signs", walsh_signs(symmetries), persistent=False)
+
+    def multiply(self, x: Tensor) -> Tensor:
+        """``(*batch, K, width / K) -> (*batch, D)``."""
+        return super().multiply(transform(x, self.signs))
+
+
 def set_mirrors(
     network: nn.Module, tokens: SignedCopies, outputs: SignedCopies
 ) -> None:
@@ -228,6 +249,18 @@ def make_inner(num_inputs: int, num_outputs: int, symmetries: int) -> InnerLinea
 def make_activation(function: nn.Module, symmetries: int) -> nn.Module:
     """An activation function of the hidden vector."""
     return function if symmetries == 1 else Activation(function, symmetries)
+
+
+def make_product(symmetries: int) -> Callable[[Tensor, Tensor], Tensor]:
+    """The product of two hidden vectors, entry by entry."""
+    return torch.mul if symmetries == 1 else Activation(torch.mul, symmetries)
+
+
+def make_readout(width: int, num_outputs: int, symmetries: int) -> FullLinear:
+    """From the hidden vector to predictions, without a layer between."""
+    if symmetries == 1:
+        return FullLinear(width, num_outputs)
+    return DirectReadout(width, num_outputs, symmetries)
 
 
 def make_head(width: int, num_outputs: int, symmetries: int) -> nn.Sequential:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from torchrl_nerd.modules.history import stored
 from torchrl_nerd.modules.kv_cache import KeyValueCache
+from torchrl_nerd.modules.products import make_products
 from torchrl_nerd.modules.symmetric import (
     hidden_shape,
     make_activation,
@@ -42,6 +43,7 @@ class TransformerConfig:
     heads: int = 4  # divides width
     band: int = 10  # tokens each layer sees, the current one included (paper: h = 10)
     pairs: bool = False  # embed a token together with the one before it
+    products: bool = False  # of features, see `products`
     symmetries: int = 1  # mirrors of the robot and their products; see `symmetric`
 
     def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
@@ -169,7 +171,7 @@ class CausalTransformer(nn.Module):
     ) -> None:
         super().__init__()
         for name, size in asdict(config).items():
-            if size < {"band": 2, "pairs": 0}.get(name, 1):
+            if size < {"band": 2, "pairs": 0, "products": 0}.get(name, 1):
                 raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
             raise ValueError(
@@ -183,6 +185,7 @@ class CausalTransformer(nn.Module):
             self.embed_last = make_embedding(num_inputs, *sizes, bias=False)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.head = make_head(config.width, num_outputs, config.symmetries)
+        self.products = make_products(config.products, num_inputs, num_outputs, *sizes)
         initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -194,7 +197,7 @@ class CausalTransformer(nn.Module):
 
         It has to be empty: what it holds is replaced.
         """
-        x = self.embed(tokens)
+        x, factors = self.products.enter(self.embed(tokens), tokens)
         if self.embed_last is not None:
             adds = self.embed_last(tokens)  # (rows, T, *hidden), to the next one
             x = torch.cat((x[:, :1], x[:, 1:] + adds[:, :-1]), 1)
@@ -204,7 +207,7 @@ class CausalTransformer(nn.Module):
             x = block(x, memory, layer)
         if memory is not None:
             memory.begin(tokens.shape[1])
-        return self.head(x)
+        return self.products.leave(self.head(x), x, factors)
 
     def empty_memory(self, rows: int) -> KeyValueCache:
         """A history of nothing for ``rows`` rows."""
@@ -219,11 +222,11 @@ class CausalTransformer(nn.Module):
 
     def step(self, token: Tensor, memory: KeyValueCache) -> Tensor:
         """Next token of all envs, ``(rows, F) -> (rows, D)``; advances ``memory``."""
-        x = self.embed(token)
+        x, factors = self.products.enter(self.embed(token), token)
         if self.embed_last is not None:
             x = x + memory.last
             memory.last = stored(memory.last, self.embed_last(token))
         for layer, block in enumerate(self.blocks):
             x = cast(Block, block).step(x, memory, layer)
         memory.advance()
-        return self.head(x)
+        return self.products.leave(self.head(x), x, factors)

@@ -83,7 +83,8 @@ def begin_from(
 
     What the network's inputs mean, their statistics, is part of what it learned, and so is
     a hybrid's gate. The training range is left to be fitted. A transformer may get a longer
-    band: tokens that are new in it count for little at first, see `FAR`.
+    band: tokens that are new in it count for little at first, see `FAR`. A network may get
+    products, which add nothing at first.
 
     Raises:
         ValueError: in one sentence, a configuration of another network, kind or step,
@@ -91,7 +92,7 @@ def begin_from(
             copies do not share, or mirrors that the scene does not have.
     """
     known, asked = start.config, configured_network(config)
-    if known != asked and not _has_longer_band(known, asked):
+    if known != asked and not _is_larger(known, asked):
         raise ValueError(
             f"expected the network of the model to start from, {_named(known)}, "
             f"got {_named(asked)}"
@@ -114,8 +115,12 @@ def begin_from(
     if isinstance(model, HybridNeRD) and isinstance(start, HybridNeRD):
         model.is_gated = start.is_gated
     weights = start.network.state_dict()
+    if asked != known and not any(name.startswith("products.") for name in weights):
+        model.network.products.silence()
     for name, weight in model.network.state_dict().items():
-        if name.endswith("offset_bias"):  # (heads, band)
+        if name not in weights:  # of products
+            weights[name] = weight
+        elif name.endswith("offset_bias"):  # (heads, band)
             new = weight.shape[1] - weights[name].shape[1]
             weights[name] = F.pad(weights[name], (0, new), value=FAR)
     model.network.load_state_dict(weights)
@@ -126,13 +131,14 @@ def begin_from(
     return model
 
 
-def _has_longer_band(known: NetworkConfig, asked: NetworkConfig) -> bool:
-    """Whether ``asked`` is the transformer ``known`` with a longer band."""
-    if not (
-        isinstance(known, TransformerConfig) and isinstance(asked, TransformerConfig)
-    ):
-        return False
-    return known.band < asked.band and known == replace(asked, band=known.band)
+def _is_larger(known: NetworkConfig, asked: NetworkConfig) -> bool:
+    """Whether ``asked`` is ``known``, with a longer band or with products."""
+    if isinstance(known, MLPConfig) and isinstance(asked, MLPConfig):
+        asked = replace(asked, products=asked.products and known.products)
+    elif isinstance(known, TransformerConfig) and isinstance(asked, TransformerConfig):
+        band, products = min(asked.band, known.band), asked.products and known.products
+        asked = replace(asked, band=band, products=products)
+    return known == asked
 
 
 def _of_inputs(first: NeRD, second: NeRD) -> Iterator[tuple[str, Any, Any]]:
