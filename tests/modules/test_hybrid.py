@@ -30,12 +30,13 @@ from torchrl_nerd.training.samples import cover
 from torchrl_nerd.training.start import begin_from
 
 ROWS = 32
+PRODUCTS = "mlp-4x128", "mlp-4x128-products"
 
 
-def fresh(scene, step):
+def fresh(scene, step, network="mlp-2x64"):
     made = make_step(scene, STEPS[step])
     stats = scene_stats(scene)
-    return HybridNeRD(scene, made, NO_PREDICTIONS, NETWORKS["mlp-2x64"], stats)
+    return HybridNeRD(scene, made, NO_PREDICTIONS, NETWORKS[network], stats)
 
 
 def lively(scene, step, generator):
@@ -215,3 +216,11 @@ def test_its_last_layer_is_zero_at_first_and_no_other_is(generator):
     model = fresh(load_scene("double_pendulum"), "penalty-contact")
     linear = [m for m in model.network.modules() if isinstance(m, nn.Linear)]
     assert not linear[-1].weight.any() and all(m.weight.any() for m in linear[:-1])
+
+
+def test_its_products_add_nothing_at_first(generator):
+    scene = load_scene("double_pendulum")
+    rows = random_transitions(scene, ROWS, generator)
+    pair = (fresh(scene, "penalty-contact", name) for name in PRODUCTS)
+    plain, model = (advance(model, rows) for model in pair)
+    assert torch.equal(plain[QVEL], model[QVEL])

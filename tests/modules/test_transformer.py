@@ -17,6 +17,7 @@ CONFIGS = {
     "pairs": TransformerConfig(layers=2, width=16, heads=2, band=4, pairs=True),
     "deep": TransformerConfig(layers=3, width=24, heads=3, band=4),
     "symmetric": TransformerConfig(2, 16, 2, band=4, pairs=True, symmetries=4),
+    "products": TransformerConfig(2, 16, 2, band=4, pairs=True, products=True),
 }
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 each_precision = pytest.mark.parametrize(

@@ -4,7 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from dynamics_helpers import hybrid_model, little_data, random_drive, random_model
+from dynamics_helpers import (
+    enliven,
+    hybrid_model,
+    little_data,
+    random_drive,
+    random_model,
+)
 from torch import Generator
 
 from torchrl_nerd.checkpoint import from_pretrained, load_checkpoint
@@ -145,6 +151,28 @@ def test_a_longer_band_begins_where_the_shorter_one_is(name, generator, monkeypa
     assert (apart[0][4:] > apart[1][4:]).all() and (apart[1] < 1e-4).all()
     with pytest.raises(ValueError, match="from, transformer-2x64@9, got .*2x64@4"):
         begin_from(model, scene, replace(CONFIG, network="transformer-2x64@4"))
+
+
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        ("mlp-4x128", "mlp-4x128-products"),
+        ("transformer-4x128@5", "transformer-4x128-products@5"),
+    ],
+)
+def test_products_add_nothing_at_first(name, asked, generator):
+    initial = random_model(CARTPOLE, generator, name)
+    drive = random_drive(CARTPOLE, 4, 12, generator)
+    config = replace(CONFIG, network=asked)
+    model = begin_from(initial, CARTPOLE, config)
+    model.training_range.load_state_dict(initial.training_range.state_dict())
+    assert torch.equal(path(model, drive), path(initial, drive))
+    enliven(model, generator)
+    again = begin_from(model, CARTPOLE, config)  # those that it has are kept
+    again.training_range.load_state_dict(model.training_range.state_dict())
+    assert torch.equal(path(again, drive), path(model, drive))
+    with pytest.raises(ValueError, match="network of the model to start from"):
+        begin_from(model, CARTPOLE, replace(config, network=name))
 
 
 def test_mirrors_that_some_varied_robots_lack_are_refused(generator):

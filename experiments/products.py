@@ -1,0 +1,98 @@
+"""Networks with and without products of features: errors at equal training.
+
+    python experiments/products.py franka --json results/products_franka.json
+
+Two MLPs of `nerd train` learn a robot from the same data, batches and number of updates.
+One of them also multiplies features, see `torchrl_nerd.modules.products`. Errors are those
+of the robot's protocol: passive or driven test rollouts, means over its horizons.
+"""
+
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from torch import Generator
+
+from torchrl_nerd.data.simulate import simulate
+from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
+from torchrl_nerd.evaluation.results import write_results
+from torchrl_nerd.evaluation.rollout_error import means_by_horizon, passive_errors
+from torchrl_nerd.robots import load_scene, preset_of, source_of
+from torchrl_nerd.training.trainer import Trainer
+
+TEST_SEED, TEST_ROLLOUTS = 500, 256
+
+
+@dataclass
+class Options:
+    """What to train."""
+
+    scene: tyro.conf.Positional[str]
+    network: str = "mlp-4x128"  # alone, and with products
+    seeds: tuple[int, ...] = (0,)
+    trajectories: int = 5000
+    steps: int = 2500
+    """Updates on single steps; a tenth as many on rollouts follow."""
+    json: Path | None = None
+    """Write the results to this file."""
+
+
+def train(options: Options, network: str, seed: int) -> dict[str, Any]:
+    """Train one network and return its errors on test rollouts and the time taken."""
+    scene, preset = load_scene(options.scene), preset_of(options.scene)
+    data = simulate(scene, options.trajectories, 100, Generator().manual_seed(0))
+    config = replace(
+        preset.train,
+        network=network,
+        step=None,
+        steps=options.steps,
+        rollout_steps=options.steps // 10,
+        single_step_fraction=1.0,
+        bf16_fraction=0.0,
+        seed=seed,
+    )
+    protocol = preset.protocol
+    assert protocol is not None, (
+        f"expected a robot with a protocol, got {options.scene}"
+    )
+    horizons = list(protocol.horizons)
+    with tempfile.TemporaryDirectory() as folder:
+        how = {"horizons": tuple(horizons), "quiet": True, "logger": "csv"}
+        source = source_of(scene)
+        trainer = Trainer(scene, data, source, config, Path(folder), **how)
+        began = time.process_time()
+        trainer.run(until=options.steps)
+        seconds = (time.process_time() - began) / options.steps
+        model = trainer.run().eval()
+    weights = sum(x.numel() for x in model.network.parameters())
+    row = {"network": network, "seed": seed, "weights": weights}
+    row |= {"seconds_per_update": seconds}
+    both = NeRDDynamics(model), MujocoDynamics(scene)
+    for case, of_case in protocol.cases.items():
+        about = horizons, TEST_ROLLOUTS, TEST_SEED
+        is_driven = case in protocol.random_actions
+        errors = passive_errors(of_case, *both, *about, random_actions=is_driven)
+        row |= {f"{case}_{key}": x for key, x in means_by_horizon(errors).items()}
+    return row
+
+
+def main(options: Options) -> None:
+    """Train all networks in turns and print, or write, what came of it."""
+    torch.set_num_threads(1)
+    results = []
+    for seed in options.seeds:
+        for network in (options.network, f"{options.network}-products"):
+            results.append(train(options, network, seed))
+            print(results[-1], flush=True)
+    if options.json is not None:
+        about = {"scene": options.scene, "steps": options.steps}
+        about |= {"trajectories": options.trajectories, "test_rollouts": TEST_ROLLOUTS}
+        write_results(options.json, {**about, "rows": results}, TEST_SEED)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
