@@ -501,6 +501,11 @@ def unmet_policies_table(folder: Path = RESULTS) -> str:
     return with_sources(table, records)
 
 
+def percent(share: float) -> str:
+    """With its sign and one digit after the point, or one digit where that is zero."""
+    return f"{100.0 * share:{'+.1f' if abs(share) >= 5e-4 else '+.1g'}}"
+
+
 def own_policies_table(folder: Path = RESULTS) -> str:
     """Models by the returns of policies that learned in them alone."""
     head = "task", "model", "seeds", "return in MuJoCo, promised"
@@ -511,7 +516,7 @@ def own_policies_table(folder: Path = RESULTS) -> str:
         for model in found["models"]:
             about = found["task"], f"{model['model']}, {model['kind']}"
             returns = f"{model['return']:,.0f}, {model['promised']:,.0f}"
-            shares = (f"{100.0 * model[key]:+.1f}" for key in ("difference", "worst"))
+            shares = (percent(model[key]) for key in ("difference", "worst"))
             line = [*about, str(model["policies"]), returns, ", ".join(shares)]
             published = "-" if paper is None else f"{100.0 * paper:+.2g}"
             table.append([*line, published])
