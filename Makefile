@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-franka-mlp model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -279,6 +279,19 @@ model-franka: $(STAMP) ## Franka's transformer: single steps, then data along tw
 		--single-step-fraction 0.85 --bf16-fraction 0 --steps 6000 --rollout-steps 1000 \
 		--lr 0.0015 --adamw-lr 0.0005 --rollout-lr-ratio 0.15 --validate-every 2000
 	cp runs/franka_on/best/* $(PRETRAINED)/franka/
+
+model-franka-mlp: $(STAMP) ## Franka's MLP, with products: the same data, the policies' in a second stage
+	$(NERD) data franka --trajectories 20000 --seed 1 --out datasets/franka_wide
+	for task in reach reach_osc; do \
+		$(NERD) data franka --policy torchrl_nerd/policies/franka-$$task --noise 0.3 \
+			--trajectories 3000 --seed 11 --out datasets/franka_$$task || exit 1; \
+	done
+	$(NERD) train franka --data datasets/franka_wide --threads 1 --out runs/franka_mlp_wide
+	$(NERD) train franka --init-from runs/franka_mlp_wide/last --out runs/franka_mlp_on \
+		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \
+		--lr 0.006 --adamw-lr 0.0018 --rollout-steps 1500 --rollout-lr-ratio 0.15 \
+		--validate-every 1500 --threads 1
+	cp runs/franka_mlp_on/best/* $(PRETRAINED)/franka-mlp/
 
 model-anymal: $(STAMP) ## ANYmal's transformer: single steps; data along a policy did not help
 	$(NERD) data anymal --trajectories 20000 --seed 1 --out datasets/anymal_wide

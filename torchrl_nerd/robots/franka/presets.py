@@ -13,7 +13,7 @@ from torchrl_nerd.robots.franka.tasks import (
 from torchrl_nerd.robots.robot import EvaluationProtocol, Preset, Robot
 
 TRAIN = TrainConfig(
-    network="mlp-4x128",
+    network="mlp-4x128-products",
     steps=12_000,
     rollout_steps=600,
     single_step_fraction=1.0,
@@ -61,7 +61,13 @@ ROBOT = Robot(
         "franka_gravity": Preset(
             EvaluationProtocol({"random": FrankaGravityReachTorque()}, **RANDOM),
             DATA,
-            replace(TRAIN, steps=10_000, rollout_steps=500, validate_every=2_500),
+            replace(
+                TRAIN,
+                network="mlp-4x128",
+                steps=10_000,
+                rollout_steps=500,
+                validate_every=2_500,
+            ),
             task="franka_gravity/reach_torque",
             strategy="correlated",
             variation=VARIATION,
