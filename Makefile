@@ -286,12 +286,12 @@ model-franka-mlp: $(STAMP) ## Franka's MLP, with products: the same data, the po
 		$(NERD) data franka --policy torchrl_nerd/policies/franka-$$task --noise 0.3 \
 			--trajectories 3000 --seed 11 --out datasets/franka_$$task || exit 1; \
 	done
-	$(NERD) train franka --data datasets/franka_wide --threads 1 --out runs/franka_mlp_wide
-	$(NERD) train franka --init-from runs/franka_mlp_wide/last --out runs/franka_mlp_on \
+	$(NERD) train franka --data datasets/franka_wide --threads 1 --out runs/franka_mlp_first
+	$(NERD) train franka --init-from runs/franka_mlp_first/last --out runs/franka_mlp_second \
 		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \
 		--lr 0.006 --adamw-lr 0.0018 --rollout-steps 1500 --rollout-lr-ratio 0.15 \
 		--validate-every 1500 --threads 1
-	cp runs/franka_mlp_on/best/* $(PRETRAINED)/franka-mlp/
+	cp runs/franka_mlp_second/best/* $(PRETRAINED)/franka-mlp/
 
 model-anymal: $(STAMP) ## ANYmal's transformer: single steps; data along a policy did not help
 	$(NERD) data anymal --trajectories 20000 --seed 1 --out datasets/anymal_wide

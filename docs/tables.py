@@ -6,7 +6,7 @@ A page asks for one of `TABLES` by its name in a comment: ``<!-- table: eval -->
 import json
 import re
 from collections.abc import Iterable, Iterator
-from math import inf
+from math import exp, inf, log
 from pathlib import Path
 from typing import Any
 
@@ -635,6 +635,47 @@ def symmetric_layers_table(folder: Path = RESULTS) -> str:
     return with_sources(table, [record])
 
 
+def products_table(folder: Path = RESULTS) -> str:
+    """Errors of networks with and without products of features, by robot."""
+    head = "robot", "motion, steps", "error", "without", "with", "all quantities, ratio"
+    table, records = [[*head, "time of an update"]], read("products", folder)
+    for scene, record in records.items():
+        without, having = with_and_without(record["results"]["rows"])
+        cost = having["seconds_per_update"] / without["seconds_per_update"]
+        longest: dict[tuple[str, int], list[str]] = {}
+        for key in without:
+            if key in ("seed", "weights", "seconds_per_update"):
+                continue
+            motion, _, quantity = key.partition("_")
+            steps = int(quantity.rpartition("_")[2])
+            longest.setdefault((motion, steps), []).append(key)
+        for (motion, steps), keys in sorted(longest.items()):
+            if steps < max(n for m, n in longest if m == motion):
+                continue
+            first = keys[0]
+            logs = [log(having[key] / without[key]) for key in keys]
+            ratio = f"{exp(sum(logs) / len(logs)):.2f}"
+            name = first.removeprefix(f"{motion}_").rpartition("_")[0]
+            errors = number(without[first]), number(having[first])
+            line = [scene, f"{motion}, {steps}", name, *errors, ratio]
+            table.append([*line, f"{cost:.2f}"])
+    return with_sources(table, records.values())
+
+
+def with_and_without(
+    rows: list[dict[str, Any]],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Means over seeds of the first network's rows, and of those of the other one."""
+    by_network: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_network.setdefault(row["network"], []).append(row)
+    means = [
+        {k: sum(r[k] for r in alike) / len(alike) for k in alike[0] if k != "network"}
+        for alike in by_network.values()
+    ]
+    return means[0], means[1]
+
+
 def short_and_long(errors: dict[str, Any], names: list[str], case: str) -> str:
     """Mean errors of the joints (rad) over 20 and 100 steps, the least of some rows."""
     places = [f"{case}, {steps} steps, rad" for steps in (20, 100)]
@@ -680,6 +721,7 @@ TABLES = {
     "network_off": network_off_table,
     "self_contact": self_contact_table,
     "symmetric_layers": symmetric_layers_table,
+    "products": products_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"env_rate": MEASURED, "kinematics_libraries": MEASURED}
@@ -702,6 +744,7 @@ COMMANDS |= {
 COMMANDS |= {"self_contact": "python experiments/self_contact.py --json FILE"}
 LAYERS = "python experiments/symmetric_layers.py --json FILE"
 COMMANDS |= {"symmetric_layers": LAYERS}
+COMMANDS |= {"products": "python experiments/products.py ROBOT --json FILE"}
 COMMANDS |= {"returns": "nerd transfer TASK --json results/transfer_TASK.json"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 

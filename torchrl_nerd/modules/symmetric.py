@@ -81,10 +81,7 @@ def block_product(x: Tensor, weight: Tensor) -> Tensor:
 
 
 class Activation(nn.Module):
-    """A function of the parts, of one hidden vector or of two, in characters.
-
-    An activation function, or a product.
-    """
+    """A function of the parts in characters: an activation, or a product of two."""
 
     signs: Tensor
 
