@@ -139,6 +139,7 @@ NETWORKS: dict[str, NetworkConfig] = {
     **TRANSFORMERS,
     **{f"mlp-{depth}x{width}": MLPConfig(depth, width) for depth, width in MLPS},
     "mlp-4x128-products": MLPConfig(4, 128, products=True),
+    "mlp-4x160-products": MLPConfig(4, 160, products=True),
     "gru": GRUConfig(),
 }
 """Kind, then depth x width; ``adaptive``: a transformer for hidden parameters."""
