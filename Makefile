@@ -290,7 +290,7 @@ model-franka-mlp: $(STAMP) ## Franka's MLP, with products: the same data, the po
 	$(NERD) train franka --init-from runs/franka_mlp_first/last --out runs/franka_mlp_second \
 		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \
 		--lr 0.006 --adamw-lr 0.0018 --rollout-steps 1500 --rollout-lr-ratio 0.15 \
-		--validate-every 1500 --threads 1
+		--validate-every 1500 --save-every 250 --threads 1
 	cp runs/franka_mlp_second/best/* $(PRETRAINED)/franka-mlp/
 
 model-anymal: $(STAMP) ## ANYmal's transformer: single steps; data along a policy did not help

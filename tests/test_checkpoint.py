@@ -229,7 +229,7 @@ def test_nothing_is_ever_unpickled():
 MADE_BY_MAKE = re.findall(r"^model-([\w-]+):", (ROOT / "Makefile").read_text(), re.M)
 
 
-MODELS = ("cartpole", "franka-mlp", "cube-mlp")
+MODELS = ("cartpole", "franka_gravity-mlp", "cube-mlp")
 
 
 @pytest.mark.parametrize("name", MODELS)
