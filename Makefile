@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-franka-mlp model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned data-franka model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-franka-mlp model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -265,27 +265,24 @@ model-cube: $(STAMP) ## the cube's transformer: single steps; rollouts did not h
 		--bf16-fraction 0.7 --loss-eps 0.02 --out runs/cube_wide
 	cp runs/cube_wide/last/* $(PRETRAINED)/cube/
 
-model-franka: $(STAMP) ## Franka's transformer: single steps, then data along two policies
+data-franka: $(STAMP)
 	$(NERD) data franka --trajectories 20000 --seed 1 --out datasets/franka_wide
+	$(NERD) data franka --policy torchrl_nerd/policies/franka-reach --noise 0.3 \
+		--trajectories 3000 --seed 11 --out datasets/franka_reach
+	$(NERD) data franka --policy torchrl_nerd/policies/franka-reach_osc --noise 0.3 \
+		--trajectories 3000 --seed 11 --out datasets/franka_reach_osc
+
+model-franka: data-franka ## Franka's transformer: single steps, then data along two policies
 	$(NERD) train franka --data datasets/franka_wide $(WIDE) --steps 16900 \
 		--bf16-fraction 0 --out runs/franka_wide
 	$(NERD) data franka --trajectories 10000 --seed 1 --out datasets/franka_on
-	for task in reach reach_osc; do \
-		$(NERD) data franka --policy torchrl_nerd/policies/franka-$$task --noise 0.3 \
-			--trajectories 3000 --seed 11 --out datasets/franka_$$task || exit 1; \
-	done
 	$(NERD) train franka --init-from runs/franka_wide/last $(SECOND) --out runs/franka_on \
 		--data datasets/franka_on datasets/franka_reach datasets/franka_reach_osc \
 		--single-step-fraction 0.85 --bf16-fraction 0 --steps 6000 --rollout-steps 1000 \
 		--lr 0.0015 --adamw-lr 0.0005 --rollout-lr-ratio 0.15 --validate-every 2000
 	cp runs/franka_on/best/* $(PRETRAINED)/franka/
 
-model-franka-mlp: $(STAMP) ## Franka's MLP, with products: the same data, the policies' in a second stage
-	$(NERD) data franka --trajectories 20000 --seed 1 --out datasets/franka_wide
-	for task in reach reach_osc; do \
-		$(NERD) data franka --policy torchrl_nerd/policies/franka-$$task --noise 0.3 \
-			--trajectories 3000 --seed 11 --out datasets/franka_$$task || exit 1; \
-	done
+model-franka-mlp: data-franka ## Franka's MLP, with products: the same data, the policies' in a second stage
 	$(NERD) train franka --data datasets/franka_wide --threads 1 --out runs/franka_mlp_first
 	$(NERD) train franka --init-from runs/franka_mlp_first/last --out runs/franka_mlp_second \
 		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \

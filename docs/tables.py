@@ -642,23 +642,21 @@ def products_table(folder: Path = RESULTS) -> str:
     for scene, record in records.items():
         without, having = with_and_without(record["results"]["rows"])
         cost = having["seconds_per_update"] / without["seconds_per_update"]
-        longest: dict[tuple[str, int], list[str]] = {}
-        for key in without:
-            if key in ("seed", "weights", "seconds_per_update"):
-                continue
-            motion, _, quantity = key.partition("_")
-            steps = int(quantity.rpartition("_")[2])
-            longest.setdefault((motion, steps), []).append(key)
-        for (motion, steps), keys in sorted(longest.items()):
-            if steps < max(n for m, n in longest if m == motion):
-                continue
-            first = keys[0]
-            logs = [log(having[key] / without[key]) for key in keys]
-            ratio = f"{exp(sum(logs) / len(logs)):.2f}"
-            name = first.removeprefix(f"{motion}_").rpartition("_")[0]
-            errors = number(without[first]), number(having[first])
-            line = [scene, f"{motion}, {steps}", name, *errors, ratio]
-            table.append([*line, f"{cost:.2f}"])
+        others = "seed", "weights", "seconds_per_update"
+        parts = [key.split("_", 1) for key in without if key not in others]
+        last = max(int(what.rpartition("_")[2]) for _, what in parts)
+        by_motion: dict[str, list[str]] = {}
+        for motion, what in parts:
+            if what.endswith(f"_{last}"):
+                by_motion.setdefault(motion, []).append(what)
+        for motion, names in by_motion.items():
+            pairs = [(without[f"{motion}_{x}"], having[f"{motion}_{x}"]) for x in names]
+            ratio = exp(
+                sum(log(after / before) for before, after in pairs) / len(pairs)
+            )
+            errors = [number(x) for x in pairs[0]]
+            line = [scene, f"{motion}, {last}", names[0].removesuffix(f"_{last}")]
+            table.append([*line, *errors, f"{ratio:.2f}", f"{cost:.2f}"])
     return with_sources(table, records.values())
 
 

@@ -7,24 +7,19 @@ One of them also multiplies features, see `torchrl_nerd.modules.products`. Error
 of the robot's protocol: passive or driven test rollouts, means over its horizons.
 """
 
-import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
-from torch import Generator
+from symmetric_layers import TEST_SEED, trained, write
 
-from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
-from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import means_by_horizon, passive_errors
-from torchrl_nerd.robots import load_scene, preset_of, source_of
-from torchrl_nerd.training.trainer import Trainer
+from torchrl_nerd.robots import load_scene, preset_of
 
-TEST_SEED, TEST_ROLLOUTS = 500, 256
+TEST_ROLLOUTS = 256
 
 
 @dataclass
@@ -44,7 +39,6 @@ class Options:
 def train(options: Options, network: str, seed: int) -> dict[str, Any]:
     """Train one network and return its errors on test rollouts and the time taken."""
     scene, preset = load_scene(options.scene), preset_of(options.scene)
-    data = simulate(scene, options.trajectories, 100, Generator().manual_seed(0))
     config = replace(
         preset.train,
         network=network,
@@ -59,23 +53,13 @@ def train(options: Options, network: str, seed: int) -> dict[str, Any]:
     assert protocol is not None, (
         f"expected a robot with a protocol, got {options.scene}"
     )
-    horizons = list(protocol.horizons)
-    with tempfile.TemporaryDirectory() as folder:
-        how = {"horizons": tuple(horizons), "quiet": True, "logger": "csv"}
-        source = source_of(scene)
-        trainer = Trainer(scene, data, source, config, Path(folder), **how)
-        began = time.process_time()
-        trainer.run(until=options.steps)
-        seconds = (time.process_time() - began) / options.steps
-        model = trainer.run().eval()
-    weights = sum(x.numel() for x in model.network.parameters())
-    row = {"network": network, "seed": seed, "weights": weights}
-    row |= {"seconds_per_update": seconds}
+    model, about = trained(scene, config, options.trajectories, protocol.horizons)
+    row = {"network": network, "seed": seed, **about}
     both = NeRDDynamics(model), MujocoDynamics(scene)
     for case, of_case in protocol.cases.items():
-        about = horizons, TEST_ROLLOUTS, TEST_SEED
+        how = list(protocol.horizons), TEST_ROLLOUTS, TEST_SEED
         is_driven = case in protocol.random_actions
-        errors = passive_errors(of_case, *both, *about, random_actions=is_driven)
+        errors = passive_errors(of_case, *both, *how, random_actions=is_driven)
         row |= {f"{case}_{key}": x for key, x in means_by_horizon(errors).items()}
     return row
 
@@ -88,10 +72,7 @@ def main(options: Options) -> None:
         for network in (options.network, f"{options.network}-products"):
             results.append(train(options, network, seed))
             print(results[-1], flush=True)
-    if options.json is not None:
-        about = {"scene": options.scene, "steps": options.steps}
-        about |= {"trajectories": options.trajectories, "test_rollouts": TEST_ROLLOUTS}
-        write_results(options.json, {**about, "rows": results}, TEST_SEED)
+    write(options, results, TEST_ROLLOUTS)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,9 @@ from torchrl_nerd.data.simulate import simulate
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.evaluation.rollout_error import means_by_horizon, passive_errors
+from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.robots import load_scene, preset_of, source_of
+from torchrl_nerd.scenes import Scene
 from torchrl_nerd.training.trainer import Trainer
 
 HORIZONS: tuple[int, ...] = (100, 500)  # control steps
@@ -45,11 +47,25 @@ class Options:
     """Write the results to this file."""
 
 
+def trained(
+    scene: Scene, config: TrainConfig, trajectories: int, horizons: tuple[int, ...]
+) -> tuple[NeRD, dict[str, Any]]:
+    """A model, its number of weights and the time of an update on single steps."""
+    data = simulate(scene, trajectories, 100, Generator().manual_seed(0))
+    with tempfile.TemporaryDirectory() as folder:
+        how = {"horizons": horizons, "quiet": True, "logger": "csv"}
+        trainer = Trainer(scene, data, source_of(scene), config, Path(folder), **how)
+        began = time.process_time()
+        trainer.run(until=config.steps)
+        seconds = (time.process_time() - began) / config.steps
+        model = trainer.run().eval()
+    weights = sum(x.numel() for x in model.network.parameters())
+    return model, {"weights": weights, "seconds_per_update": seconds}
+
+
 def train(options: Options, network: str, symmetries: int, seed: int) -> dict[str, Any]:
     """Train one network and return its errors on test rollouts and the time taken."""
     scene = load_scene(options.scene)
-    source = source_of(scene)
-    data = simulate(scene, options.trajectories, 100, Generator().manual_seed(0))
     preset = preset_of(options.scene).train
     config = TrainConfig(
         network=network,
@@ -63,19 +79,12 @@ def train(options: Options, network: str, symmetries: int, seed: int) -> dict[st
         single_step_fraction=1.0,
         seed=seed,
     )
-    with tempfile.TemporaryDirectory() as folder:
-        how = {"horizons": HORIZONS, "quiet": True, "logger": "csv"}
-        trainer = Trainer(scene, data, source, config, Path(folder), **how)
-        began = time.process_time()
-        trainer.run(until=options.steps)
-        seconds = (time.process_time() - began) / options.steps
-        model = trainer.run().eval()
-    about = list(HORIZONS), TEST_ROLLOUTS, TEST_SEED
+    model, about = trained(scene, config, options.trajectories, HORIZONS)
     both = NeRDDynamics(model), MujocoDynamics(scene)
-    errors = means_by_horizon(passive_errors(source, *both, *about))
-    weights = sum(x.numel() for x in model.network.parameters())
+    how = list(HORIZONS), TEST_ROLLOUTS, TEST_SEED
+    errors = means_by_horizon(passive_errors(source_of(scene), *both, *how))
     named = {"network": network, "symmetries": symmetries, "seed": seed}
-    return {**named, "weights": weights, "seconds_per_update": seconds, **errors}
+    return {**named, **about, **errors}
 
 
 def main(options: Options) -> None:
@@ -86,10 +95,15 @@ def main(options: Options) -> None:
         for network, symmetries in NETWORKS:
             results.append(train(options, network, symmetries, seed))
             print(results[-1], flush=True)
+    write(options, results, TEST_ROLLOUTS)
+
+
+def write(options: Any, rows: list[dict[str, Any]], rollouts: int) -> None:
+    """Write the rows to ``options.json``, if there is one, with what they depend on."""
     if options.json is not None:
-        about = {"scene": options.scene, "steps": options.steps}
-        about |= {"trajectories": options.trajectories, "test_rollouts": TEST_ROLLOUTS}
-        write_results(options.json, {**about, "rows": results}, TEST_SEED)
+        about = {name: getattr(options, name) for name in ("scene", "steps")}
+        about |= {"trajectories": options.trajectories, "test_rollouts": rollouts}
+        write_results(options.json, {**about, "rows": rows}, TEST_SEED)
 
 
 if __name__ == "__main__":
