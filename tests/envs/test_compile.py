@@ -50,16 +50,18 @@ def path(env: SceneEnv, actions: torch.Tensor) -> list[TensorDictBase]:
 def test_its_pieces_are_the_eager_steps(task_id, generator):
     """Traced, and run as they were traced: every bit is the same.
 
-    But of a linear solve, whose last bits depend on where its operands lie in memory.
+    But of robots with legs, whose contact points traced code finds by sums in another
+    order, and of a linear solve, whose last bits depend on where its operands lie.
     """
-    solves = task_id == "franka/reach_osc"
     maker = EnvMaker(task_id, "streaming", generator)
+    sums = 1e-13 * task_id.startswith(("ant", "anymal"))
+    solves = 1e-9 * (task_id == "franka/reach_osc")
     eager, traced = maker(ROWS), maker(ROWS)
     traced.compile(backend="eager", fullgraph=True)
     actions = random_actions(eager, STEPS, generator)
     for one, other in zip(path(eager, actions), path(traced, actions), strict=True):
         assert set(one.keys()) == set(other.keys())
-        bound = {"atol": 1e-9 * solves, "rtol": 0.0}
+        bound = {"atol": sums + solves, "rtol": sums}
         torch.testing.assert_close(one, other, **bound)
 
 
