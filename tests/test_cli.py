@@ -225,6 +225,11 @@ def test_a_dry_run_refuses_what_the_run_would(command, capsys):
         ("transfer cartpole/swingup --dynamics nowhere", "'nowhere'"),
         ("play cartpole/swingup --dynamics nowhere", "'nowhere'"),
         ("finetune cube --from {log} --update head", "expected update 'physics'"),
+        ("finetune cube --from {log} --batch-size 8", "expected no --batch-size for"),
+        (
+            "finetune cube --from {log} --model cube_real-mlp --evaluations 2",
+            "expected no --evaluations for",
+        ),
         ("bench unicorn", "'unicorn'"),
         ("bench cartpole --steps 0", "expected steps of at least 1, got 0"),
         ("stability unicorn", "'unicorn'"),

@@ -146,6 +146,17 @@ def test_the_terminal_observation_survives_the_automatic_reset(dynamics, generat
     )
 
 
+def test_a_step_before_the_first_reset_is_refused(generator):
+    env = EnvMaker(TASK, "streaming", generator)()
+    step = env.rand_action()
+    with pytest.raises(RuntimeError, match=r"expected reset\(\) before"):
+        env.step(step)
+    other = EnvMaker(TASK, "streaming", generator)()
+    other.reset()
+    env.load_state_dict(other.state_dict())
+    env.step(step)  # a restored one goes on
+
+
 def test_wrong_action_shape_is_refused_in_one_sentence(generator):
     env = EnvMaker(TASK, "mujoco", generator)(3)
     env.reset()
@@ -193,4 +204,5 @@ def test_bad_arguments_are_refused_in_one_sentence(generator):
 def test_make_env_takes_a_task_object_and_a_model(inference, generator):
     model = random_model(make_task(TASK).scene, generator, "mlp-4x64")
     env = NeRDEnv(make_task(TASK), model, 2, inference=inference)
+    env.reset()
     assert act(env, torch.zeros(env.action_spec.shape)).batch_size == (2,)

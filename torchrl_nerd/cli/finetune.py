@@ -17,7 +17,12 @@ from torchrl_nerd.data.log_files import load_recording
 from torchrl_nerd.data.recorded import Recording
 from torchrl_nerd.dynamics import Model
 from torchrl_nerd.files import check_writable, folder_name, read_json, write_json
+from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.finetune import ANALYTIC, FineTuner, start_model
+
+OF_PHYSICS = ("evaluations",)  # settings that the other kind of training ignores
+OF_NETWORKS = ("epochs", "batch_size", "sequence_length", "short_history_fraction")
+OF_NETWORKS = (*OF_NETWORKS, "lr", "clip", "validate_every", "patience")
 
 
 @dataclass(frozen=True)
@@ -49,14 +54,25 @@ class Finetune(DeviceCommand):
     def inputs(self) -> tuple[Recording, dict[str, Tensor], Model]:
         """The log, its trajectories for each purpose, and the model to begin with.
 
-        Raises ValueError for a folder that holds a model or cannot be written.
+        Raises ValueError for a folder that holds a model or cannot be written, and for
+        options that this kind of model does not use.
         """
         scene, out = recorded_scene(self.scene), self.folder
         if (out / CARD).exists():
             raise ValueError(f"{out} already holds a model: choose another --out")
         check_writable(out / CARD)
         recording, split = load_recording(self.recorded, scene)
-        return recording, split, start_model(scene, self.model).to(self.device)
+        model = start_model(scene, self.model).to(self.device)
+        self._refuse_unused(isinstance(model, FreeBodyPenaltyStep))
+        return recording, split, model
+
+    def _refuse_unused(self, is_fit: bool) -> None:
+        unused, default = OF_NETWORKS if is_fit else OF_PHYSICS, FinetuneConfig()
+        changed = [x for x in unused if getattr(self.config, x) != getattr(default, x)]
+        if changed:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
+            what = "physical parameters, whose fit" if is_fit else "a network, which"
+            raise SettingError(f"expected no {options} for {what} does not use them")
 
     def plan(self) -> list[str]:
         """How many trajectories there are to learn from, once they pass the checks."""

@@ -99,7 +99,8 @@ class SceneEnv(RenderedEnv):
         self.register_buffer("_episode", zeros.long())
         self.register_buffer("_age", zeros.long())
         for key, size in self._state_sizes.items():  # (num_envs, size) each
-            self.register_buffer(f"_state_{key}", zeros[:, None].repeat(1, size))
+            unset = zeros[:, None].repeat(1, size) * torch.nan  # until the first reset
+            self.register_buffer(f"_state_{key}", unset)
         drawn = task.num_uniforms + self._state_sizes.get(PARAMETERS, 0)
         offsets = stream_offsets(drawn, self.device)
         self.register_buffer("_offsets", offsets, persistent=False)
@@ -243,21 +244,20 @@ class SceneEnv(RenderedEnv):
 
     @unaffected
     def warm_up(self, history: TensorDictBase) -> None:
-        """Show the dynamics a recorded motion up to the present state.
-
-        See `Transition.warm_up`.
-        """
+        """Show the dynamics a recorded past, see `Transition.warm_up`."""
         self._transition.warm_up(history, self.batch_size.numel())
 
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict[ACTION]
-        if action.shape != self.action_spec.shape:
-            raise ValueError(
-                f"expected an action of shape {tuple(self.action_spec.shape)}, "
-                f"got {tuple(action.shape)}"
-            )
         state, moves = self._state(), tensordict.get("_step", None)
+        if not self._shown and state[QPOS].isnan().any():
+            raise RuntimeError("expected reset() before the first step")
+        action, expected = tensordict[ACTION], self.action_spec.shape
+        if action.shape != expected:
+            got = tuple(action.shape)
+            raise ValueError(
+                f"expected an action of shape {tuple(expected)}, got {got}"
+            )
         held = None if moves is None else ~moves.reshape(self.batch_size)
         past = None if held is None else self.dynamics.history()
         with self._gradients():
