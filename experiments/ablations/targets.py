@@ -39,6 +39,10 @@ class PlainDelta(StateDelta):
         residual = moved - self.trapezoid(qpos, qvel, change)
         return super().integrate(qpos, qvel, torch.cat((change, residual), -1), limit)
 
+    def error_weights(self, std: Tensor) -> Tensor:
+        """All alike."""
+        return torch.ones_like(std)
+
     def trapezoid(self, qpos: Tensor, qvel: Tensor, change: Tensor) -> Tensor:
         """What the rule moves a robot by whose velocity changes so, in B_t."""
         return self.step_size * (self.in_base(qpos, qvel) + 0.5 * change)

@@ -80,14 +80,15 @@ def test_errors_are_relative_lengths(rng):
     pair = torch.from_numpy(outputs), torch.from_numpy(targets)
     errors = relative_error(pair[0] - pair[1], torch.from_numpy(size), loss_eps)
     np.testing.assert_allclose(errors.numpy(), expected, rtol=1e-5, atol=1e-4)
-    loss = one_step_loss(*pair, loss_eps)
+    loss = one_step_loss(*pair, torch.ones(3), loss_eps)
     np.testing.assert_allclose(float(loss), expected.mean(), rtol=1e-5, atol=1e-4)
 
 
 def test_predicting_no_change_costs_less_than_one(generator):
     targets = torch.randn(9, 7, 4, generator=generator).double()
-    assert 0.9 < one_step_loss(0.0 * targets, targets, 1e-3) < 1.0
-    assert one_step_loss(targets, targets, 1e-3) < 2e-4
+    weights = torch.tensor([1.0, 1.0, 0.1, 0.2])
+    assert 0.9 < one_step_loss(0.0 * targets, targets, weights, 1e-3) < 1.0
+    assert one_step_loss(targets, targets, weights, 1e-3) < 2e-4
 
 
 @every_scene

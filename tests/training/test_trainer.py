@@ -67,7 +67,8 @@ def loss_of(trainer: Trainer, seed: int) -> float:
     inputs, targets = trainer.sequences.one_step(256, 8, generator)
     with torch.no_grad():
         output = trainer.model.network(inputs.token)
-        return float(one_step_loss(inputs.change(output), targets, 0.01))
+        change = inputs.change(output)
+        return float(one_step_loss(change, targets, trainer.weights, 0.01))
 
 
 @pytest.mark.parametrize(("name", "network"), slow_but(CASES[:2], CASES))

@@ -40,6 +40,26 @@ def test_integrating_returns_the_next_state(scene, generator):
 
 
 @every_scene
+def test_errors_of_positions_weigh_as_speeds(scene, generator):
+    """As far as one moves the robot in a control step, and never more than a velocity."""
+    rows, transform = random_transitions(scene, ROWS, generator), StateDelta(scene)
+    nv, step = scene.model.nv, scene.control_step
+    speed, distance = 1e-3 * torch.rand(2, generator=generator).double() + 1e-5
+    std = torch.cat((speed.expand(nv), (step * distance).expand(nv)))
+    error = torch.randn(ROWS, 2 * nv, generator=generator).double()
+    error[:, :nv] = 0.0
+    states, delta = (rows[QPOS], rows[QVEL]), delta_of(scene, rows)
+    ends = (transform.integrate(*states, x)[0] for x in (delta, delta + std * error))
+    moved = differentiate_pos(scene.layout, *ends)
+    expected = moved.norm(dim=-1) / (step * speed)
+    weights = transform.error_weights(std)
+    bound = min(1.0, float(speed / distance))  # where a position would weigh more
+    found = (weights * error).norm(dim=-1) / bound
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0.0)
+    assert weights.max() == 1.0
+
+
+@every_scene
 def test_any_two_states_are_a_change_apart(scene, rng):
     """Even far from each other: turns of up to half a circle."""
     transform = StateDelta(scene)

@@ -26,14 +26,17 @@ def relative_error(errors: Tensor, size: Tensor, loss_eps: float) -> Tensor:
     return (square + RESOLUTION**2).sqrt()
 
 
-def one_step_loss(outputs: Tensor, targets: Tensor, loss_eps: float) -> Tensor:
+def one_step_loss(
+    outputs: Tensor, targets: Tensor, weights: Tensor, loss_eps: float
+) -> Tensor:
     """Mean relative error of targets ``(*batch, D)``, for the square of NeRD eq. 2.
 
     Random torques set the scale of targets; without the division the quiet motions that
-    decide a passive rollout vanish beside the violent ones.
+    decide a passive rollout vanish beside the violent ones. ``weights (D,)`` measure
+    positions as `rollout_loss` does, see `StateDelta.error_weights`.
     """
-    size = targets.square().mean(-1)
-    return relative_error(outputs - targets, size, loss_eps).mean()
+    size = (weights * targets).square().mean(-1)
+    return relative_error(weights * (outputs - targets), size, loss_eps).mean()
 
 
 def rollout_loss(

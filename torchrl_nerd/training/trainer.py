@@ -24,7 +24,7 @@ from torchrl_nerd.evaluation.rollout_error import (
 )
 from torchrl_nerd.files import check_writable, read_json, write_json
 from torchrl_nerd.modules.linear import in_bfloat16
-from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.nerd import TARGET, NeRD
 from torchrl_nerd.robots import Source
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.seeds import fold_in
@@ -97,10 +97,9 @@ class Trainer:
         init_from: NeRD | None = None,
         compile: bool = False,
     ) -> None:
-        if data.batch_size[1] < config.longest:
+        if (steps := data.batch_size[1]) < (least := config.longest):
             raise ValueError(
-                f"expected trajectories of at least {config.longest} steps, "
-                f"got {data.batch_size[1]}"
+                f"expected trajectories of at least {least} steps, got {steps}"
             )
         self.scene, self.source, self.config = scene, source, config
         check_writable(folder / STATE)
@@ -146,7 +145,8 @@ class Trainer:
         else:
             model = begin_from(init_from, self.scene, self.config, symmetry)
             self.init_from = fingerprint(init_from)
-        self.model = model.to(self.device)
+        self.model, delta = model.to(self.device), model.state_delta
+        self.weights = delta.error_weights(model.normalize.std(TARGET)).float()
         symmetry = symmetry and symmetry.to(self.device)
         shown = symmetry if self.config.use_symmetry else None
         self.sequences, self.rest = Sequences(model, data, shown), rest_of(data)
@@ -217,7 +217,7 @@ class Trainer:
         """Loss of a batch of sequences."""
         inputs, targets = Inputs(*batch[:-1]), batch[-1]
         changes = inputs.change(self.model.network(inputs.token).float())
-        return one_step_loss(changes, targets, self.config.loss_eps)
+        return one_step_loss(changes, targets, self.weights, self.config.loss_eps)
 
     def _rollout(self, *batch: Any) -> Tensor:
         """Loss of the model's own rollouts."""

@@ -63,6 +63,16 @@ class StateDelta(Transform):
         """Width of ``state_delta``."""
         return 2 * self.layout.nv
 
+    def error_weights(self, std: Tensor) -> Tensor:
+        """Weights ``(2 nv,)`` of errors in standard deviations, so that all are speeds.
+
+        1 of a velocity. A position's error counts as the velocity that makes it in one
+        control step h, at most 1: std(position) / (h std(velocity)).
+        """
+        velocity, position = std.split(self.layout.nv)
+        share = position / (self.step_size * velocity)
+        return torch.cat((torch.ones_like(share), share.clamp_max(1.0)))
+
     def delta(
         self, qpos: Tensor, qvel: Tensor, next_qpos: Tensor, next_qvel: Tensor
     ) -> Tensor:
