@@ -15,9 +15,12 @@ import torch
 import tyro
 from symmetric_layers import TEST_SEED, trained, write
 
+from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.dynamics import MujocoDynamics, NeRDDynamics
 from torchrl_nerd.evaluation.rollout_error import means_by_horizon, passive_errors
-from torchrl_nerd.robots import load_scene, preset_of
+from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.robots import load_scene, preset_of, protocol_of
+from torchrl_nerd.scenes import Scene
 
 TEST_ROLLOUTS = 256
 
@@ -36,8 +39,10 @@ class Options:
     """Write the results to this file."""
 
 
-def train(options: Options, network: str, seed: int) -> dict[str, Any]:
-    """Train one network and return its errors on test rollouts and the time taken."""
+def settings(
+    options: Any, network: str, seed: int
+) -> tuple[Scene, TrainConfig, tuple[int, ...]]:
+    """The robot, how it is learned, and the horizons of its protocol."""
     scene, preset = load_scene(options.scene), preset_of(options.scene)
     config = replace(
         preset.train,
@@ -49,19 +54,27 @@ def train(options: Options, network: str, seed: int) -> dict[str, Any]:
         bf16_fraction=0.0,
         seed=seed,
     )
-    protocol = preset.protocol
-    assert protocol is not None, (
-        f"expected a robot with a protocol, got {options.scene}"
-    )
-    model, about = trained(scene, config, options.trajectories, protocol.horizons)
-    row = {"network": network, "seed": seed, **about}
-    both = NeRDDynamics(model), MujocoDynamics(scene)
+    return scene, config, protocol_of(scene).horizons
+
+
+def errors_of(model: NeRD) -> dict[str, float]:
+    """Mean errors on the test rollouts of a robot's protocol, by case and horizon."""
+    protocol, found = protocol_of(model.scene), {}
+    both = NeRDDynamics(model), MujocoDynamics(model.scene)
     for case, of_case in protocol.cases.items():
         how = list(protocol.horizons), TEST_ROLLOUTS, TEST_SEED
         is_driven = case in protocol.random_actions
         errors = passive_errors(of_case, *both, *how, random_actions=is_driven)
-        row |= {f"{case}_{key}": x for key, x in means_by_horizon(errors).items()}
-    return row
+        found |= {f"{case}_{key}": x for key, x in means_by_horizon(errors).items()}
+    return found
+
+
+def train(options: Options, network: str, seed: int) -> dict[str, Any]:
+    """Train one network and return its errors on test rollouts and the time taken."""
+    scene, config, horizons = settings(options, network, seed)
+    model, about = trained(scene, config, options.trajectories, horizons)
+    row = {"network": network, "seed": seed, **about}
+    return row | errors_of(model)
 
 
 def main(options: Options) -> None:

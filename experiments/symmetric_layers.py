@@ -48,13 +48,17 @@ class Options:
 
 
 def trained(
-    scene: Scene, config: TrainConfig, trajectories: int, horizons: tuple[int, ...]
+    scene: Scene,
+    config: TrainConfig,
+    trajectories: int,
+    horizons: tuple[int, ...],
+    make: type[Trainer] = Trainer,
 ) -> tuple[NeRD, dict[str, Any]]:
     """A model, its number of weights and the time of an update on single steps."""
     data = simulate(scene, trajectories, 100, Generator().manual_seed(0))
     with tempfile.TemporaryDirectory() as folder:
         how = {"horizons": horizons, "quiet": True, "logger": "csv"}
-        trainer = Trainer(scene, data, source_of(scene), config, Path(folder), **how)
+        trainer = make(scene, data, source_of(scene), config, Path(folder), **how)
         began = time.process_time()
         trainer.run(until=config.steps)
         seconds = (time.process_time() - began) / config.steps
