@@ -637,10 +637,20 @@ def symmetric_layers_table(folder: Path = RESULTS) -> str:
 
 def products_table(folder: Path = RESULTS) -> str:
     """Errors of networks with and without products of features, by robot."""
-    head = "robot", "motion, steps", "error", "without", "with", "all quantities, ratio"
-    table, records = [[*head, "time of an update"]], read("products", folder)
+    return pairs_table(folder, "products", "network", ("without", "with"))
+
+
+def loss_weights_table(folder: Path = RESULTS) -> str:
+    """Errors of networks whose loss weighs positions as speeds, or all alike, by robot."""
+    return pairs_table(folder, "loss_weights", "positions", ("alike", "as speeds"))
+
+
+def pairs_table(folder: Path, name: str, differs: str, shown: tuple[str, str]) -> str:
+    """Errors of two trainings of each robot, whose rows differ in one entry."""
+    head = "robot", "motion, steps", "error", *shown, "all quantities, ratio"
+    table, records = [[*head, "time of an update"]], read(name, folder)
     for scene, record in records.items():
-        without, having = with_and_without(record["results"]["rows"])
+        without, having = means_of_two(record["results"]["rows"], differs)
         cost = having["seconds_per_update"] / without["seconds_per_update"]
         others = "seed", "weights", "seconds_per_update"
         parts = [key.split("_", 1) for key in without if key not in others]
@@ -660,16 +670,20 @@ def products_table(folder: Path = RESULTS) -> str:
     return with_sources(table, records.values())
 
 
-def with_and_without(
-    rows: list[dict[str, Any]],
+def means_of_two(
+    rows: list[dict[str, Any]], differs: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Means over seeds of the first network's rows, and of those of the other one."""
-    by_network: dict[str, list[dict[str, Any]]] = {}
+    """Means over seeds of rows like the first one, and of all others."""
+    groups: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        by_network.setdefault(row["network"], []).append(row)
+        groups.setdefault(row[differs], []).append(row)
     means = [
-        {k: sum(r[k] for r in alike) / len(alike) for k in alike[0] if k != "network"}
-        for alike in by_network.values()
+        {
+            key: sum(row[key] for row in alike) / len(alike)
+            for key, value in alike[0].items()
+            if not isinstance(value, str)
+        }
+        for alike in groups.values()
     ]
     return means[0], means[1]
 
@@ -720,6 +734,7 @@ TABLES = {
     "self_contact": self_contact_table,
     "symmetric_layers": symmetric_layers_table,
     "products": products_table,
+    "loss_weights": loss_weights_table,
 }
 MEASURED = "python benchmarks/{0}.py --json results/{0}.json"
 COMMANDS = {"env_rate": MEASURED, "kinematics_libraries": MEASURED}
@@ -743,6 +758,7 @@ COMMANDS |= {"self_contact": "python experiments/self_contact.py --json FILE"}
 LAYERS = "python experiments/symmetric_layers.py --json FILE"
 COMMANDS |= {"symmetric_layers": LAYERS}
 COMMANDS |= {"products": "python experiments/products.py ROBOT --json FILE"}
+COMMANDS |= {"loss_weights": "python experiments/loss_weights.py ROBOT --json FILE"}
 COMMANDS |= {"returns": "nerd transfer TASK --json results/transfer_TASK.json"}
 COMMAND = "nerd {0} ROBOT --json results/{0}_ROBOT.json"
 
