@@ -41,6 +41,7 @@ def move_to_meta(trainer: Trainer) -> None:
     trainer.device = META
     trainer.lr_ratio, trainer.ema_share = (torch.ones((), device=META) for _ in "12")
     trainer.model.to(META)
+    trainer.weights = trainer.weights.to(META)
     trainer.optimizers = trainer.make_optimizers()
     trainer.average = {k: v.to(META) for k, v in trainer.average.items()}
     sequences = trainer.sequences
