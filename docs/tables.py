@@ -650,23 +650,19 @@ def pairs_table(folder: Path, name: str, differs: str, shown: tuple[str, str]) -
     head = "robot", "motion, steps", "error", *shown, "all quantities, ratio"
     table, records = [[*head, "time of an update"]], read(name, folder)
     for scene, record in records.items():
-        without, having = means_of_two(record["results"]["rows"], differs)
-        cost = having["seconds_per_update"] / without["seconds_per_update"]
+        first, second = means_of_two(record["results"]["rows"], differs)
+        cost = second["seconds_per_update"] / first["seconds_per_update"]
         others = "seed", "weights", "seconds_per_update"
-        parts = [key.split("_", 1) for key in without if key not in others]
-        last = max(int(what.rpartition("_")[2]) for _, what in parts)
-        by_motion: dict[str, list[str]] = {}
-        for motion, what in parts:
-            if what.endswith(f"_{last}"):
-                by_motion.setdefault(motion, []).append(what)
-        for motion, names in by_motion.items():
-            pairs = [(without[f"{motion}_{x}"], having[f"{motion}_{x}"]) for x in names]
-            ratio = exp(
-                sum(log(after / before) for before, after in pairs) / len(pairs)
-            )
-            errors = [number(x) for x in pairs[0]]
-            line = [scene, f"{motion}, {last}", names[0].removesuffix(f"_{last}")]
-            table.append([*line, *errors, f"{ratio:.2f}", f"{cost:.2f}"])
+        groups: dict[str, list[str]] = {}
+        for key in (key for key in first if key not in others):
+            motion, steps = key.partition("_")[0], key.rpartition("_")[2]
+            groups.setdefault(f"{motion}, {steps}", []).append(key)
+        for group, keys in groups.items():
+            logs = [log(second[key] / first[key]) for key in keys]
+            ratio = exp(sum(logs) / len(logs))
+            what = keys[0].partition("_")[2].rpartition("_")[0]
+            errors = number(first[keys[0]]), number(second[keys[0]])
+            table.append([scene, group, what, *errors, f"{ratio:.2f}", f"{cost:.2f}"])
     return with_sources(table, records.values())
 
 
