@@ -307,7 +307,11 @@ model-double_pendulum: $(STAMP) ## the double pendulum's transformer: single ste
 	$(NERD) train double_pendulum --init-from runs/pendulum_wide/last $(SECOND) $(PENDULUM) \
 		--data datasets/pendulum_on --lr 0.004 --adamw-lr 0.0012 --steps 0 \
 		--rollout-steps 2000 --rollout-lr-ratio 0.06 --validate-every 500 --out runs/pendulum_on
-	cp runs/pendulum_on/best/* $(PRETRAINED)/double_pendulum/
+	$(NERD) train double_pendulum --init-from runs/pendulum_on/best $(PENDULUM) \
+		--data datasets/pendulum_on --lr 0.004 --adamw-lr 0.0012 --single-step-fraction 0.75 \
+		--steps 10000 --rollout-steps 2500 --rollout-lr-ratio 0.15 --validate-every 2500 \
+		--threads 1 --out runs/pendulum_third
+	cp runs/pendulum_third/best/* $(PRETRAINED)/double_pendulum/
 
 model-anymal-mlp: $(STAMP) ## ANYmal's learned model: two stages, the second with data along two policies
 	$(NERD) data anymal --trajectories 20000 --out datasets/anymal_mlp

@@ -128,7 +128,6 @@ NetworkConfig = TransformerConfig | MLPConfig | GRUConfig
 TRANSFORMERS = {
     "transformer-2x64": TransformerConfig(2, 64, 4),
     "transformer-2x96": TransformerConfig(2, 96, 4),
-    "transformer-2x96-products": TransformerConfig(2, 96, 4, products=True),
     "adaptive-4x64": TransformerConfig(4, 64, 4, band=64, pairs=True),
     "transformer-4x128": TransformerConfig(4, 128, 4),
     "transformer-4x128-products": TransformerConfig(4, 128, 4, products=True),
