@@ -169,9 +169,9 @@ model-anymal-adaptive: $(STAMP) ## ANYmals that find their hidden parameters
 
 FRANKA := --data datasets/franka_varied --lr 0.004 --adamw-lr 0.0012 --bf16-fraction 0.7
 
-model-franka-adaptive: $(STAMP) ## Frankas that find their hidden parameters
+model-franka-adaptive: model-franka ## Frankas that find their hidden parameters
 	$(NERD) data franka --vary preset --trajectories 7000 --steps 200 --out datasets/franka_varied
-	$(NERD) train franka $(BEGUN) $(FEW_ROLLOUTS) $(FRANKA) --init-from franka --out runs/franka_varied
+	$(NERD) train franka $(BEGUN) $(FEW_ROLLOUTS) $(FRANKA) --init-from runs/franka_on/best --out runs/franka_varied
 	$(NERD) train franka $(BEGUN) $(FRANKA) --init-from runs/franka_varied/last --steps 6000 \
 		--rollout-steps 300 --rollout-length 20 --rollout-batch-size 48 --save-every 100 \
 		--out runs/franka_adaptive
@@ -280,7 +280,13 @@ model-franka: data-franka ## Franka's transformer: single steps, then data along
 		--data datasets/franka_on datasets/franka_reach datasets/franka_reach_osc \
 		--single-step-fraction 0.85 --bf16-fraction 0 --steps 6000 --rollout-steps 1000 \
 		--lr 0.0015 --adamw-lr 0.0005 --rollout-lr-ratio 0.15 --validate-every 2000
-	cp runs/franka_on/best/* $(PRETRAINED)/franka/
+	$(NERD) train franka --init-from runs/franka_on/best --out runs/franka_third \
+		--network transformer-4x128-products \
+		--data datasets/franka_wide datasets/franka_reach datasets/franka_reach_osc \
+		--batch-size 128 --single-step-fraction 0.85 --bf16-fraction 0 --steps 9000 \
+		--rollout-steps 1500 --lr 0.004 --adamw-lr 0.0012 --rollout-lr-ratio 0.15 \
+		--validate-every 3000 --save-every 500 --threads 1
+	cp runs/franka_third/best/* $(PRETRAINED)/franka/
 
 model-franka-mlp: data-franka ## Franka's MLP, with products: the same data, the policies' in a second stage
 	$(NERD) train franka --data datasets/franka_wide --threads 1 --out runs/franka_mlp_first
