@@ -21,8 +21,10 @@ from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.finetune import ANALYTIC, FineTuner, start_model
 
 OF_PHYSICS = ("evaluations",)  # settings that the other kind of training ignores
-OF_NETWORKS = ("epochs", "batch_size", "sequence_length", "short_history_fraction")
-OF_NETWORKS = (*OF_NETWORKS, "lr", "clip", "validate_every", "patience")
+OF_NETWORKS = (
+    *("epochs", "batch_size", "sequence_length", "short_history_fraction"),
+    *("lr", "clip", "validate_every", "patience"),
+)
 
 
 @dataclass(frozen=True)
