@@ -74,7 +74,7 @@ class Config:
 
     robot: Positional[str]  # gymnasium/ID, dm_control/DOMAIN-TASK or an MJCF file
     trajectories: int = 5000  # random ones of 100 control steps
-    network: str = "mlp-4x128"
+    network: str = "mlp-4x128-products"
     updates: int = 5000  # on 1,024 single steps
     rollout_updates: int = 500  # on 128 rollouts of 8 steps
     policy: Path | None = None  # of a task of this robot; None: random motion alone

@@ -42,7 +42,7 @@ THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
     protocol=None,
     data=DataConfig(trajectories=10_000, steps=100),
     train=TrainConfig(
-        network="mlp-4x128",
+        network="mlp-4x128-products",
         steps=10_000,
         rollout_steps=500,
         single_step_fraction=1.0,
