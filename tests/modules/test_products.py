@@ -7,7 +7,7 @@ import torch
 from dynamics_helpers import enliven
 
 from torchrl_nerd.modules.networks import MLPConfig
-from torchrl_nerd.modules.products import Products
+from torchrl_nerd.modules.products import BOUND, Products
 from torchrl_nerd.modules.transformer import TransformerConfig
 
 INPUTS, OUTPUTS, WIDTH, ROWS = 5, 3, 16, 7
@@ -29,6 +29,15 @@ def test_they_are_what_the_formula_says(generator):
     gated = (h @ made.gate.weight.T) * factors
     expected = gated @ made.readout.weight.T + made.readout.bias
     torch.testing.assert_close(after, expected)
+
+
+def test_they_stay_bounded_behind_the_largest_contact_forces(generator):
+    made = Products(INPUTS, OUTPUTS, WIDTH, 1).double()
+    token = torch.randn(ROWS, INPUTS, generator=generator, dtype=torch.float64)
+    token = torch.where(token.abs() > 0.3, token.sign() * 2.0 * BOUND, token)
+    x = torch.randn(ROWS, WIDTH, generator=generator, dtype=torch.float64)
+    inside = made.enter(x, token.clamp(-BOUND, BOUND))
+    assert all(map(torch.equal, made.enter(x, token), inside))
 
 
 def test_without_blocks_and_head_a_network_is_a_polynomial_of_degree_four(generator):

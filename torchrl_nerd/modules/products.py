@@ -8,7 +8,8 @@ an activation function learn those slowly. Here, of a token x,
     h = blocks(E x + W p)                            the network between its ends
     output = head(h) + V ((A h) * (B x + C p))       linear in x and p, as the state says
 
-with * entry by entry.
+with * entry by entry. Forces of contact have heavy tails, and products of them run away
+where data are few. So an entry of x counts as at most `BOUND` standard deviations here.
 """
 
 from functools import partial
@@ -21,6 +22,8 @@ from torchrl_nerd.modules.symmetric import (
     make_product,
     make_readout,
 )
+
+BOUND = 10.0  # standard deviations; states and torques stay far below
 
 
 class Products(nn.Module):
@@ -42,6 +45,7 @@ class Products(nn.Module):
 
         ``x (*batch, *hidden)`` is the embedding of ``token (*batch, F)``.
         """
+        token = token.clamp(-BOUND, BOUND)
         products = self.multiply(self.left(token), self.right(token))
         return x + self.entry(products), self.direct(token) + self.factors(products)
 
