@@ -158,7 +158,8 @@ FEW_ROLLOUTS := --steps 5000 --rollout-steps 400 --rollout-length 10 --rollout-b
 model-ant-adaptive: $(STAMP) ## Ants that find their hidden parameters
 	$(NERD) data ant --vary preset --trajectories 7000 --steps 200 --out datasets/ant_varied
 	$(NERD) train ant $(BEGUN) $(FEW_ROLLOUTS) --data datasets/ant_varied --init-from ant \
-		--symmetries 4 --lr 0.006 --adamw-lr 0.0018 --out runs/ant_adaptive
+		--network transformer-4x128-products@64 --symmetries 4 --lr 0.006 --adamw-lr 0.0018 \
+		--out runs/ant_adaptive
 	$(call SHIP_ADAPTIVE,ant)
 
 model-anymal-adaptive: $(STAMP) ## ANYmals that find their hidden parameters
@@ -177,23 +178,17 @@ model-franka-adaptive: model-franka ## Frankas that find their hidden parameters
 		--out runs/franka_adaptive
 	$(call SHIP_ADAPTIVE,franka)
 
-# The Ant's networks: single steps and rollouts, then both again with more data along a run.
-# Then policies learn in the MLP, and both networks learn from how they move in MuJoCo. Others
-# learn in the transformer, which learns from how these move as well.
-ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin
-ANT_LEARNED := $(ANT_DATA) datasets/ant_correlated datasets/ant_resting datasets/ant_learned
-ANT := --symmetries 4 --save-every 500 --threads 1
-TRANSFORMER := --network transformer-4x128 --single-step-fraction 0.85
-MLP := --network mlp-4x160 --single-step-fraction 1
-FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25 --validate-every 4000
-SMALLER := --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
-AGAIN := --data $(ANT_DATA) datasets/ant_run_more $(SMALLER)
-LAST := --data $(ANT_LEARNED) $(SMALLER) --validate-every 4000
-OWN := --data $(ANT_LEARNED) datasets/ant_own_run datasets/ant_own_spin $(SMALLER)
-POLICY_IN := $(PY) experiments/time_to_policy.py --wanted 0 --frames 8000000 --horizon 16 \
-	--minibatch 8192 --lr 1e-3
-IN_THE_MLP := $(POLICY_IN) --dynamics runs/ant_mlp_second/best --episodes 64
-IN_THE_TRANSFORMER := $(POLICY_IN) --dynamics runs/ant_fourth/best --episodes 2
+# The Ant's networks: single steps and rollouts, then both again with more data. Between them
+# policies learn in the MLP, and both networks learn from how these move in MuJoCo.
+ANT_DATA := datasets/ant datasets/ant_run datasets/ant_spin datasets/ant_correlated datasets/ant_resting
+ANT_LEARNED := $(ANT_DATA) datasets/ant_run_more datasets/ant_learned
+ANT := --symmetries 4 --validate-every 4000 --save-every 500 --threads 1
+TRANSFORMER := --network transformer-4x128-products --single-step-fraction 0.85
+MLP := --network mlp-4x128-products --single-step-fraction 1
+FIRST := --data $(ANT_DATA) --rollout-lr-ratio 0.25
+AGAIN := --data $(ANT_LEARNED) --lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4
+IN_THE_MLP := $(PY) experiments/time_to_policy.py --wanted 0 --frames 5000000 --horizon 16 \
+	--minibatch 8192 --lr 1e-3 --dynamics runs/ant_mlp_first/best --episodes 64
 
 data-ant: $(STAMP)
 	$(NERD) data ant --trajectories 10000 --seed 21 --out datasets/ant
@@ -209,47 +204,24 @@ data-ant: $(STAMP)
 data-ant-learned: data-ant
 	$(NERD) train ant $(ANT) $(FIRST) $(MLP) \
 		--steps 24000 --rollout-steps 4000 --out runs/ant_mlp_first
-	$(NERD) train ant $(ANT) $(AGAIN) $(MLP) \
-		--validate-every 4000 --init-from runs/ant_mlp_first/best \
-		--steps 10000 --rollout-steps 4500 --out runs/ant_mlp_second
-	for seed in 11 12 13; do \
+	for seed in 11 12; do \
 		$(IN_THE_MLP) ant/run --seed $$seed --out runs/learned_$$seed || exit 1; \
 	done
 	$(IN_THE_MLP) ant/spin --seed 11 --out runs/learned_11
 	$(NERD) data ant --policy runs/learned_*/ant-*/*/[0-9]* \
 		--trajectories 2200 --steps 500 --seed 61 --out datasets/ant_learned
 
-model-ant: data-ant-learned ## the Ant's transformer, with the mirrors of the Ant built in
+model-ant-mlp: data-ant-learned ## the Ant's MLP, with the mirrors of the Ant built in
+	$(NERD) train ant $(ANT) $(AGAIN) $(MLP) \
+		--init-from runs/ant_mlp_first/best --steps 10000 --rollout-steps 4500 --out runs/ant_mlp_second
+	cp runs/ant_mlp_second/best/* $(PRETRAINED)/ant-mlp/
+
+model-ant: data-ant-learned ## the Ant's transformer, with the same mirrors
 	$(NERD) train ant $(ANT) $(FIRST) $(TRANSFORMER) \
 		--steps 15000 --rollout-steps 3000 --out runs/ant_first
 	$(NERD) train ant $(ANT) $(AGAIN) $(TRANSFORMER) \
-		--validate-every 4000 --init-from runs/ant_first/best \
-		--steps 8000 --rollout-steps 3500 --out runs/ant_second
-	$(NERD) train ant $(ANT) $(AGAIN) $(TRANSFORMER) \
-		--validate-every 1500 --init-from runs/ant_second/best \
-		--steps 0 --rollout-steps 3000 --out runs/ant_third
-	$(NERD) train ant $(ANT) $(LAST) $(TRANSFORMER) \
-		--init-from runs/ant_third/best --steps 8000 --rollout-steps 3500 --out runs/ant_fourth
-	for seed in 21 22; do \
-		$(IN_THE_TRANSFORMER) ant/run --seed $$seed --out runs/own_$$seed || exit 1; \
-	done
-	$(IN_THE_TRANSFORMER) ant/spin --seed 21 --out runs/own_21
-	$(NERD) data ant --policy runs/own_*/ant-run/*/[0-9]* \
-		--trajectories 1100 --steps 500 --seed 62 --out datasets/ant_own_run
-	$(NERD) data ant --policy runs/own_*/ant-spin/*/[0-9]* \
-		--trajectories 550 --steps 500 --seed 63 --out datasets/ant_own_spin
-	$(NERD) train ant $(ANT) $(OWN) $(TRANSFORMER) \
-		--validate-every 4000 --init-from runs/ant_fourth/best \
-		--steps 6000 --rollout-steps 2500 --out runs/ant_fifth
-	$(NERD) train ant $(ANT) $(OWN) $(TRANSFORMER) \
-		--validate-every 1500 --init-from runs/ant_fifth/best \
-		--steps 0 --rollout-steps 4500 --out runs/ant_sixth
-	cp runs/ant_sixth/best/* $(PRETRAINED)/ant/
-
-model-ant-mlp: data-ant-learned ## the Ant's MLP, with the same mirrors
-	$(NERD) train ant $(ANT) $(LAST) $(MLP) \
-		--init-from runs/ant_mlp_second/best --steps 10000 --rollout-steps 4500 --out runs/ant_mlp_third
-	cp runs/ant_mlp_third/best/* $(PRETRAINED)/ant-mlp/
+		--init-from runs/ant_first/best --steps 8000 --rollout-steps 3500 --out runs/ant_second
+	cp runs/ant_second/best/* $(PRETRAINED)/ant/
 
 # Transformers that learned single steps on a GPU, in minutes: make model-franka DEVICE=cuda.
 # On two cores the same takes a day. The second stage is short and runs anywhere.

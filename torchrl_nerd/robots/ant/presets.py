@@ -16,7 +16,7 @@ PRESET = Preset(
     EvaluationProtocol({"passive": AntRun()}, (100, 500), PUBLISHED),
     DataConfig(trajectories=15_000, steps=100),
     TrainConfig(  # `make model-ant` adds data along a policy
-        network="transformer-4x128",
+        network="transformer-4x128-products",
         symmetries=4,
         predicted_force=True,
         steps=15_000,
