@@ -23,7 +23,7 @@ from torchrl_nerd.modules.symmetric import (
     make_readout,
 )
 
-BOUND = 10.0  # standard deviations; states and torques stay far below
+BOUND = 10.0  # standard deviations
 
 
 class Products(nn.Module):
