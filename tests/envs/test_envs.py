@@ -15,6 +15,7 @@ from dynamics_helpers import (
     random_model,
     start_at,
 )
+from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_nerd import GroundTruthEnv, NeRDEnv, load_scene, make_env
@@ -155,6 +156,15 @@ def test_a_step_before_the_first_reset_is_refused(generator):
     other.reset()
     env.load_state_dict(other.state_dict())
     env.step(step)  # a restored one goes on
+
+
+def test_a_first_reset_of_some_envs_alone_is_refused() -> None:
+    env = make_env("cartpole/swingup", num_envs=3)
+    some = TensorDict({"_reset": torch.tensor([[True], [False], [True]])}, [3])
+    with pytest.raises(RuntimeError, match="all envs in the first reset"):
+        env.reset(some)
+    env.reset()
+    assert env.reset(some)["qpos"].isfinite().all()
 
 
 def test_wrong_action_shape_is_refused_in_one_sentence(generator):

@@ -36,8 +36,7 @@ class SceneEnv(RenderedEnv):
     Per env: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, the controller's over the last
     control step, and of servos ``ctrl`` (zero after a reset). Random numbers are each
-    env's own, so its episodes do not depend on how many envs there are.
-    ``reset(td, set_state=True)`` starts from the ``qpos``, ``qvel`` and parameters in it.
+    env's own. ``reset(td, set_state=True)`` starts from the state and parameters in it.
 
     An env whose action or next state is not finite, or that runs away, keeps its last state
     and ends as ``terminated``; no other env notices. ``fault`` says why, see
@@ -47,8 +46,7 @@ class SceneEnv(RenderedEnv):
         task: reset distribution, observation, reward, end.
         dynamics: what steps the state.
         num_envs: how many envs step together.
-        seed: of the resets; where none is given one is drawn, so that workers that make
-            their own env differ.
+        seed: of the resets; drawn where not given, so that envs of workers differ.
         device: where states, observations and rewards live.
         dump_dir: where the first fault of each kind leaves a dump of its last steps.
         state_dtype: of states and torques; engines compute in their own.
@@ -217,6 +215,10 @@ class SceneEnv(RenderedEnv):
         recorded = self._is_differentiable and torch.is_grad_enabled()
         return torch.set_grad_enabled(recorded)
 
+    def _expect_begun(self, wanted: str) -> None:
+        if not self._shown and self._state()[QPOS].isnan().any():
+            raise RuntimeError(f"expected {wanted}, got envs without a state")
+
     @unaffected
     def _reset(
         self,
@@ -228,6 +230,8 @@ class SceneEnv(RenderedEnv):
         is_reset = every if tensordict is None else tensordict.get("_reset", every)
         is_reset = is_reset.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
         old, given = self._state(), {}
+        if tensordict is not None and not (self._shown or is_reset.all()):
+            self._expect_begun("all envs in the first reset")
         if set_state:
             sizes, dtype = self._state_sizes, old[QPOS].dtype
             given = given_state(self.scene, tensordict, is_reset, sizes, dtype)
@@ -250,14 +254,10 @@ class SceneEnv(RenderedEnv):
     @unaffected
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state, moves = self._state(), tensordict.get("_step", None)
-        if not self._shown and state[QPOS].isnan().any():
-            raise RuntimeError("expected reset() before the first step")
-        action, expected = tensordict[ACTION], self.action_spec.shape
-        if action.shape != expected:
-            got = tuple(action.shape)
-            raise ValueError(
-                f"expected an action of shape {tuple(expected)}, got {got}"
-            )
+        self._expect_begun("reset() before the first step")
+        action, expected = tensordict[ACTION], tuple(self.action_spec.shape)
+        if (got := tuple(action.shape)) != expected:
+            raise ValueError(f"expected an action of shape {expected}, got {got}")
         held = None if moves is None else ~moves.reshape(self.batch_size)
         past = None if held is None else self.dynamics.history()
         with self._gradients():
