@@ -165,6 +165,8 @@ def test_a_fault_is_named_and_leaves_a_dump_once(dynamics, generator, tmp_path):
         env = NeRDEnv("ant/run", model, ROWS, inference=inference, dump_dir=tmp_path)
     env.reset()
     actions = random_actions(env, 5, generator)
+    act_all(env, actions[:2])
+    env.reset()  # the dump begins here
     row = int(torch.randint(ROWS, (), generator=generator))
     good = act_all(env, actions[:3])
     assert not good["fault"].any() and not list(tmp_path.iterdir())

@@ -267,7 +267,7 @@ class SceneEnv(RenderedEnv):
             found = self._hold(found, held, tensordict)
             age = torch.where(held, self._age, age)
         if self.recorder is not None:
-            self.recorder.record(state, action, found["joint_torque"], found[FAULT])
+            self.recorder.record(state, action, found, self._age)
         return self._seen(self._hand_out(found, {"_age": age}))
 
     def _hold(

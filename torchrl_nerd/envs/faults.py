@@ -2,7 +2,7 @@
 
 A fault ends its env as ``terminated`` at its last good state and leaves the others bitwise
 as they are. With a folder, the first fault of each kind leaves a dump there: the last
-states, torques, actions and the ground of one such env.
+states, torques, actions and the ground of one such env, in its present episode.
 """
 
 from collections import deque
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrl_nerd.files import writable_folder
-from torchrl_nerd.keys import QPOS, QVEL
+from torchrl_nerd.keys import FAULT, QPOS, QVEL
 from torchrl_nerd.tensor_files import write_tensors
 
 REASONS = ("none", "action", "diverged", "runaway")
@@ -79,22 +79,29 @@ class FaultRecorder:
         self._written: set[int] = set()
 
     def record(
-        self, state: Mapping[str, Tensor], action: Tensor, torque: Tensor, fault: Tensor
+        self,
+        state: Mapping[str, Tensor],
+        action: Tensor,
+        after: Mapping[str, Tensor],
+        age: Tensor,
     ) -> None:
         """Keep a step, ``(num_envs, size)`` each; dump each kind of fault that is new.
 
-        The ``state`` before it, the ``action`` as it was given, the joint ``torque`` and
-        the ``fault`` from `find_faults`.
+        The ``state`` before it, the ``action`` as it was given, the joint torque and the
+        fault in ``after`` it, and how old each episode was, ``age (num_envs,)``.
         """
+        torque, fault = after["joint_torque"], after[FAULT]
         step = {**state, "action": action, "joint_torque": torque}
         self._steps.append({k: v.detach().cpu().clone() for k, v in step.items()})
         for kind in fault.unique().tolist():
             if kind and kind not in self._written:
                 self._written.add(kind)
-                self._write(kind, int((fault == kind).nonzero()[0, 0]))
+                env = int((fault == kind).nonzero()[0, 0])
+                self._write(kind, env, 1 + int(age[env]))
 
-    def _write(self, kind: int, env: int) -> None:
-        steps = self._steps  # at most `HISTORY`, the oldest first: (T, n) each
+    def _write(self, kind: int, env: int, count: int) -> None:
+        # at most `HISTORY`, the oldest first, none before the reset: (T, n) each
+        steps = list(self._steps)[-count:]
         tensors = {k: torch.stack([s[k][env] for s in steps]) for k in steps[0]}
         about = {**self.about, "reason": REASONS[kind], "env": str(env)}
         path = self.folder / f"fault_{REASONS[kind]}.safetensors"
