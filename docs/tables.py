@@ -556,7 +556,7 @@ def open_loop_table(folder: Path = RESULTS) -> str:
         "4 substeps",
     ]
     lines, records = [], read("open_loop", folder)
-    rated = [["robot", "network / in bf16", "MuJoCo, 1 substep", "its own"]]
+    rated = [["robot", "network", "rate / in bf16", "MuJoCo, 1 substep", "its own"]]
     rated[0] += ["front", "front, bf16"]
     for robot, record in records.items():
         found = record["results"]
@@ -576,7 +576,7 @@ def open_loop_table(folder: Path = RESULTS) -> str:
             lines.append([robot, case, *cells])
         fronts = (found.get(k) for k in ("on_the_front", "on_the_front_in_bf16"))
         places = (", ".join(places_of(x, cases)) if x else "-" for x in fronts)
-        rated.append([robot, *speeds, *places])
+        rated.append([robot, found["configuration"]["network"], *speeds, *places])
     return "\n\n".join((rows([head, *lines]), with_sources(rated, records.values())))
 
 
