@@ -228,10 +228,10 @@ class SceneEnv(RenderedEnv):
     ) -> TensorDict:
         every = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         is_reset = every if tensordict is None else tensordict.get("_reset", every)
+        if is_reset is not every and not (self._shown or is_reset.all()):
+            self._expect_begun("all envs in the first reset")
         is_reset = is_reset.reshape(self.batch_size)  # (num_envs, 1) -> (num_envs,)
         old, given = self._state(), {}
-        if tensordict is not None and not (self._shown or is_reset.all()):
-            self._expect_begun("all envs in the first reset")
         if set_state:
             sizes, dtype = self._state_sizes, old[QPOS].dtype
             given = given_state(self.scene, tensordict, is_reset, sizes, dtype)
