@@ -36,7 +36,7 @@ class SceneEnv(RenderedEnv):
     Per env: ``qpos``, ``qvel`` (float64), ``observation`` (float32), the task's
     parameters such as ``terrain``, and ``joint_torque``, the controller's over the last
     control step, and of servos ``ctrl`` (zero after a reset). Random numbers are each
-    env's own. ``reset(td, set_state=True)`` starts from the state and parameters in it.
+    env's own, however many there are. ``reset(td, set_state=True)`` starts from ``td``.
 
     An env whose action or next state is not finite, or that runs away, keeps its last state
     and ends as ``terminated``; no other env notices. ``fault`` says why, see
