@@ -77,6 +77,7 @@ class Config:
     network: str = "mlp-4x128-products"
     updates: int = 5000  # on 1,024 single steps
     rollout_updates: int = 500  # on 128 rollouts of 8 steps
+    symmetries: int = 1  # of the robot, that the network has
     policy: Path | None = None  # of a task of this robot; None: random motion alone
     along: int = 200  # trajectories along it for the data, of up to 1,000 control steps
     noise: float = 0.3  # of actions there, largest standard deviation
@@ -122,6 +123,7 @@ def train(scene: Scene, cfg: Config) -> Path:
         rollout_steps=cfg.rollout_updates,
         single_step_fraction=1.0,
         loss_eps=0.02,
+        symmetries=cfg.symmetries,
         validate_every=cfg.updates + cfg.rollout_updates,  # at the end alone
         save_every=500,
         seed=cfg.seed,
