@@ -38,8 +38,9 @@ from torchrl_nerd.training.trainer import Trainer
 from torchrl_nerd.transforms import StateDelta
 
 # Quarter turns and mirrors of the ant; the cube's whole group; ANYmal's trunk is heavier
-# on one side.
+# on one side. Of fixed bases a mirror, and walkers whose legs are at two places and at one.
 ORDERS = {"ant": 8, "cube": 48, "anymal": 1}
+ORDERS |= {"cartpole": 2, "dm_control/walker-walk": 2, "gymnasium/Walker2d-v5": 2}
 
 
 @pytest.fixture(params=list(ORDERS))
@@ -59,8 +60,8 @@ def test_the_groups_are_those_of_the_shapes(name, order):
     assert len(find_isometries(load_scene(name))) == order
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cube_slope"])
-def test_a_fixed_base_and_a_ground_that_varies_are_refused(name):
+@pytest.mark.parametrize("name", ["double_pendulum", "cube_slope"])
+def test_a_ground_that_varies_is_refused(name):
     with pytest.raises(ValueError, match=f"one ground .* got '{name}'"):
         find_isometries(load_scene(name))
 
@@ -133,6 +134,53 @@ def test_a_robot_that_touches_itself_may_have_a_mirror(first, order, tmp_path):
     assert len(find_isometries(scene)) == order
 
 
+TWO_ARMS = """
+<mujoco>
+  <default><geom type="capsule" size="0.03" density="500"/></default>
+  <worldbody>
+    <body pos="1 2 0.5">
+      <joint name="lift" type="slide" axis="0 0 1"/>
+      <geom fromto="0 -0.2 0 0 0.2 0"/>
+      <body pos="0 0.2 0"><joint name="left" axis="0.6 0 0.8" range="-80 {high}"/>
+        <geom fromto="0 0 0 0 0.3 -0.2"/></body>
+      <body pos="0 -0.2 0"><joint name="right" axis="0.6 0 0.8" range="-70 80"/>
+        <geom fromto="0 0 0 0 -0.3 -0.2"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="right"/><motor joint="left"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(("high", "order"), [(70, 2), (75, 1)])
+def test_two_arms_of_a_fixed_base_anywhere_are_mirrored(high, order, tmp_path):
+    """The hinges turn about axes that the mirror does not put on each other as they are."""
+    path = tmp_path / "arms.xml"
+    path.write_text(TWO_ARMS.format(high=high))
+    found = find_isometries(Scene.from_mjcf(path))
+    assert len(found) == order
+    for mirror in found[1:]:
+        qpos = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+        assert mirror.qpos(qpos).tolist() == [0.1, -0.3, -0.2]
+        torque = torch.tensor([1.0, 2.0], dtype=torch.float64)
+        assert mirror.torque(torque).tolist() == [-2.0, -1.0]
+
+
+def test_a_feature_that_only_the_data_fill_is_refused(generator):
+    """A planar walker's contacts have no speed out of its plane, in data neither."""
+    symmetry = symmetry_of("gymnasium/Walker2d-v5")
+    scene = load_scene(symmetry.name)
+    stats = data_stats(scene, simulate(scene, 8, 50, generator))
+    symmetry.complete(stats)
+    unseen = symmetry.is_still.nonzero()[:, 0]
+    assert len(unseen)
+    stats[TOKEN].m2[unseen[0]] = 1.0
+    with pytest.raises(
+        ValueError, match=rf"got none for \[{unseen[0]}\]: train without"
+    ):
+        symmetry.complete(stats)
+
+
 @pytest.mark.parametrize(
     ("more", "order"),
     [
@@ -191,7 +239,7 @@ def small_model(name: str, generator: Generator) -> tuple[NeRD, TensorDict]:
     return NeRD(scene, NO_PREDICTIONS, MLPConfig(1, 16), stats), data
 
 
-@pytest.mark.parametrize("name", ["ant", "cube"])
+@pytest.mark.parametrize("name", ["ant", "cube", "dm_control/walker-walk"])
 def test_the_range_of_a_training_has_the_symmetries(name, generator):
     """So that what is clamped is so in every symmetric copy."""
     model, data = small_model(name, generator)
@@ -208,16 +256,17 @@ def test_the_range_of_a_training_has_the_symmetries(name, generator):
             choice = torch.full((len(x),), number)
             there = copies(x.clamp(low, high), choice)
             torch.testing.assert_close(copies(x, choice).clamp(low, high), there)
-    ends = torch.stack((seen.qpos_low, seen.qpos_high))
+    q, v = symmetry.isometries[0].base
+    ends, speed = torch.stack((seen.qpos_low, seen.qpos_high))[:, q:], seen.speed[v:]
     for isometry in symmetry.isometries:
         there = isometry.joints(ends).sort(0).values
-        torch.testing.assert_close(there, ends[:, 7:], atol=1e-12, rtol=0)
-        assert (seen.speed[isometry.joint_sources] == seen.speed[6:]).all()
+        torch.testing.assert_close(there, ends, atol=1e-12, rtol=0)
+        assert (isometry.joints(speed).abs() == speed).all()
     assert (seen.qpos_low <= before.qpos_low).all()
     assert (seen.speed >= before.speed).all()
 
 
-@pytest.mark.parametrize("name", ["ant", "cube"])
+@pytest.mark.parametrize("name", ["ant", "cube", "dm_control/walker-walk"])
 def test_the_score_of_a_copy_is_that_of_the_original(name, generator):
     """Without the copies of the data it is another one."""
     model, data = small_model(name, generator)
@@ -253,13 +302,15 @@ def test_a_copy_of_a_trajectory_is_the_trajectory_of_the_copy(scene, data):
         dynamics.reset(mirrored)
         path = dynamics.rollout(mirrored, isometry.torque(torque))
         expected = isometry.qpos(data[NEXT_QPOS][:, :steps])
-        assert _apart(path[QPOS], expected).median() < 1e-9
-        assert _apart(path[QPOS], expected).max() < 1e-3  # sensitive, in contact
+        assert _apart(scene, path[QPOS], expected).median() < 1e-9
+        assert _apart(scene, path[QPOS], expected).max() < 1e-3  # sensitive, in contact
         expected = isometry.qvel(data[NEXT_QVEL][:, :steps])
         assert (path[QVEL] - expected).abs().median() < 1e-8
 
 
-def _apart(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def _apart(scene: Scene, a: Tensor, b: Tensor) -> Tensor:
+    if not scene.base.is_floating:
+        return (a - b).abs().amax(-1)
     rest = torch.cat((a[..., :3] - b[..., :3], a[..., 7:] - b[..., 7:]), -1)
     return rest.abs().amax(-1) + orientation_error(a[..., 3:7], b[..., 3:7])
 
@@ -272,7 +323,9 @@ def test_the_group_is_closed_and_has_inverses(scene, data):
     for first in group[:8]:
         for second in group[-8:]:
             twice = second(first(state))
-            gaps = [_apart(twice[QPOS], mirrored[QPOS]).max() for mirrored in copies]
+            gaps = [
+                _apart(scene, twice[QPOS], mirrored[QPOS]).max() for mirrored in copies
+            ]
             assert min(gaps) < 1e-9
 
 
@@ -325,7 +378,7 @@ def test_batches_show_symmetric_copies_of_the_data(scene, data, generator):
     state = data[:32, 0].empty().update({QPOS: qpos[:, 0], QVEL: qvel[:, 0]})
     dynamics.reset(state)
     path = dynamics.rollout(state, torque, terrain)
-    assert _apart(path[QPOS], qpos[:, 1:]).median() < 1e-6
+    assert _apart(scene, path[QPOS], qpos[:, 1:]).median() < 1e-6
     loss = rollout_loss(model, qpos, qvel, torque, terrain, 0.02)
     assert loss.isfinite()
     inputs, targets = sequences.one_step(64, 2, generator)

@@ -1,8 +1,9 @@
 """Isometries of a robot: maps of states and torques that commute with MuJoCo's step.
 
 An ant turned by 90 degrees is the same ant with its legs renumbered. Candidates are the 48
-isometries that map the axes of the base frame to themselves. One is kept if it maps joints
-to joints and shapes to shapes, and commutes with MuJoCo's step.
+isometries that map the axes of the base frame to themselves, or those of the world where
+the base is fixed. One is kept if it maps joints to joints and shapes to shapes, and
+commutes with MuJoCo's step.
 """
 
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.base import keep_constants, keep_indices
@@ -29,7 +30,7 @@ from torchrl_nerd.keys import (
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.scenes.contact_points import collision_filter, own_contacts
 from torchrl_nerd.scenes.penetration import touching_bodies
-from torchrl_nerd.scenes.sampling import sample_commands
+from torchrl_nerd.training.contact_states import states_in_contact
 
 PLACE_TOL = 1e-6  # m, and of a unit vector
 STEP_RTOL = 1e-6  # the solver's own tolerance is 1e-8
@@ -39,7 +40,6 @@ MAX_DEPTH = 0.01  # m that the trials reach into the ground
 # the robot does not touch itself, before or after the step, so many are let pass
 MAX_STRAYED = 1 / 16
 MIRROR = np.diag((1.0, -1.0, 1.0))  # of the world, where the base is mirrored
-OVERSHOOT = 0.2  # of a joint's range, beyond its limits
 # of a shape: what its contacts are computed with, and the radius about its center
 LAW = ("condim", "priority", "friction", "solref", "solimp", "margin", "gap", "rbound")
 
@@ -50,6 +50,7 @@ class Isometry(nn.Module):
     Args:
         body: ``(3, 3)``, of vectors in the axes of the floating base. Where it is a
             reflection, the world is mirrored as well, so that the base stays a rotation.
+            None for a fixed base.
         sources: ``(nv,)``: dof v of the copy is sign times dof source.
         signs: ``(nv,)``.
         actuated: dofs with a motor, in the order of torques.
@@ -66,12 +67,20 @@ class Isometry(nn.Module):
 
     def __init__(
         self,
-        body: np.ndarray,
+        body: np.ndarray | None,
         sources: np.ndarray,
         signs: np.ndarray,
         actuated: list[int],
     ) -> None:
         super().__init__()
+        self.is_floating = body is not None
+        self.base = (7, 6) if self.is_floating else (0, 0)  # its part of qpos and qvel
+        dofs = self.base[1]
+        motors = [actuated.index(source) for source in sources[actuated]]
+        keep_indices(self, joint_sources=sources[dofs:] - dofs, motors=motors)
+        keep_constants(self, joint_signs=signs[dofs:], motor_signs=signs[actuated])
+        if body is None:
+            return
         parity = np.linalg.det(body)
         world, mirror = np.eye(3), np.ones(4)
         if parity < 0.0:  # axes of rotations in the mirror's plane flip: they are axial
@@ -79,24 +88,25 @@ class Isometry(nn.Module):
         turn = np.empty(4)
         mujoco.mju_mat2Quat(turn, (world @ body.T).reshape(-1))
         keep_constants(self, world=world, mirror=mirror, turn=turn, axial=parity * body)
-        keep_constants(self, joint_signs=signs[6:], motor_signs=signs[actuated])
-        motors = [actuated.index(source) for source in sources[actuated]]
-        keep_indices(self, joint_sources=sources[6:], motors=motors)
 
     def qpos(self, qpos: Tensor) -> Tensor:
         """Symmetric copy of positions ``(*batch, nq)``."""
+        joints = self.joints(qpos[..., self.base[0] :])
+        if not self.is_floating:
+            return joints
         position, quat = qpos[..., :3] @ self.world.mT, qpos[..., 3:7] * self.mirror
-        turned = quat_multiply(quat, self.turn)
-        return torch.cat((position, turned, self.joints(qpos)), -1)
+        return torch.cat((position, quat_multiply(quat, self.turn), joints), -1)
 
-    def joints(self, qpos: Tensor) -> Tensor:
-        """Symmetric copy of joint positions ``(*batch, nv - 6)``."""
-        return qpos[..., self.joint_sources + 1] * self.joint_signs
+    def joints(self, values: Tensor) -> Tensor:
+        """Symmetric copy of positions or velocities of joints ``(*batch, joints)``."""
+        return values[..., self.joint_sources] * self.joint_signs
 
     def qvel(self, qvel: Tensor) -> Tensor:
         """Symmetric copy of velocities ``(*batch, nv)``."""
+        joints = self.joints(qvel[..., self.base[1] :])
+        if not self.is_floating:
+            return joints
         linear, angular = qvel[..., :3] @ self.world.mT, qvel[..., 3:6] @ self.axial.mT
-        joints = qvel[..., self.joint_sources] * self.joint_signs
         return torch.cat((linear, angular, joints), -1)
 
     def torque(self, joint_torque: Tensor) -> Tensor:
@@ -121,50 +131,76 @@ def find_isometries(scene: Scene) -> list[Isometry]:
     Of a varied scene they are those that every robot has.
 
     Raises:
-        ValueError: a fixed base, a ball joint, servos, or a ground that varies.
+        ValueError: a ball joint, props, servos, or a ground that varies.
     """
     model, ground = scene.model, scene.terrain
-    is_legged = scene.base.is_floating and model.nv == model.njnt + 5
+    has_hinges = model.nv == model.njnt + 5 * scene.base.is_floating  # and slides
     is_varied = ground is not None and ground.is_per_env
-    if not is_legged or is_varied or scene.servos is not None:
+    if not has_hinges or is_varied or scene.servos is not None:
         raise ValueError(
-            "expected a floating base, hinges or slides, motors and one ground for "
-            f"use_symmetry or symmetries, got '{scene.name}'"
+            "expected hinges or slides, motors and one ground for use_symmetry or "
+            f"symmetries, got '{scene.name}'"
         )
     identity, *others = _candidates(scene)
     return [identity, *filter(Trial(scene).agrees, others)]
 
 
 def _candidates(scene: Scene) -> Iterator[Isometry]:
-    """Isometries that put joints on joints, shapes on shapes and the ground on itself."""
-    actuated, model = list(scene.actuated), scene.model
+    """Isometries that put joints on joints, shapes on shapes and the ground on itself.
+
+    Joints at one place, such as the hips of a planar walker, are mapped to themselves or to
+    each other.
+    """
+    actuated, model, is_floating = (
+        list(scene.actuated),
+        scene.model,
+        scene.base.is_floating,
+    )
     data = mujoco.MjData(model)
-    data.qpos[:] = np.eye(model.nq)[3]  # the base at the origin, not turned
+    data.qpos[:] = 0.0
+    if is_floating:  # the base at the origin, not turned
+        data.qpos[3] = 1.0
     mujoco.mj_kinematics(model, data)
-    shapes = Shapes(model, data)
+    # what permutes joints leaves the mean of their places
+    center = np.zeros(3) if is_floating else data.xanchor.mean(0)
+    shapes = Shapes(model, data, center)
+    known: list[list[float]] = []
     for order, sign in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         body = np.eye(3)[list(order)] * np.array(sign)[:, None]
-        matched = _match_joints(model, data, body)
-        if matched is None or not shapes.are_mapped(body):
+        if not shapes.are_mapped(body):
             continue
-        if set(matched[0][actuated]) <= set(actuated):
-            yield Isometry(body, *matched, actuated)
+        for is_swapped in (False, True):
+            matched = _match_joints(model, data, center, body, is_swapped)
+            if matched is None or not set(matched[0][actuated]) <= set(actuated):
+                continue
+            effect = [*matched[0], *matched[1], *(body.flat if is_floating else ())]
+            if effect not in known:  # of a fixed base what joints do is all
+                known.append(effect)
+                yield Isometry(body if is_floating else None, *matched, actuated)
 
 
 def _match_joints(
-    model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    center: np.ndarray,
+    body: np.ndarray,
+    is_swapped: bool,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """For each dof the one it is mapped from, and the sign; None if one has none."""
+    """For each dof the one it is mapped from, and the sign; None if one has none.
+
+    Of several at one place it is the dof itself last where ``is_swapped``, else first.
+    """
     sources, signs = np.arange(model.nv), np.ones(model.nv)
     scalar = [j for j in range(model.njnt) if model.jnt_type[j] != FREE]
+    places = data.xanchor - center
     for joint in scalar:
         axial = 1.0 if model.jnt_type[joint] == SLIDE else np.linalg.det(body)
-        anchor, axis = body @ data.xanchor[joint], axial * body @ data.xaxis[joint]
-        for other in scalar:
+        anchor, axis = body @ places[joint], axial * body @ data.xaxis[joint]
+        for other in sorted(scalar, key=lambda j: (j == joint) == is_swapped):
             along = float(axis @ data.xaxis[other])
             if (
                 model.jnt_type[other] == model.jnt_type[joint]
-                and np.linalg.norm(anchor - data.xanchor[other]) < PLACE_TOL
+                and np.linalg.norm(anchor - places[other]) < PLACE_TOL
                 and abs(abs(along) - 1.0) < PLACE_TOL
             ):
                 dof = model.jnt_dofadr[other]
@@ -172,19 +208,22 @@ def _match_joints(
                 break
         else:
             return None
-    return sources, signs
+    is_permutation = len(set(sources.tolist())) == model.nv
+    return (sources, signs) if is_permutation else None
 
 
 class Shapes:
     """Shapes of a robot that touch something, at the place of its joints in ``data``."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, center: np.ndarray
+    ) -> None:
         touches = collision_filter(model)
         is_own = model.body_weldid[model.geom_bodyid] > 0
         own = np.flatnonzero(is_own & touches.any(1))
         laws = [getattr(model, f"geom_{name}").reshape(model.ngeom, -1) for name in LAW]
         self.laws = np.concatenate([model.geom_type[:, None], *laws], 1)[own]
-        self.places = data.geom_xpos[own]
+        self.places = data.geom_xpos[own] - center
         self.mutual = touches[np.ix_(own, own)]
         self.ground = np.asarray(touches[own][:, ~is_own].any(1))
 
@@ -235,28 +274,3 @@ def _touch_themselves(scene: Scene, state: TensorDictBase) -> Tensor:
     """Whether two of the robot's own bodies touch, ``(n,)``."""
     pairs = touching_bodies(scene.model, state[QPOS])
     return torch.tensor([any(low > 0 for low, _ in some) for some in pairs])
-
-
-def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
-    """Random states and torques ``[count]``, up to ``max_depth`` m in the ground.
-
-    Joints are up to `OVERSHOOT` of their ranges beyond them. Of a varied scene each is of
-    a robot of its own.
-    """
-    generator = Generator().manual_seed(0)
-    state, scale = scene.sample_initial(count, generator)
-    share = torch.linspace(-OVERSHOOT, 1.0 + OVERSHOOT, count, dtype=torch.float64)
-    for joint in scene.model.jnt_limited.nonzero()[0]:
-        low, high = scene.model.jnt_range[joint]
-        mixed = share[torch.randperm(count, generator=generator)]
-        state[QPOS][:, scene.model.jnt_qposadr[joint]] = low + (high - low) * mixed
-    draw = torch.rand(count, dtype=torch.float64, generator=generator)
-    scene.place_on_terrain(state, -max_depth * draw)
-    torque = sample_commands(scene.sampling, scale, 1, generator)
-    found = TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
-    if scene.variation is not None:
-        own = scene.variation.draw(count, generator)
-        kinds = [p.kind for p in scene.variation.parameters]
-        # every isometry has a delay, which would hide the torque of a single step
-        found[PARAMETERS] = own * torch.tensor([kind != "delay" for kind in kinds])
-    return found

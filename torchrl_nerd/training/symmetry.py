@@ -17,11 +17,8 @@ from torchrl_nerd.modules.symmetric import SignedCopies
 from torchrl_nerd.modules.training_range import TrainingRange
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
-from torchrl_nerd.training.isometries import (
-    Isometry,
-    find_isometries,
-    states_in_contact,
-)
+from torchrl_nerd.training.contact_states import states_in_contact
+from torchrl_nerd.training.isometries import Isometry, find_isometries
 from torchrl_nerd.training.samples import raw_tokens
 from torchrl_nerd.training.signed_permutations import SignedPermutations, match_entries
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
@@ -37,7 +34,7 @@ class Symmetry(nn.Module):
     not be as symmetric as the shape.
 
     Raises:
-        ValueError: see `find_isometries`; a feature that is zero in all of these states.
+        ValueError: see `find_isometries`.
     """
 
     def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
@@ -49,12 +46,7 @@ class Symmetry(nn.Module):
         for key in (QPOS, QVEL):  # a change between any two states will do
             states["next", key] = states[key].roll(1, 0)
         here = raw_tokens(*encode, states)
-        still = (here[0] == 0.0).all(0).nonzero()[:, 0].tolist()
-        if still and len(group) > 1:
-            raise ValueError(
-                f"expected random states of '{scene.name}' to fill every feature, got "
-                f"none for {still}: train without use_symmetry and symmetries"
-            )
+        self.is_still = (here[0] == 0.0).all(0)  # (F,): not seen to move
         kept, found = [], []
         for isometry in group:
             there = raw_tokens(*encode, isometry(states))
@@ -67,7 +59,20 @@ class Symmetry(nn.Module):
         self.tokens, self.targets = map(SignedPermutations, (tokens, targets))
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
-        """Statistics of tokens and targets with all their symmetric copies."""
+        """Statistics of tokens and targets with all their symmetric copies.
+
+        Raises:
+            ValueError: a feature of the data that is zero in all of `STATES`, so that
+                nothing tells where symmetries put it.
+        """
+        token = stats[TOKEN]
+        moves = (token.mean != 0.0) | (token.m2 != 0.0)  # (F,)
+        unseen = (moves & self.is_still.to(moves.device)).nonzero()[:, 0].tolist()
+        if unseen and len(self.isometries) > 1:
+            raise ValueError(
+                f"expected random states of '{self.name}' to fill every feature of the "
+                f"data, got none for {unseen}: train without use_symmetry and symmetries"
+            )
         both = (TOKEN, self.tokens), (TARGET, self.targets)
         return {key: copies.complete(stats[key]) for key, copies in both}
 
@@ -103,13 +108,14 @@ class Symmetry(nn.Module):
             )  # (2, K, D)
             low.copy_(ends.amin((0, 1)))
             high.copy_(ends.amax((0, 1)))
-        joints = torch.stack((seen.qpos_low, seen.qpos_high))  # (2, nq)
         group = [cast(Isometry, isometry) for isometry in self.isometries]
+        q, v = group[0].base
+        joints = torch.stack((seen.qpos_low, seen.qpos_high))[:, q:]
         ends = torch.stack([isometry.joints(joints) for isometry in group])  # (K, 2, .)
-        seen.qpos_low[7:] = ends.amin((0, 1))
-        seen.qpos_high[7:] = ends.amax((0, 1))
-        speeds = [seen.speed[isometry.joint_sources] for isometry in group]
-        seen.speed[6:] = torch.stack(speeds).amax(0)  # the base's are norms of vectors
+        seen.qpos_low[q:] = ends.amin((0, 1))
+        seen.qpos_high[q:] = ends.amax((0, 1))
+        speeds = [isometry.joints(seen.speed[v:]).abs() for isometry in group]
+        seen.speed[v:] = torch.stack(speeds).amax(0)  # the base's are norms of vectors
 
     def keeps(self, normalize: Normalize) -> bool:
         """Whether copies of normalised tokens and targets are those of raw ones."""
