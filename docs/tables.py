@@ -576,7 +576,10 @@ def open_loop_table(folder: Path = RESULTS) -> str:
             lines.append([robot, case, *cells])
         fronts = (found.get(k) for k in ("on_the_front", "on_the_front_in_bf16"))
         places = (", ".join(places_of(x, cases)) if x else "-" for x in fronts)
-        rated.append([robot, found["configuration"]["network"], *speeds, *places])
+        config = found["configuration"]
+        count = config.get("symmetries", 1)
+        network = config["network"] + f", {count} symmetries" * (count > 1)
+        rated.append([robot, network, *speeds, *places])
     return "\n\n".join((rows([head, *lines]), with_sources(rated, records.values())))
 
 

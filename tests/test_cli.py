@@ -549,7 +549,8 @@ def test_a_scene_is_explained(name, tmp_path, capsys):
     counts = ", ".join(map(str, content["symmetries"]))
     assert f"symmetries of a network: {counts}" in text
     assert (content["symmetries"] == [1]) == bool(content["why_no_symmetries"])
-    known = {"ant": [1, 2, 4], "cube": [1, 2, 4, 8], "anymal": [1], "cartpole": [1]}
+    assert ("--symmetries" in text) == (content["symmetries"] != [1])
+    known = {"ant": [1, 2, 4], "cube": [1, 2, 4, 8], "anymal": [1], "cartpole": [1, 2]}
     assert content["symmetries"] == known.get(scene.name, content["symmetries"])
 
 
@@ -616,12 +617,13 @@ def test_settings_that_do_not_fit_are_refused_before_data_are_drawn(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    for options, said in {
-        "--network nope": "nope",
-        "--sequence-length 400": "at least 400 steps, got 100: draw them",
-        "--use-symmetry": "floating base",
+    for line, said in {
+        "cartpole --network nope": "nope",
+        "cartpole --sequence-length 400": "at least 400 steps, got 100: draw them",
+        "cartpole --symmetries 4": "expected symmetries 1 or 2, ",
+        "double_pendulum --use-symmetry": "motors and one ground",
     }.items():
-        assert said in refusal(capsys, "train", "cartpole", *options.split())
+        assert said in refusal(capsys, "train", *line.split())
     assert not (tmp_path / "datasets").exists()
 
 

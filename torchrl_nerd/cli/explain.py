@@ -29,7 +29,8 @@ class Explain(Command):
         scene = self.inputs()
         report = explain(scene)
         counts, why_none = _symmetries(scene)
-        listed = ", ".join(map(str, counts)) + (f": {why_none}" if why_none else "")
+        why = why_none or f"nerd train {self.scene} --symmetries {counts[-1]}"
+        listed = f"{', '.join(map(str, counts))}: {why}"
         print(report, f"symmetries of a network: {listed}", sep="\n")
         found = {"symmetries": counts, "why_no_symmetries": why_none}
         return asdict(report) | {"token_width": report.token_width} | found
