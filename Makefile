@@ -23,7 +23,7 @@ NERD := $(PY) -m torchrl_nerd.cli
 GPU_PY := $(or $(wildcard $(PY)),$(PYTHON))
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest
 
-.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned data-franka model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-franka-mlp model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
+.PHONY: help setup dev demo test check size words test-slow test-gpu gpu gpu-wheels bench-check results varied-cartpole varied-double_pendulum model-cartpole-adaptive model-double_pendulum-adaptive model-ant-adaptive model-anymal-adaptive model-franka-adaptive data-ant data-ant-learned data-anymal data-anymal-learned anymal-wide data-franka model-ant model-ant-mlp model-double_pendulum model-cube model-franka model-franka-mlp model-anymal model-anymal-mlp model-double_pendulum-mlp policies format docs build lock clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -162,9 +162,9 @@ model-ant-adaptive: $(STAMP) ## Ants that find their hidden parameters
 		--out runs/ant_adaptive
 	$(call SHIP_ADAPTIVE,ant)
 
-model-anymal-adaptive: $(STAMP) ## ANYmals that find their hidden parameters
+model-anymal-adaptive: anymal-wide ## ANYmals that find their hidden parameters
 	$(NERD) data anymal --vary preset --trajectories 7000 --steps 200 --out datasets/anymal_varied
-	$(NERD) train anymal $(BEGUN) $(FEW_ROLLOUTS) --data datasets/anymal_varied --init-from anymal \
+	$(NERD) train anymal $(BEGUN) $(FEW_ROLLOUTS) --data datasets/anymal_varied --init-from runs/anymal_wide/last \
 		--lr 0.006 --adamw-lr 0.0018 --save-every 100 --out runs/anymal_adaptive
 	$(call SHIP_ADAPTIVE,anymal)
 
@@ -268,11 +268,45 @@ model-franka-mlp: data-franka ## Franka's MLP, with products: the same data, the
 		--validate-every 1500 --save-every 250 --threads 1
 	cp runs/franka_mlp_second/best/* $(PRETRAINED)/franka-mlp/
 
-model-anymal: $(STAMP) ## ANYmal's transformer: single steps; data along a policy did not help
+# ANYmal's networks: single steps and rollouts, then both again with more data, as the Ant's.
+ANYMAL := --validate-every 4000 --save-every 500 --threads 1
+ANYMAL_DATA := datasets/anymal datasets/anymal_more datasets/anymal_resting
+IN_ANYMAL := $(PY) experiments/time_to_policy.py --wanted 0 --frames 5000000 --horizon 16 \
+	--minibatch 8192 --lr 1e-3 --dynamics runs/anymal_mlp_first/best --episodes 64
+
+data-anymal: $(STAMP)
+	$(NERD) data anymal --trajectories 10000 --seed 21 --out datasets/anymal
+	$(NERD) data anymal --trajectories 10000 --seed 81 --out datasets/anymal_more
+	$(NERD) data anymal --strategy resting --trajectories 6000 --seed 71 --out datasets/anymal_resting
+
+data-anymal-learned: data-anymal
+	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) --rollout-lr-ratio 0.25 $(MLP) \
+		--steps 24000 --rollout-steps 4000 --out runs/anymal_mlp_first
+	$(IN_ANYMAL) anymal/forward --seed 11 --out runs/anymal_learned_11
+	$(IN_ANYMAL) anymal/sideways --seed 11 --out runs/anymal_learned_11
+	$(IN_ANYMAL) anymal/forward --seed 12 --out runs/anymal_learned_12
+	$(NERD) data anymal --policy runs/anymal_learned_*/anymal-*/*/[0-9]* \
+		--trajectories 2200 --steps 500 --seed 61 --out datasets/anymal_learned
+
+model-anymal-mlp: data-anymal-learned ## ANYmal's MLP: two stages, the second with data along policies
+	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) datasets/anymal_learned \
+		--lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4 $(MLP) \
+		--init-from runs/anymal_mlp_first/best --steps 10000 --rollout-steps 4500 --out runs/anymal_mlp_second
+	cp runs/anymal_mlp_second/best/* $(PRETRAINED)/anymal-mlp/
+
+anymal-wide: $(STAMP)
 	$(NERD) data anymal --trajectories 20000 --seed 1 --out datasets/anymal_wide
 	$(NERD) train anymal --data datasets/anymal_wide $(WIDE) --predicted-force --steps 10500 \
 		--bf16-fraction 0.7 --out runs/anymal_wide
-	cp runs/anymal_wide/last/* $(PRETRAINED)/anymal/
+
+model-anymal: anymal-wide data-anymal-learned ## ANYmal's transformer: single steps, then two stages with products
+	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) --rollout-lr-ratio 0.15 $(TRANSFORMER) \
+		--init-from runs/anymal_wide/last --lr 0.006 --adamw-lr 0.0018 \
+		--steps 9000 --rollout-steps 1000 --out runs/anymal_second
+	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) datasets/anymal_learned \
+		--lr 0.005 --adamw-lr 0.0015 --rollout-lr-ratio 0.3 $(TRANSFORMER) \
+		--init-from runs/anymal_second/best --steps 8000 --rollout-steps 3000 --out runs/anymal_third
+	cp runs/anymal_third/best/* $(PRETRAINED)/anymal/
 
 PENDULUM := --network transformer-2x96 --predicted-force --unconstrained-motion --loss-eps 1.0
 
@@ -290,25 +324,6 @@ model-double_pendulum: $(STAMP) ## the double pendulum's transformer: single ste
 		--steps 10000 --rollout-steps 2500 --rollout-lr-ratio 0.15 --validate-every 2500 \
 		--threads 1 --out runs/pendulum_third
 	cp runs/pendulum_third/best/* $(PRETRAINED)/double_pendulum/
-
-model-anymal-mlp: $(STAMP) ## ANYmal's learned model: two stages, the second with data along two policies
-	$(NERD) data anymal --trajectories 20000 --out datasets/anymal_mlp
-	$(NERD) train anymal --data datasets/anymal_mlp --network mlp-4x128 \
-		--steps 15000 --rollout-steps 1000 --bf16-fraction 0.8 --out runs/anymal_mlp
-	for task in forward sideways; do \
-		$(PY) examples/ppo.py --task anymal/$$task --dynamics runs/anymal_mlp/best \
-			--out runs/ppo_anymal_$$task --horizon 16 --minibatch 8192 --lr 1e-3 \
-			--total-frames 8000000 --episodes 512 || exit 1; \
-	done
-	$(NERD) data anymal --policy runs/ppo_anymal_forward --noise 0.3 --trajectories 5000 \
-		--out datasets/anymal_forward
-	$(NERD) data anymal --policy runs/ppo_anymal_sideways --noise 0.3 --trajectories 5000 \
-		--out datasets/anymal_sideways
-	$(NERD) train anymal --init-from runs/anymal_mlp/best --out runs/anymal_on \
-		--data datasets/anymal_mlp datasets/anymal_forward datasets/anymal_sideways \
-		--network mlp-4x128 --bf16-fraction 0.8 --steps 7000 --rollout-steps 1000 \
-		--lr 0.004 --adamw-lr 0.0012 --validate-every 1000
-	cp runs/anymal_on/best/* $(PRETRAINED)/anymal-mlp/
 
 PENDULUM_MLP := --network mlp-4x120 --predicted-force --unconstrained-motion \
 	--single-step-fraction 1.0 --loss-eps 1.0 --bf16-fraction 0.9 --validate-every 6000

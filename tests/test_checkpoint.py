@@ -248,7 +248,7 @@ def test_so_are_make_targets_of_models_that_take_more(name):
     # continued, learned on a GPU, or from data along a policy as well
     is_plain = made["init_from"] is None and made["device"] == "cpu"
     assert not is_plain or trajectories != preset.data.trajectories
-    assert made["trajectories"] == trajectories
+    assert 0 <= trajectories - made["trajectories"] <= 1e-4 * trajectories  # dropped
     expect_settings(made, {**asdict(preset.train), **changes})
 
 

@@ -142,7 +142,8 @@ class OODScore(nn.Module):
         super().__init__()
         one = torch.ones((), dtype=torch.float64)
         self.register_buffer("center", one.new_zeros(num_features))
-        self.register_buffer("whitening", one.new_zeros(num_features, num_features))
+        # the largest buffer of most models: float32 is exact enough for a score
+        self.register_buffer("whitening", torch.zeros(num_features, num_features))
         self.register_buffer("reach", one)
 
     @torch.no_grad()
@@ -170,7 +171,8 @@ class OODScore(nn.Module):
 
     def mahalanobis(self, features: Tensor) -> Tensor:
         """Distance ``(*batch,)`` from the mean in units of the data's spread."""
-        white = (features - self.center) @ self.whitening.T
+        around = features - self.center
+        white = around @ self.whitening.T.to(around.dtype)
         return torch.linalg.vector_norm(white, dim=-1)
 
     def forward(self, features: Tensor, excess: Tensor) -> Tensor:
