@@ -151,12 +151,8 @@ def _candidates(scene: Scene) -> Iterator[Isometry]:
     Joints at one place, such as the hips of a planar walker, are mapped to themselves or to
     each other.
     """
-    actuated, model, is_floating = (
-        list(scene.actuated),
-        scene.model,
-        scene.base.is_floating,
-    )
-    data = mujoco.MjData(model)
+    actuated, model = list(scene.actuated), scene.model
+    data, is_floating = mujoco.MjData(model), scene.base.is_floating
     data.qpos[:] = 0.0
     if is_floating:  # the base at the origin, not turned
         data.qpos[3] = 1.0
