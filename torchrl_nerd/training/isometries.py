@@ -73,8 +73,7 @@ class Isometry(nn.Module):
         actuated: list[int],
     ) -> None:
         super().__init__()
-        self.is_floating = body is not None
-        self.base = (7, 6) if self.is_floating else (0, 0)  # its part of qpos and qvel
+        self.base = (0, 0) if body is None else (7, 6)  # its part of qpos and qvel
         dofs = self.base[1]
         motors = [actuated.index(source) for source in sources[actuated]]
         keep_indices(self, joint_sources=sources[dofs:] - dofs, motors=motors)
@@ -92,7 +91,7 @@ class Isometry(nn.Module):
     def qpos(self, qpos: Tensor) -> Tensor:
         """Symmetric copy of positions ``(*batch, nq)``."""
         joints = self.joints(qpos[..., self.base[0] :])
-        if not self.is_floating:
+        if not any(self.base):
             return joints
         position, quat = qpos[..., :3] @ self.world.mT, qpos[..., 3:7] * self.mirror
         return torch.cat((position, quat_multiply(quat, self.turn), joints), -1)
@@ -104,7 +103,7 @@ class Isometry(nn.Module):
     def qvel(self, qvel: Tensor) -> Tensor:
         """Symmetric copy of velocities ``(*batch, nv)``."""
         joints = self.joints(qvel[..., self.base[1] :])
-        if not self.is_floating:
+        if not any(self.base):
             return joints
         linear, angular = qvel[..., :3] @ self.world.mT, qvel[..., 3:6] @ self.axial.mT
         return torch.cat((linear, angular, joints), -1)
