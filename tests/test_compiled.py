@@ -31,7 +31,9 @@ def test_a_long_compilation_is_announced_once_and_a_short_one_is_not(
     for _ in range(3):
         assert double(torch.ones(2)).tolist() == [2.0, 2.0]
     for thread in set(threading.enumerate()) - before:
-        if isinstance(thread, threading.Timer):  # nothing is left that would speak later
+        if isinstance(
+            thread, threading.Timer
+        ):  # nothing is left that would speak later
             thread.join(10.0)
             assert not thread.is_alive()
     assert capfd.readouterr().err.count("compiling a step") == expected
