@@ -45,6 +45,7 @@ from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
 from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN, TRUST
 from torchrl_nerd.modules.nerd import NeRD
+from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import make_task
 from torchrl_nerd.seeds import fold_in
 from torchrl_nerd.tasks import Task
@@ -291,10 +292,11 @@ def main(cfg: Config) -> None:
     """Both ways side by side, then the report.
 
     Raises:
-        ValueError: an unknown task, trajectories that are too short, or a folder that
-            holds models already.
+        ValueError: an unknown task or network, trajectories that are too short, or a
+            folder that holds models already.
     """
     make_task(cfg.name)
+    network_config(cfg.network)
     if cfg.length < PIECE:
         raise ValueError(f"expected --length of at least {PIECE}, got {cfg.length}")
     if any(cfg.folder.glob("model_*")):

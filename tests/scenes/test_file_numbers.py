@@ -1,5 +1,7 @@
 """Numbers that no robot has are refused in one sentence, which names the file."""
 
+import os
+
 import mujoco
 import pytest
 
@@ -71,6 +73,22 @@ def test_controls_that_mujoco_gives_up_on_are_refused(limit, tmp_path, capfd):
     mujoco.mj_step(model, data)
     assert data.warning[mujoco.mjtWarning.mjWARN_BADCTRL].number == 1
     assert Scene.from_mjcf(write(tmp_path, ctrlrange="-1 1e4"))
+
+
+def test_a_robot_is_read_again_once_a_file_that_it_includes_has_changed(tmp_path):
+    whole, body = DEFAULT | {"mass": "2"}, "<body" + ROBOT.split("<body")[1]
+    part, main = body.split("</worldbody>")[0], tmp_path / "robot.xml"
+    (tmp_path / "parts").mkdir()
+    included = tmp_path / "parts" / "arm.xml"
+    main.write_text(
+        ROBOT.replace(part, '<include file="parts/arm.xml"/>').format(**whole)
+    )
+    for mass in ("1", "2"):
+        text = part.format(**DEFAULT | {"mass": mass})
+        included.write_text(f"<mujocoinclude>{text}</mujocoinclude>")
+        os.utime(included, ns=(0, int(mass)))  # some disks tell seconds alone
+        first, again = import_scene(str(main)), import_scene(str(main))
+        assert first is again and first.model.body_mass[1] == float(mass)
 
 
 def test_a_path_has_one_name_however_it_is_typed(tmp_path, monkeypatch):

@@ -183,6 +183,17 @@ def test_an_env_of_a_model_hands_out_what_it_was_driven_by(compile, arm, generat
         torch.testing.assert_close(after[QPOS], now["next", QPOS], rtol=1e-5, atol=1e-5)
 
 
+def test_a_control_beyond_its_range_is_the_range_end_as_in_mujoco(arm, generator):
+    state, torque, _, ctrl = one_step(arm)
+    for dynamics in (NeRDDynamics(random_model(arm, generator)), MujocoDynamics(arm)):
+        steps = []
+        for beyond in (2.0, 7.0, -1e9):  # their range is from -2 to 2
+            dynamics.reset(state)
+            steps.append(dynamics.step(state, torque, None, beyond * ctrl))
+        assert torch.equal(steps[0][QVEL], steps[1][QVEL])
+        assert not torch.equal(steps[0][QVEL], steps[2][QVEL])
+
+
 def test_data_along_a_policy_are_the_servos_motion(arm, generator):
     def actor(shown: TensorDict) -> TensorDict:
         return shown.set("action", 0.3 * shown["observation"][:, :2].sin())

@@ -15,6 +15,7 @@ from torchrl_nerd.keys import PARAMETERS, QPOS, QVEL
 from torchrl_nerd.modules.history import History, WindowNetwork
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.scenes.commands import drive_of
+from torchrl_nerd.scenes.controllers import clip, ctrl_range
 from torchrl_nerd.scenes.variation import ranges_of
 
 Inference = Literal["streaming", "window"]
@@ -81,6 +82,7 @@ class TorchDynamics(Dynamics):
         self._compiled = Compiled(self._predict_as_read, **self.compile_options)
         self._in_parts = RowThreads(self._compiled)
         self._row_work = self.scene.layout.nv
+        self._ctrl_range = ctrl_range(self.scene.model)
 
     def parts(self, num_envs: int) -> int:
         """In how many parts, each on a thread of its own, a compiled step is made."""
@@ -133,8 +135,10 @@ class TorchDynamics(Dynamics):
         qpos, qvel = (state[key].to(here, self.state_dtype) for key in (QPOS, QVEL))
         ground = None if terrain is None else terrain.to(qpos)
         self._prepare(len(qpos))
-        told = None if self.scene.servos is None or ctrl is None else ctrl.to(qpos)
-        drive = drive_of(joint_torque.to(qpos), told, self._told(state, qpos))
+        held = None
+        if self.scene.servos is not None and ctrl is not None:  # as MuJoCo reads it
+            held = clip(ctrl.to(qpos), *self._ctrl_range)
+        drive = drive_of(joint_torque.to(qpos), held, self._told(state, qpos))
         is_recorded = self.differentiable and torch.is_grad_enabled()
         if self.differentiable and not is_recorded:  # it is part of an earlier graph
             self._memory = self.history()

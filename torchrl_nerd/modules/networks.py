@@ -138,8 +138,8 @@ MLPS = (1, 16), (1, 32), (2, 32), (2, 64), (4, 64), (4, 120), (4, 128), (4, 160)
 NETWORKS: dict[str, NetworkConfig] = {
     **TRANSFORMERS,
     **{f"mlp-{depth}x{width}": MLPConfig(depth, width) for depth, width in MLPS},
+    "mlp-4x64-products": MLPConfig(4, 64, products=True),
     "mlp-4x128-products": MLPConfig(4, 128, products=True),
-    "mlp-4x160-products": MLPConfig(4, 160, products=True),
     "gru": GRUConfig(),
 }
 """Kind, then depth x width; ``adaptive``: a transformer for hidden parameters."""

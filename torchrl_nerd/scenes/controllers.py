@@ -98,7 +98,7 @@ class PDController:
         torque = constant(qpos, self.kp) * offset - constant(qpos, self.kd) * velocity
         if self.limit is None:
             return torque
-        return _clip(torque, [-limit for limit in self.limit], self.limit)
+        return clip(torque, [-limit for limit in self.limit], self.limit)
 
 
 @dataclass(frozen=True)
@@ -191,16 +191,20 @@ class ActuatorController:
         speed = take(qvel, self.dof_addresses) @ moment.mT
         force = (gain[0] + gain[1] * stretch + gain[2] * speed) * ctrl
         force = force + bias[0] + bias[1] * stretch + bias[2] * speed
-        force = _clip(force, self.force_low, self.force_high)
-        return _clip(force @ moment, self.torque_low, self.torque_high)
+        force = clip(force, self.force_low, self.force_high)
+        return clip(force @ moment, self.torque_low, self.torque_high)
+
+
+def ctrl_range(model: mujoco.MjModel) -> tuple[Row, Row]:
+    """Smallest and largest control of each actuator; `UNLIMITED` where none is clipped."""
+    is_clipped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    is_limited = model.actuator_ctrllimited * is_clipped
+    return _ranges(is_limited, model.actuator_ctrlrange, UNLIMITED)
 
 
 def clipped_ctrl(model: mujoco.MjModel, ctrl: Tensor) -> Tensor:
     """What MuJoCo takes a control ``(*batch, nu)`` for: one within its range."""
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
-        return ctrl
-    ranges = model.actuator_ctrllimited, model.actuator_ctrlrange
-    return _clip(ctrl, *_ranges(*ranges, UNLIMITED))
+    return clip(ctrl, *ctrl_range(model))
 
 
 def driven_dofs(model: mujoco.MjModel) -> list[int]:
@@ -257,5 +261,6 @@ def _rows(matrix: np.ndarray) -> tuple[Row, ...]:
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _clip(x: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
+def clip(x: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
+    """``x (*batch, n)`` from ``low`` to ``high``, n numbers each."""
     return torch.minimum(torch.maximum(x, constant(x, low)), constant(x, high))
