@@ -621,7 +621,7 @@ def test_settings_that_do_not_fit_are_refused_before_data_are_drawn(
         "cartpole --network nope": "nope",
         "cartpole --sequence-length 400": "at least 400 steps, got 100: draw them",
         "cartpole --symmetries 4": "expected symmetries 1 or 2, ",
-        "double_pendulum --use-symmetry": "motors and one ground",
+        "double_pendulum --use-symmetry": "actuators on them and one ground",
     }.items():
         assert said in refusal(capsys, "train", *line.split())
     assert not (tmp_path / "datasets").exists()

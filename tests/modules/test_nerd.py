@@ -53,6 +53,18 @@ def test_decode_inverts_the_normalised_target(scene, dtype, tolerance, generator
         assert (got - want).abs().max() < tolerance * (scale + want.abs().max())
 
 
+class OtherDelta(StateDelta):
+    """Some other target."""
+
+
+def test_features_and_targets_of_ones_own_are_not_lost_over_another_ground():
+    scene = load_scene("cartpole")
+    given = {"state_delta": OtherDelta(scene)}
+    model = NeRD(scene, NO_PREDICTIONS, NETWORKS["mlp-1x16"], **given)
+    with pytest.raises(ValueError, match="got SceneFeatures and OtherDelta$"):
+        model.with_terrain(scene)
+
+
 @each_precision
 def test_encode_is_the_transforms_normalised(scene, dtype, tolerance, generator):
     model = NeRD(

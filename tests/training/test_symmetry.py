@@ -15,6 +15,7 @@ from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import MujocoDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import (
+    CTRL,
     JOINT_TORQUE,
     NEXT_QPOS,
     NEXT_QVEL,
@@ -142,28 +143,68 @@ TWO_ARMS = """
       <joint name="lift" type="slide" axis="0 0 1"/>
       <geom fromto="0 -0.2 0 0 0.2 0"/>
       <body pos="0 0.2 0"><joint name="left" axis="0.6 0 0.8" range="-80 {high}"/>
-        <geom fromto="0 0 0 0 0.3 -0.2"/></body>
+        <geom fromto="0 0 0 0 0.3 -0.2"/><site name="hand"/></body>
       <body pos="0 -0.2 0"><joint name="right" axis="0.6 0 0.8" range="-70 80"/>
         <geom fromto="0 0 0 0 -0.3 -0.2"/></body>
     </body>
   </worldbody>
-  <actuator><motor joint="right"/><motor joint="left"/></actuator>
+  <actuator>{actuators}</actuator>
 </mujoco>
 """
+MOTORS = '<motor joint="right"/><motor joint="left"/>'
+SERVO = '<position joint="{}" kp="{}" kv="0.5" ctrlrange="{}"/>'
+
+
+def two_arms(folder: Path, high: float = 70, actuators: str = MOTORS) -> Scene:
+    """A lift with two arms, whose range ends at ``high`` degrees on the left."""
+    path = folder / "arms.xml"
+    path.write_text(TWO_ARMS.format(high=high, actuators=actuators))
+    return Scene.from_mjcf(path)
 
 
 @pytest.mark.parametrize(("high", "order"), [(70, 2), (75, 1)])
 def test_two_arms_of_a_fixed_base_anywhere_are_mirrored(high, order, tmp_path):
     """The hinges turn about axes that the mirror does not put on each other as they are."""
-    path = tmp_path / "arms.xml"
-    path.write_text(TWO_ARMS.format(high=high))
-    found = find_isometries(Scene.from_mjcf(path))
+    found = find_isometries(two_arms(tmp_path, high))
     assert len(found) == order
     for mirror in found[1:]:
         qpos = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
         assert mirror.qpos(qpos).tolist() == [0.1, -0.3, -0.2]
         torque = torch.tensor([1.0, 2.0], dtype=torch.float64)
         assert mirror.torque(torque).tolist() == [-2.0, -1.0]
+
+
+@pytest.mark.parametrize(
+    ("right", "order"),
+    [((30, "-1 0.5"), 2), ((31, "-1 0.5"), 1), ((30, "-1 0.4"), 1)],
+    ids=["alike", "another law", "another range"],
+)
+def test_controls_of_servos_are_mirrored(right, order, tmp_path, generator):
+    servos = SERVO.format("right", *right) + SERVO.format("left", 30, "-0.5 1")
+    scene = two_arms(tmp_path, actuators=servos)
+    symmetry = Symmetry(scene)
+    assert len(symmetry.isometries) == order
+    data = simulate(scene, 8, 10, generator)
+    encode = SceneFeatures(scene), StateDelta(scene)
+    dynamics = MujocoDynamics(scene)
+    for number, mirror in enumerate(symmetry.isometries):
+        copy, choice = mirror(data), torch.full((8,), number)
+        if number == 1:
+            assert copy[CTRL][0, 0].tolist() == (-data[CTRL][0, 0].flip(0)).tolist()
+        dynamics.reset(copy[:, 0])
+        path = dynamics.rollout(copy[:, 0], None, None, copy[CTRL])
+        for key, there in ((QPOS, NEXT_QPOS), (QVEL, NEXT_QVEL)):
+            torch.testing.assert_close(path[key], copy[there], rtol=1e-7, atol=1e-7)
+        both = symmetry.tokens, symmetry.targets
+        here, mirrored = raw_tokens(*encode, data), raw_tokens(*encode, copy)
+        for copies, x, expected in zip(both, here, mirrored, strict=True):
+            torch.testing.assert_close(copies(x, choice), expected)
+
+
+def test_a_servo_that_no_joint_has_is_refused(tmp_path):
+    servo = '<position site="hand" kp="3" gear="1 0 0 0 0 0"/>'
+    with pytest.raises(ValueError, match="actuators on them and one ground .*arms.xml"):
+        find_isometries(two_arms(tmp_path, actuators=servo))
 
 
 def test_a_feature_that_only_the_data_fill_is_refused(generator):

@@ -147,9 +147,14 @@ class NeRD(nn.Module):
         """The same weights for the same robot over another ground.
 
         Raises:
-            ValueError: another robot, a ground that is described by other features, or
-                other parameters than the model is told.
+            ValueError: another robot, a ground that is described by other features,
+                other parameters than the model is told, or features or targets that were
+                given to the model.
         """
+        own = type(self.scene_features), type(self.state_delta)
+        if own != (SceneFeatures, StateDelta):  # they hold the ground that they are of
+            names = " and ".join(x.__name__ for x in own)
+            raise ValueError(f"expected SceneFeatures and StateDelta, got {names}")
         if scene.robot_hash != self.scene.robot_hash:
             raise ValueError(
                 f"expected the robot of scene '{self.scene.name}' over another ground, "

@@ -7,8 +7,9 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 
 from torchrl_nerd.geometry.manifold import SLIDE
-from torchrl_nerd.keys import JOINT_TORQUE, PARAMETERS, QPOS
+from torchrl_nerd.keys import CTRL, JOINT_TORQUE, PARAMETERS, QPOS, QVEL
 from torchrl_nerd.scenes import Scene
+from torchrl_nerd.scenes.commands import drive
 from torchrl_nerd.scenes.sampling import sample_commands
 
 OVERSHOOT = 0.2  # of a joint's range, beyond its limits
@@ -16,9 +17,10 @@ UPRIGHT = 1.0 - 1e-6  # smallest height of an axis that is vertical
 
 
 def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
-    """Random states and torques ``[count]``, up to ``max_depth`` m in the ground.
+    """Random states, torques and servos' controls, up to ``max_depth`` m in the ground.
 
-    Joints are up to `OVERSHOOT` of their ranges beyond them. Of a varied scene each is of
+    The batch is ``[count]``. Joints are up to `OVERSHOOT` of their ranges beyond them.
+    Of a varied scene each is of
     a robot of its own.
     """
     generator = Generator().manual_seed(0)
@@ -30,8 +32,11 @@ def states_in_contact(scene: Scene, count: int, max_depth: float) -> TensorDict:
         state[QPOS][:, scene.model.jnt_qposadr[joint]] = low + (high - low) * mixed
     draw = torch.rand(count, dtype=torch.float64, generator=generator)
     _place_on_ground(scene, state, -max_depth * draw)
-    torque = sample_commands(scene.sampling, scale, 1, generator)
-    found = TensorDict(state, [count]).set(JOINT_TORQUE, torque[:, 0])
+    command = sample_commands(scene.sampling, scale, 1, generator)[:, 0]
+    torque, ctrl = drive(scene, command, state[QPOS], state[QVEL])
+    found = TensorDict(state, [count]).set(JOINT_TORQUE, torque)
+    if ctrl is not None:
+        found[CTRL] = ctrl
     if scene.variation is not None:
         own = scene.variation.draw(count, generator)
         kinds = [p.kind for p in scene.variation.parameters]

@@ -18,7 +18,8 @@ from torchrl_nerd.modules.training_range import TrainingRange
 from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.contact_states import states_in_contact
-from torchrl_nerd.training.isometries import Isometry, find_isometries
+from torchrl_nerd.training.isometries import find_isometries
+from torchrl_nerd.training.isometry import Isometry
 from torchrl_nerd.training.samples import raw_tokens
 from torchrl_nerd.training.signed_permutations import SignedPermutations, match_entries
 from torchrl_nerd.transforms import Normalize, StateDelta, Stats
