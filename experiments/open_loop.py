@@ -78,6 +78,7 @@ class Config:
     updates: int = 5000  # on 1,024 single steps
     rollout_updates: int = 500  # on 128 rollouts of 8 steps
     symmetries: int = 1  # of the robot, that the network has
+    near_symmetry: bool = False  # those that it has but nearly, as well
     policy: Path | None = None  # of a task of this robot; None: random motion alone
     along: int = 200  # trajectories along it for the data, of up to 1,000 control steps
     noise: float = 0.3  # of actions there, largest standard deviation
@@ -124,6 +125,7 @@ def train(scene: Scene, cfg: Config) -> Path:
         single_step_fraction=1.0,
         loss_eps=0.02,
         symmetries=cfg.symmetries,
+        near_symmetry=cfg.near_symmetry,
         validate_every=cfg.updates + cfg.rollout_updates,  # at the end alone
         save_every=500,
         seed=cfg.seed,

@@ -73,6 +73,7 @@ class Config:
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
     network: str = "mlp-4x64"
     symmetries: int = 1  # of the robot, built into the network: 4 of Ant-v5
+    near_symmetry: bool = False  # those that it has but nearly, as well
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
     num_envs: int = 512
@@ -185,7 +186,8 @@ def train_model(
     how = TrainConfig(
         network=cfg.network,
         symmetries=cfg.symmetries,
-        use_symmetry=cfg.symmetries > 1,
+        near_symmetry=cfg.near_symmetry,
+        use_symmetry=cfg.symmetries > 1 and not cfg.near_symmetry,
         steps=cfg.updates if start is None else updates,
         rollout_steps=0,
         batch_size=cfg.batch,

@@ -94,8 +94,9 @@ class TrainConfig:
     """Settings of a training: one-step targets first, then rollouts of the model.
 
     Raises:
-        SettingError: a number that is too small, or symmetries of a hybrid, whose
-            analytic change has no symmetric copies.
+        SettingError: a number that is too small, symmetries of a hybrid, whose
+            analytic change has no symmetric copies, or symmetric copies of the data of
+            a robot that is nearly symmetric.
     """
 
     network: str = "transformer-2x64"  # transformer, mlp or gru with depth x width
@@ -114,6 +115,7 @@ class TrainConfig:
     use_symmetry: bool = False  # augment data by the robot's symmetries
     # mirrors of the robot and their products that the network itself has: 2, 4 or 8
     symmetries: int = 1
+    near_symmetry: bool = False  # mirrors that a step has but for a few percent, too
     rollout_batch_size: int = 128  # rollouts per update
     rollout_length: int = 8  # control steps of a rollout
     rollout_history: int = 0  # recorded steps that the model sees before it
@@ -149,6 +151,11 @@ class TrainConfig:
         if self.use_symmetry and self.step is not None:
             raise SettingError(
                 "expected training without use_symmetry for a hybrid, got it with one"
+            )
+        if self.near_symmetry and (self.use_symmetry or self.symmetries == 1):
+            raise SettingError(
+                "expected near_symmetry with symmetries above 1 and without use_symmetry, "
+                f"got symmetries {self.symmetries} and use_symmetry {self.use_symmetry}"
             )
         if self.symmetries > 1 and self.step is not None:
             raise SettingError(

@@ -15,14 +15,9 @@ from torchrl_nerd.dynamics import NeRDDynamics
 from torchrl_nerd.geometry.rotations import orientation_error
 from torchrl_nerd.keys import JOINT_TORQUE, QPOS, QVEL
 from torchrl_nerd.modules.networks import MLPConfig
-from torchrl_nerd.modules.symmetric import (
-    SignedCopies,
-    block_product,
-    set_mirrors,
-    transform,
-    walsh_signs,
-)
+from torchrl_nerd.modules.symmetric import SignedCopies, block_product, set_mirrors
 from torchrl_nerd.modules.transformer import TransformerConfig
+from torchrl_nerd.modules.walsh import transform, walsh_signs
 from torchrl_nerd.robots import load_scene, make_task
 from torchrl_nerd.settings import SettingError
 from torchrl_nerd.training.optimizers import split_parameters
@@ -97,6 +92,26 @@ def test_mirrored_tokens_give_mirrored_outputs(network, tokens):
     unsigned = other[0], torch.ones_like(other[1])  # the wrong mirrors: not symmetric
     set_mirrors(network, unsigned, products(network.config.symmetries, OUTPUTS))
     assert max(apart(network, tokens)) > 1e-3
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", CONFIGS)
+def test_an_asymmetry_is_zero_at_first_and_tells_mirrors_apart(
+    name, tokens, generator
+):
+    config = replace(CONFIGS[name], symmetries=4, asymmetry=True)
+    network = config.build(INPUTS, OUTPUTS)
+    assert not network.embed.asymmetry.any()
+    enliven(network, generator).double()
+    set_mirrors(network, products(4, INPUTS), products(4, OUTPUTS))
+    assert min(apart(network, tokens)[1:]) > 1e-3
+    plain = replace(config, asymmetry=False).build(INPUTS, OUTPUTS).double()
+    weights = network.state_dict()
+    weights.pop("embed.asymmetry")
+    plain.load_state_dict(weights)
+    network.embed.asymmetry.zero_()
+    assert torch.equal(network(tokens), plain(tokens))
+    assert max(apart(network, tokens)) < 1e-12 * float(network(tokens).abs().max())
 
 
 @torch.no_grad()
@@ -267,6 +282,29 @@ def test_it_is_trained_saved_loaded_and_trained_on(ant_data, tmp_path):
     plain = replace(second, symmetries=1)
     with pytest.raises(ValueError, match="mlp-1x16 with symmetries 4, got mlp-1x16$"):
         Trainer(*about, plain, tmp_path / "plain", init_from=start, **quiet)
+    near = replace(second, use_symmetry=False, near_symmetry=True)
+    with pytest.raises(
+        ValueError, match="symmetries 4, got mlp-1x16 with nearly symmetries 4$"
+    ):
+        Trainer(*about, near, tmp_path / "near", init_from=start, **quiet)
+
+
+def test_a_robot_that_is_nearly_symmetric_learns_how_it_is_not(tmp_path):
+    """The left knee of Gymnasium's Humanoid has a spring, the right one has none."""
+    scene = load_scene("gymnasium/Humanoid-v5")
+    sizes = dict(batch_size=8, sequence_length=1, steps=3, rollout_steps=0)
+    config = TrainConfig("mlp-1x16", symmetries=2, near_symmetry=True, **sizes)
+    data = simulate(scene, 20, 20, torch.Generator().manual_seed(0))
+    about = scene, data[is_sound(data)], scene, config, tmp_path / "run"
+    model = Trainer(*about, horizons=(2,), quiet=True, logger="csv").run().eval()
+    loaded = load_checkpoint(tmp_path / "run" / "last", scene)
+    assert loaded.config == MLPConfig(1, 16, symmetries=2, asymmetry=True)
+    assert loaded.network.embed.asymmetry.all()
+    state = data[:, 1]
+    steps = [NeRDDynamics(x).step(state, state[JOINT_TORQUE]) for x in (model, loaded)]
+    assert torch.equal(steps[0][QVEL], steps[1][QVEL])
+    with pytest.raises(SettingError, match="symmetries 1, the .* got 2"):
+        make_model(scene, replace(config, near_symmetry=False), None, Symmetry(scene))
 
 
 @pytest.mark.parametrize("name, most", [("ant", 4), ("cube", 8)])
@@ -291,6 +329,12 @@ def test_symmetries_that_no_network_has_are_refused(ant_data):
     scene = load_scene("ant")
     with pytest.raises(SettingError, match="1 of symmetries for a hybrid, got 2"):
         TrainConfig(step="unconstrained", symmetries=2)
+    for how in (
+        {"near_symmetry": True},
+        {"near_symmetry": True, "symmetries": 2, "use_symmetry": True},
+    ):
+        with pytest.raises(SettingError, match="expected near_symmetry with symmetr"):
+            TrainConfig(**how)
     with pytest.raises(SettingError, match="or an MLP with symmetries, got 'gru'"):
         make_model(scene, TrainConfig(network="gru", symmetries=2))
     for width, count in ((16, 3), (16, -4), (128, 128)):

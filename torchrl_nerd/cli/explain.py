@@ -28,19 +28,25 @@ class Explain(Command):
         """Print the report and return its contents."""
         scene = self.inputs()
         report = explain(scene)
-        counts, why_none = _symmetries(scene)
-        why = why_none or f"nerd train {self.scene} --symmetries {counts[-1]}"
-        listed = f"{', '.join(map(str, counts))}: {why}"
-        print(report, f"symmetries of a network: {listed}", sep="\n")
-        found = {"symmetries": counts, "why_no_symmetries": why_none}
+        found, how = _symmetries(scene)
+        print(report, f"symmetries of a network: {how}", sep="\n")
         return asdict(report) | {"token_width": report.token_width} | found
 
 
-def _symmetries(scene: Scene) -> tuple[list[int], str | None]:
-    """Numbers of symmetries that a network can have, or why it is 1 alone."""
+def _symmetries(scene: Scene) -> tuple[dict[str, Any], str]:
+    """Numbers of symmetries that a network can have, and in words, or why it is 1 alone."""
+    counts, near, why = [1], [1], None
     try:
         counts = Symmetry(scene).counts()
+        if counts == [1]:
+            near = Symmetry(scene, is_near=True).counts()
+            why = "no mirror or half turn commutes with MuJoCo's step and the features"
     except ValueError as error:
-        return [1], str(error)
-    none = "no mirror or half turn commutes with MuJoCo's step and the features"
-    return counts, none if counts == [1] else None
+        why = str(error)
+    how = f"{', '.join(map(str, counts))}: "
+    if len(near) > 1:
+        how += f"nearly {near[-1]}: --symmetries {near[-1]} --near-symmetry"
+    else:
+        how += why or f"nerd train {scene.name} --symmetries {counts[-1]}"
+    found = {"symmetries": counts, "near_symmetries": near, "why_no_symmetries": why}
+    return found, how

@@ -23,6 +23,7 @@ class MLPConfig:
     width: int = 64
     products: bool = False  # of features, see `products`
     symmetries: int = 1  # mirrors of the robot and their products; see `symmetric`
+    asymmetry: bool = False  # has them but nearly; see `Embedding`
 
     def build(self, num_inputs: int, num_outputs: int) -> "MLP":
         """A freshly initialised network."""
@@ -42,7 +43,7 @@ class MLP(nn.Module):
         expect_count(1, width=config.width)
         self.config = config
         sizes = config.width, config.symmetries
-        self.embed = make_embedding(num_inputs, *sizes)
+        self.embed = make_embedding(num_inputs, *sizes, asymmetry=config.asymmetry)
         self.blocks = nn.ModuleList(FeedForward(*sizes) for _ in range(config.depth))
         self.head = make_head(config.width, num_outputs, config.symmetries)
         self.products = make_products(config.products, num_inputs, num_outputs, *sizes)

@@ -14,7 +14,7 @@ the diagonal, and so a K-th of the products. Activation functions act on the par
 Ordonez-Apraez et al., https://arxiv.org/abs/2402.15552, on symmetries of robots.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_nerd.modules.linear import FullLinear, InnerLinear
+from torchrl_nerd.modules.walsh import transform, walsh_matrix, walsh_signs, walsh_sums
 
 HEAD_WIDTH = 64  # paper, appendix A
 
@@ -42,36 +43,6 @@ def expect_symmetries(width: int, symmetries: int) -> None:
             f"expected symmetries to be a power of two that divides width {width} and the "
             f"head's {HEAD_WIDTH}, got {symmetries}"
         )
-
-
-def walsh_signs(order: int) -> Tensor:
-    """Walsh matrix ``(order, order)`` of signs: minus where i & k has odd parity."""
-    signs = [[(-1) ** (i & k).bit_count() for k in range(order)] for i in range(order)]
-    return torch.tensor(signs, dtype=torch.int8)  # stays so where weights are cast
-
-
-def walsh_matrix(signs: Tensor, dtype: torch.dtype) -> Tensor:
-    """The orthogonal matrix ``(K, K)`` of such signs, its own inverse."""
-    return signs.to(dtype) * len(signs) ** -0.5
-
-
-def walsh_sums(parts: Sequence[Tensor]) -> list[Tensor]:
-    """The K sums of K parts with the signs of `walsh_signs`, in K log2(K) additions."""
-    sums, stride = list(parts), 1
-    while stride < len(sums):
-        for low in range(len(sums)):
-            if not low & stride:
-                a, b = sums[low], sums[low | stride]
-                sums[low], sums[low | stride] = a + b, a - b
-        stride *= 2
-    return sums
-
-
-def transform(x: Tensor, signs: Tensor) -> Tensor:
-    """Parts to characters and back, ``(*batch, K, n)``."""
-    first = x.movedim(-2, 0)  # (K, *batch, n), which is how blocks leave it in memory
-    mixed = walsh_matrix(signs, x.dtype) @ first.flatten(1)
-    return mixed.view(first.shape).movedim(0, -2)
 
 
 def block_product(x: Tensor, weight: Tensor) -> Tensor:
@@ -160,15 +131,26 @@ class Mirrored(FullLinear):
 
 
 class Embedding(Mirrored):
-    """Characters of a token: part k is ``W T_k x + b``."""
+    """Characters of a token: part k is ``W T_k x + b``, and ``b_k`` with an asymmetry.
+
+    Of a robot that has its mirrors but nearly, the biases of the other characters say how
+    it differs from its mirrored self. They are zero at first.
+    """
 
     signs: Tensor
 
     def __init__(
-        self, num_inputs: int, width: int, symmetries: int, bias: bool = True
+        self,
+        num_inputs: int,
+        width: int,
+        symmetries: int,
+        bias: bool = True,
+        asymmetry: bool = False,
     ) -> None:
         shape = num_inputs, width // symmetries
         super().__init__(shape, num_inputs, symmetries, bias)
+        odd = torch.zeros(width - shape[1]) if asymmetry else None
+        self.asymmetry = None if odd is None else nn.Parameter(odd)
         self.register_buffer("signs", walsh_signs(symmetries), persistent=False)
 
     def multiply(self, x: Tensor) -> Tensor:
@@ -178,6 +160,8 @@ class Embedding(Mirrored):
         bias = self.bias
         if bias is not None:  # the same in all parts: in the first character alone
             bias = F.pad(bias * symmetries**0.5, (0, (symmetries - 1) * size))
+            if self.asymmetry is not None:
+                bias = bias + F.pad(self.asymmetry, (size, 0))
         flat = F.linear(x, weight.transpose(0, 1).flatten(0, 1), bias)
         return flat.unflatten(-1, (symmetries, size))
 
@@ -227,13 +211,17 @@ def hidden_shape(width: int, symmetries: int) -> tuple[int, ...]:
 
 
 def make_embedding(
-    num_inputs: int, width: int, symmetries: int, bias: bool = True
+    num_inputs: int,
+    width: int,
+    symmetries: int,
+    bias: bool = True,
+    asymmetry: bool = False,
 ) -> FullLinear:
     """From a token to the hidden vector."""
     if symmetries == 1:
         return FullLinear(num_inputs, width, bias)
     expect_symmetries(width, symmetries)
-    return Embedding(num_inputs, width, symmetries, bias)
+    return Embedding(num_inputs, width, symmetries, bias, asymmetry)
 
 
 def make_inner(num_inputs: int, num_outputs: int, symmetries: int) -> InnerLinear:

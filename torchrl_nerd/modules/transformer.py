@@ -29,6 +29,7 @@ from torchrl_nerd.modules.symmetric import (
 )
 
 MASKED = float("-inf")
+LEAST = {"band": 2, "pairs": 0, "products": 0, "asymmetry": 0}  # of sizes, others 1
 # Widest band whose step is made of sums of products: a product of matrices of one row is
 # slower there, GPUs included. With a band of 64 it saves a third of an env's step.
 NARROW = 16
@@ -45,6 +46,7 @@ class TransformerConfig:
     pairs: bool = False  # embed a token together with the one before it
     products: bool = False  # of features, see `products`
     symmetries: int = 1  # mirrors of the robot and their products; see `symmetric`
+    asymmetry: bool = False  # has them but nearly; see `Embedding`
 
     def build(self, num_inputs: int, num_outputs: int) -> "CausalTransformer":
         """A freshly initialised network."""
@@ -171,7 +173,7 @@ class CausalTransformer(nn.Module):
     ) -> None:
         super().__init__()
         for name, size in asdict(config).items():
-            if size < {"band": 2, "pairs": 0, "products": 0}.get(name, 1):
+            if size < LEAST.get(name, 1):
                 raise ValueError(f"expected more {name} in a transformer, got {size}")
         if config.width % config.heads:
             raise ValueError(
@@ -179,7 +181,7 @@ class CausalTransformer(nn.Module):
             )
         self.config = config
         sizes = config.width, config.symmetries
-        self.embed = make_embedding(num_inputs, *sizes)
+        self.embed = make_embedding(num_inputs, *sizes, asymmetry=config.asymmetry)
         self.embed_last = None
         if config.pairs:
             self.embed_last = make_embedding(num_inputs, *sizes, bias=False)

@@ -73,7 +73,8 @@ def configured_network(config: TrainConfig) -> NetworkConfig:
             f"expected a transformer or an MLP with symmetries, got '{config.network}': "
             "train it with symmetries 1"
         )
-    return replace(network, symmetries=config.symmetries)
+    how = {"symmetries": config.symmetries, "asymmetry": config.near_symmetry}
+    return replace(network, **how)
 
 
 def begin_from(
@@ -152,8 +153,9 @@ def _named(network: NetworkConfig) -> str:
     """Names of a network in `NETWORKS`, or all that is known of it, and its symmetries."""
     plain, ending = network, ""
     if isinstance(network, TransformerConfig | MLPConfig) and network.symmetries > 1:
-        plain = replace(network, symmetries=1)
-        ending = f" with symmetries {network.symmetries}"
+        plain = replace(network, symmetries=1, asymmetry=False)
+        nearly = " nearly" * network.asymmetry
+        ending = f" with{nearly} symmetries {network.symmetries}"
     names = [name for name, config in NETWORKS.items() if config == plain]
     if not names and isinstance(plain, TransformerConfig):
         usual = replace(plain, band=TransformerConfig.band)
@@ -186,7 +188,7 @@ def find_symmetry(scene: Scene, config: TrainConfig) -> Symmetry | None:
     """The robot's symmetries, where data or network are to have them; see `Symmetry`."""
     if not config.use_symmetry and config.symmetries == 1:
         return None
-    return Symmetry(scene, config.features)
+    return Symmetry(scene, config.features, config.near_symmetry)
 
 
 def fingerprint(model: NeRD) -> str:

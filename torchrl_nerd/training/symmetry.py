@@ -32,15 +32,20 @@ class Symmetry(nn.Module):
     """Isometries of a robot, the identity first, and their effect on tokens and targets.
 
     Of `find_isometries` those that the features have too: a shape's contact points need
-    not be as symmetric as the shape.
+    not be as symmetric as the shape. ``is_near``: those that hold nearly as well.
 
     Raises:
         ValueError: see `find_isometries`.
     """
 
-    def __init__(self, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: FeatureConfig = NO_PREDICTIONS,
+        is_near: bool = False,
+    ) -> None:
         super().__init__()
-        self.name, group = scene.name, find_isometries(scene)
+        self.name, group = scene.name, find_isometries(scene, is_near)
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]
         states = cast(TensorDict, TensorDict.cat(parts))
