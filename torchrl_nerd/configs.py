@@ -13,7 +13,7 @@ from torchrl_nerd.settings import (
 
 COUNTS = (
     *("batch_size", "sequence_length", "rollout_batch_size", "rollout_length"),
-    *("save_every", "validate_every", "rollout_restarts", "symmetries"),
+    *("save_every", "validate_every", "rollout_restarts"),
 )
 
 Update = Literal["physics", "all", "head"]
@@ -113,7 +113,8 @@ class TrainConfig:
     # share of updates on as many single states in place of sequences
     single_step_fraction: float = 0.75
     use_symmetry: bool = False  # augment data by the robot's symmetries
-    # mirrors of the robot and their products that the network itself has: 2, 4 or 8
+    # mirrors of the robot and their products that the network itself has: 1, 2, 4 or 8;
+    # 0 for as many as there are
     symmetries: int = 1
     near_symmetry: bool = False  # mirrors that a step has but for a few percent, too
     rollout_batch_size: int = 128  # rollouts per update
@@ -152,7 +153,7 @@ class TrainConfig:
             raise SettingError(
                 "expected training without use_symmetry for a hybrid, got it with one"
             )
-        if self.near_symmetry and (self.use_symmetry or self.symmetries == 1):
+        if self.near_symmetry and (self.use_symmetry or self.symmetries < 2):
             raise SettingError(
                 "expected near_symmetry with symmetries above 1 and without use_symmetry, "
                 f"got symmetries {self.symmetries} and use_symmetry {self.use_symmetry}"

@@ -96,9 +96,7 @@ def test_mirrored_tokens_give_mirrored_outputs(network, tokens):
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", CONFIGS)
-def test_an_asymmetry_is_zero_at_first_and_tells_mirrors_apart(
-    name, tokens, generator
-):
+def test_an_asymmetry_is_zero_at_first_and_tells_mirrors_apart(name, tokens, generator):
     config = replace(CONFIGS[name], symmetries=4, asymmetry=True)
     network = config.build(INPUTS, OUTPUTS)
     assert not network.embed.asymmetry.any()

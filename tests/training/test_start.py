@@ -25,7 +25,12 @@ from torchrl_nerd.robots import load_scene
 from torchrl_nerd.training import start
 from torchrl_nerd.training import trainer as module
 from torchrl_nerd.training.samples import cover, data_stats
-from torchrl_nerd.training.start import begin_from, fingerprint, make_model
+from torchrl_nerd.training.start import (
+    begin_from,
+    find_symmetry,
+    fingerprint,
+    make_model,
+)
 from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import Trainer
 
@@ -196,6 +201,42 @@ def test_a_told_model_goes_on_with_the_parameters_that_it_knows(generator):
     begin_from(initial, scene, config)
     with pytest.raises(ValueError, match="expected the parameters .* is told"):
         begin_from(initial, CARTPOLE.vary(second | first), config)
+
+
+@pytest.mark.parametrize(
+    ("name", "how", "count"),
+    [
+        ("gymnasium/Walker2d-v5", {}, 2),
+        ("gymnasium/Ant-v5", {}, 4),
+        ("gymnasium/Walker2d-v5", {"network": "gru"}, 1),
+        ("cartpole", {"step": "unconstrained"}, 1),
+        ("double_pendulum", {}, 1),
+        ("gymnasium/Hopper-v5", {}, 1),
+        ("gymnasium/Walker2d-v5", {"symmetries": 1}, 1),
+    ],
+)
+def test_a_number_of_symmetries_that_is_left_open_is_the_largest(name, how, count):
+    scene, config = load_scene(name), replace(MLP, **{"symmetries": 0} | how)
+    found, symmetry = find_symmetry(scene, config)
+    assert found == replace(config, symmetries=count)
+    assert (symmetry is None) == (count == 1)
+    if symmetry is not None:  # whoever goes on has that of the start
+        plain = make_model(scene, replace(config, symmetries=1))
+        first = make_model(scene, found, None, symmetry)
+        assert find_symmetry(scene, config, plain)[0].symmetries == 1
+        assert find_symmetry(scene, config, first)[0].symmetries == count
+
+
+def test_a_third_party_robot_has_its_symmetries_and_resumes(tmp_path, capsys):
+    line = f"train gymnasium/Walker2d-v5 --data {tmp_path}/data --out {tmp_path}/run"
+    small = "--network mlp-1x16 --steps 3 --rollout-steps 0 --batch-size 4 --quiet"
+    drawn = f"data gymnasium/Walker2d-v5 --trajectories 4 --out {tmp_path}/data --quiet"
+    assert main(drawn.split()) == 0
+    for _ in range(2):
+        assert main(f"{line} {small}".split()) == 0
+    assert read_json(tmp_path / "run" / "state.json")["config"]["symmetries"] == 2
+    model = load_checkpoint(tmp_path / "run" / "last")
+    assert model.config.symmetries == 2
 
 
 def test_symmetry_needs_statistics_that_copies_share(generator):

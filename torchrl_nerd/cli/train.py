@@ -97,8 +97,9 @@ class Train(SceneOptions, DeviceCommand):
                 self.expect_long(read_card(scene, folder)[1])
             data = f"use the data in {', '.join(map(str, folders))}"
         self.expect_writable(out)
-        self.expect_own(out, scene)
-        model = self.untrained(scene, self.initial(scene))
+        initial = self.initial(scene)
+        self.expect_own(out, scene, initial)
+        model = self.untrained(scene, initial)
         weights = sum(weight.numel() for weight in model.network.parameters())
         return [
             data,
@@ -109,10 +110,10 @@ class Train(SceneOptions, DeviceCommand):
 
     def untrained(self, scene: Scene, initial: NeRD | None) -> NeRD:
         """The model whose training begins; settings that do not fit are refused."""
-        symmetry = find_symmetry(scene, self.config)
+        config, symmetry = find_symmetry(scene, self.config, initial)
         if initial is not None:
-            return begin_from(initial, scene, self.config, symmetry)
-        return make_model(scene, self.config, symmetry=symmetry)
+            return begin_from(initial, scene, config, symmetry)
+        return make_model(scene, config, symmetry=symmetry)
 
     def is_to_draw(self, folders: tuple[Path, ...]) -> bool:
         """Whether data are drawn, or finished; never to a folder that was named in vain."""
@@ -132,10 +133,11 @@ class Train(SceneOptions, DeviceCommand):
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
 
-    def expect_own(self, out: Path, scene: Scene) -> None:
+    def expect_own(self, out: Path, scene: Scene, initial: NeRD | None) -> None:
         """Refuse a folder that holds a run of other settings."""
         if (out / STATE).exists():
-            asked = {"config": asdict(self.config), "scene_hash": scene.hash}
+            config, _ = find_symmetry(scene, self.config, initial)
+            asked = {"config": asdict(config), "scene_hash": scene.hash}
             expect_same(f"{out} holds a run", read_json(out / STATE), asked)
 
     def run(self) -> dict[str, Any]:
@@ -145,7 +147,7 @@ class Train(SceneOptions, DeviceCommand):
         self.expect_writable(out)
         self.untrained(scene, initial)  # refuses before data are drawn, or read
         if self.is_to_draw(folders):
-            self.expect_own(out, scene)
+            self.expect_own(out, scene, initial)
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads is not None:

@@ -43,6 +43,7 @@ THIRD_PARTY = Preset(  # an MLP on single states; nothing is tuned
     data=DataConfig(trajectories=10_000, steps=100),
     train=TrainConfig(
         network="mlp-4x128-products",
+        symmetries=0,
         steps=10_000,
         rollout_steps=500,
         single_step_fraction=1.0,

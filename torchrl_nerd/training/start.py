@@ -184,11 +184,31 @@ def _expect_mirrors(symmetry: Symmetry, model: NeRD) -> None:
                 )
 
 
-def find_symmetry(scene: Scene, config: TrainConfig) -> Symmetry | None:
-    """The robot's symmetries, where data or network are to have them; see `Symmetry`."""
+def find_symmetry(
+    scene: Scene, config: TrainConfig, start: NeRD | None = None
+) -> tuple[TrainConfig, Symmetry | None]:
+    """The robot's symmetries, where data or network are to have them; see `Symmetry`.
+
+    And the configuration with their number. Where it leaves that open, it is that of the
+    model to ``start`` from, else the largest that robot and network can have.
+    """
+    if config.symmetries == 0:
+        config = replace(config, symmetries=_most(scene, config, start))
     if not config.use_symmetry and config.symmetries == 1:
-        return None
-    return Symmetry(scene, config.features, config.near_symmetry)
+        return config, None
+    return config, Symmetry(scene, config.features, config.near_symmetry)
+
+
+def _most(scene: Scene, config: TrainConfig, start: NeRD | None) -> int:
+    if start is not None:
+        return getattr(start.config, "symmetries", 1)
+    is_able = isinstance(network_config(config.network), TransformerConfig | MLPConfig)
+    if config.step is not None or not is_able:
+        return 1
+    try:
+        return Symmetry(scene, config.features).counts()[-1]
+    except ValueError:  # a robot of a kind that has none
+        return 1
 
 
 def fingerprint(model: NeRD) -> str:

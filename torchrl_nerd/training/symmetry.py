@@ -77,7 +77,8 @@ class Symmetry(nn.Module):
         if unseen and len(self.isometries) > 1:
             raise ValueError(
                 f"expected random states of '{self.name}' to fill every feature of the "
-                f"data, got none for {unseen}: train without use_symmetry and symmetries"
+                f"data, got none for {unseen}: train without use_symmetry and "
+                "with symmetries 1"
             )
         both = (TOKEN, self.tokens), (TARGET, self.targets)
         return {key: copies.complete(stats[key]) for key, copies in both}

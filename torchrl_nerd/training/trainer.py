@@ -109,7 +109,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self._build(data, init_from)
         self.identity = {  # what a resumed run must have in common
-            "config": asdict(config),
+            "config": asdict(self.config),
             "scene_hash": scene.hash,
             "init_from": self.init_from,
             "data": data_fingerprint(data),
@@ -139,9 +139,9 @@ class Trainer:
     def _build(self, data: TensorDict, init_from: NeRD | None) -> None:
         """The model, its statistics and its batches."""
         data = data.to(self.device)  # which makes all of what follows of them
-        symmetry, self.init_from = find_symmetry(self.scene, self.config), None
+        self.config, symmetry = find_symmetry(self.scene, self.config, init_from)
         if init_from is None:
-            model = self.make_model(data, symmetry)
+            model, self.init_from = self.make_model(data, symmetry), None
         else:
             model = begin_from(init_from, self.scene, self.config, symmetry)
             self.init_from = fingerprint(init_from)
