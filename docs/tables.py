@@ -417,6 +417,10 @@ def minutes_to(curve: list[dict[str, float]], wanted: float) -> str:
     return f"{times[0] / 60:.1f}" if times else "-"
 
 
+def _task_and_seed(how: dict[str, Any]) -> str:
+    return f"{how['name']}, seed {how['seed']}" if how["seed"] else how["name"]
+
+
 def policies_table(folder: Path = RESULTS) -> str:
     """Policies that learned in a model alone, and in MuJoCo: returns, frames, minutes.
 
@@ -436,6 +440,7 @@ def policies_table(folder: Path = RESULTS) -> str:
             [spent[way], minutes_to(found[way], wanted)] for way in ("model", "mujoco")
         )
         network, none = f"model, {how['network']}", ["-", "-"]
+        task = _task_and_seed(how)
         for name, way, frames, minutes, in_model in (
             ("the model, in MuJoCo", network, few, ours, promised),
             ("MuJoCo", "MuJoCo", most, theirs, "-"),
@@ -443,7 +448,7 @@ def policies_table(folder: Path = RESULTS) -> str:
             ("MuJoCo, the model's robot frames", "MuJoCo", few, none, "-"),
         ):
             if (returns := found["returns"].get(f"learned in {name}")) is not None:
-                about = how["name"], way, f"{frames:,}"
+                about = task, way, f"{frames:,}"
                 line = [*about, *minutes, spread(returns), in_model]
                 if about not in lines or lines[about][4] == "-":  # without times
                     lines[about] = line
@@ -461,7 +466,7 @@ def policy_curves_table(folder: Path = RESULTS) -> str:
             count = len(found[way])
             places = (max(1, count * i // parts) - 1 for i in range(1, parts + 1))
             earned = (f"{found[way][i]['return']:,.0f}" for i in places)
-            line = [how["name"], name, *earned]
+            line = [_task_and_seed(how), name, *earned]
             if line not in table:  # rivals of several models are one
                 table.append(line)
     return rows(table) if table[1:] else ""

@@ -7,9 +7,9 @@
    learning; PPO in the model alone, where an episode fails as soon as a step is unlike the
    data.
    After the last round the model learns once more, and says what the policy earns.
-3. Its rivals learn in MuJoCo beside it, with the same PPO: one for as many frames as the
-   policy had in the model, one for as many as the model's data cost the robot, and one
-   whose episodes fail where those in the model do.
+3. Its rivals learn in MuJoCo beside it, with the same PPO and episodes that begin anew
+   with each round: one for as many frames as the policy had in the model, one for as many
+   as the model's data cost the robot.
 4. All play whole episodes in MuJoCo, from the same held-out starts.
 
 The two ways take a processor each at the same time, and each counts what it took of it.
@@ -26,7 +26,7 @@ from typing import cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Transform, TransformedEnv
 from tyro.conf import Positional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
@@ -34,7 +34,6 @@ import ppo
 from learner import Clock, Learner, processor_time, run, use_one_thread
 
 from torchrl_nerd import make_env
-from torchrl_nerd.checkpoint import load_checkpoint
 from torchrl_nerd.configs import TrainConfig
 from torchrl_nerd.data.simulate import is_sound, simulate
 from torchrl_nerd.dynamics import GuardedDynamics, NeRDDynamics
@@ -43,7 +42,7 @@ from torchrl_nerd.envs.base import SceneEnv
 from torchrl_nerd.evaluation.policy import save_policy
 from torchrl_nerd.evaluation.policy_transfer import policy_returns, summarize
 from torchrl_nerd.evaluation.results import write_results
-from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TERRAIN, TRUST
+from torchrl_nerd.keys import NEXT_QPOS, NEXT_QVEL, QPOS, QVEL, TRUST
 from torchrl_nerd.modules.nerd import NeRD
 from torchrl_nerd.modules.networks import network_config
 from torchrl_nerd.robots import make_task
@@ -71,8 +70,8 @@ class Config:
     last_updates: int = 3000  # of the model that promises what the last policy earns
     batch: int = 512  # transitions of an update
     trust: float = 0.5  # a step fails below: twice as far out as 99% of the data
-    network: str = "mlp-4x64"
-    symmetries: int = 1  # of the robot, built into the network: 4 of Ant-v5
+    network: str = "mlp-4x64-products"
+    symmetries: int = 0  # of the robot, built into the network; 0: all that it has
     near_symmetry: bool = False  # those that it has but nearly, as well
     noise: float = 0.3  # of actions along the policy, largest standard deviation
     frames: int = 3_000_000  # actions of PPO, all rounds together; in MuJoCo as well
@@ -105,28 +104,17 @@ class Config:
 class Trusted(Transform):
     """Ends an episode as failed where a model is asked for what it has no data of.
 
-    Args:
-        least: trust that a step needs.
-        judge: whose trust it is, where the env has none. It keeps no past.
+    ``least``: the trust that a step needs.
     """
 
-    def __init__(self, least: float, judge: GuardedDynamics | None = None) -> None:
+    def __init__(self, least: float) -> None:
         super().__init__()
-        self.least, self.judge = least, judge
+        self.least = least
 
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        found = next_tensordict
-        if self.judge is not None:
-            state, ctrl = (
-                tensordict.select(QPOS, QVEL),
-                next_tensordict.get("ctrl", None),
-            )
-            ground = tensordict.get(TERRAIN, None)
-            torque = next_tensordict["joint_torque"]
-            found = self.judge.step(state, torque, ground, ctrl)
-        lost = found[TRUST] < self.least  # (num_envs, 1)
+        lost = next_tensordict[TRUST] < self.least  # (num_envs, 1)
         for key in ("done", "terminated"):
             next_tensordict[key] = next_tensordict[key] | lost
         return next_tensordict
@@ -187,7 +175,6 @@ def train_model(
         network=cfg.network,
         symmetries=cfg.symmetries,
         near_symmetry=cfg.near_symmetry,
-        use_symmetry=cfg.symmetries > 1 and not cfg.near_symmetry,
         steps=cfg.updates if start is None else updates,
         rollout_steps=0,
         batch_size=cfg.batch,
@@ -258,25 +245,18 @@ def in_the_model(cfg: Config) -> dict:
     }
 
 
-def in_mujoco(cfg: Config, is_judged: bool = False) -> dict:
-    """A policy learned in MuJoCo, what it took, and how it does.
-
-    ``is_judged``: its episodes fail as those in the model do, by the models of the rounds.
-    """
+def in_mujoco(cfg: Config) -> dict:
+    """A policy learned in MuJoCo, what it took, and how it does."""
     task, clock = begin(cfg)
-    env: EnvBase = make_env(task, "mujoco", cfg.num_envs, cfg.seed)
-    learner, curve = Learner(cfg.ppo, env), []
+    learner = Learner(cfg.ppo, make_env(task, "mujoco", cfg.num_envs, cfg.seed))
+    curve = []
     for number in range(cfg.rounds):
-        if is_judged:
-            model = cast(NeRD, load_checkpoint(cfg.folder / f"model_{number}" / "last"))
-            rule = Trusted(cfg.trust, GuardedDynamics(NeRDDynamics(model)))
-            env = make_env(task, "mujoco", cfg.num_envs, cfg.seed + number)
-            env = TransformedEnv(env, rule)
-        learner.learn(env, 1.0 / cfg.rounds)
+        env = make_env(task, "mujoco", cfg.num_envs, cfg.seed + number)
+        last = learner.learn(env, 1.0 / cfg.rounds)
         clock.note("policy")
         found = watched(cfg, learner.actor)
         robot_frames = learner.done * learner.batch * task.frame_skip
-        point = {"robot_frames": robot_frames, "return": found}
+        point = {"robot_frames": robot_frames, "return": found, **last}
         curve.append(point | {"seconds": clock.spent()})
         print(f"MuJoCo, {curve[-1]}", flush=True)
         clock.note("watching")
@@ -308,15 +288,10 @@ def main(cfg: Config) -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         ways = pool.submit(in_the_model, cfg), pool.submit(in_mujoco, cfg)
         learned, rival = (way.result() for way in ways)
-        report(cfg, learned, rival, {})  # the other rivals take as long again
+        report(cfg, learned, rival, {})
         robot_frames = learned["curve"][-1]["robot_frames"]
-        fewer = pool.submit(few_frames, cfg, robot_frames)
-        judged = pool.submit(in_mujoco, cfg, True).result()["reached"]
-        others = {
-            "the model's robot frames": fewer.result(),
-            "the rule of trust": judged,
-        }
-    report(cfg, learned, rival, others)
+        fewer = pool.submit(few_frames, cfg, robot_frames).result()
+    report(cfg, learned, rival, {"the model's robot frames": fewer})
 
 
 def report(cfg: Config, learned: dict, rival: dict, others: dict[str, Tensor]) -> None:
