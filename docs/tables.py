@@ -583,7 +583,8 @@ def open_loop_table(folder: Path = RESULTS) -> str:
         places = (", ".join(places_of(x, cases)) if x else "-" for x in fronts)
         config = found["configuration"]
         count = config.get("symmetries", 1)
-        network = config["network"] + f", {count} symmetries" * (count > 1)
+        nearly = "nearly " * config.get("near_symmetry", False)
+        network = config["network"] + f", {nearly}{count} symmetries" * (count > 1)
         rated.append([robot, network, *speeds, *places])
     return "\n\n".join((rows([head, *lines]), with_sources(rated, records.values())))
 

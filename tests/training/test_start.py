@@ -212,19 +212,22 @@ def test_a_told_model_goes_on_with_the_parameters_that_it_knows(generator):
         ("cartpole", {"step": "unconstrained"}, 1),
         ("double_pendulum", {}, 1),
         ("gymnasium/Hopper-v5", {}, 1),
+        ("gymnasium/Humanoid-v5", {"near_symmetry": True}, 2),
+        ("gymnasium/Humanoid-v5", {"use_symmetry": True}, 1),
         ("gymnasium/Walker2d-v5", {"symmetries": 1}, 1),
     ],
 )
 def test_a_number_of_symmetries_that_is_left_open_is_the_largest(name, how, count):
-    scene, config = load_scene(name), replace(MLP, **{"symmetries": 0} | how)
+    asked = {key: value for key, value in how.items() if key != "near_symmetry"}
+    scene, config = load_scene(name), replace(MLP, **{"symmetries": 0} | asked)
     found, symmetry = find_symmetry(scene, config)
-    assert found == replace(config, symmetries=count)
-    assert (symmetry is None) == (count == 1)
-    if symmetry is not None:  # whoever goes on has that of the start
+    assert found == replace(config, **{"symmetries": count} | how)
+    assert (symmetry is None) == (count == 1 and not config.use_symmetry)
+    if count > 1:  # whoever goes on has that of the start
         plain = make_model(scene, replace(config, symmetries=1))
         first = make_model(scene, found, None, symmetry)
         assert find_symmetry(scene, config, plain)[0].symmetries == 1
-        assert find_symmetry(scene, config, first)[0].symmetries == count
+        assert find_symmetry(scene, config, first)[0] == found
 
 
 def test_a_third_party_robot_has_its_symmetries_and_resumes(tmp_path, capsys):
@@ -232,6 +235,11 @@ def test_a_third_party_robot_has_its_symmetries_and_resumes(tmp_path, capsys):
     small = "--network mlp-1x16 --steps 3 --rollout-steps 0 --batch-size 4 --quiet"
     drawn = f"data gymnasium/Walker2d-v5 --trajectories 4 --out {tmp_path}/data --quiet"
     assert main(drawn.split()) == 0
+    capsys.readouterr()
+    assert main(f"{line} {small} --dry-run".split()) == 0
+    assert (
+        "of a learned model with symmetries 2 for 3 updates" in capsys.readouterr().out
+    )
     for _ in range(2):
         assert main(f"{line} {small}".split()) == 0
     assert read_json(tmp_path / "run" / "state.json")["config"]["symmetries"] == 2

@@ -101,10 +101,12 @@ class Train(SceneOptions, DeviceCommand):
         self.expect_own(out, scene, initial)
         model = self.untrained(scene, initial)
         weights = sum(weight.numel() for weight in model.network.parameters())
+        count = getattr(model.config, "symmetries", 1)
+        having = f" with symmetries {count}" if count > 1 else ""
         return [
             data,
             f"{'resume the' if (out / STATE).exists() else 'begin a'} run in {out}",
-            f"train the {weights} weights of a {model.kind} model for "
+            f"train the {weights} weights of a {model.kind} model{having} for "
             f"{self.config.total_steps} updates",
         ]
 

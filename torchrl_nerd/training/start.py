@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -190,25 +191,32 @@ def find_symmetry(
     """The robot's symmetries, where data or network are to have them; see `Symmetry`.
 
     And the configuration with their number. Where it leaves that open, it is that of the
-    model to ``start`` from, else the largest that robot and network can have.
+    model to ``start`` from, else the largest that robot and network can have, if only
+    nearly.
     """
     if config.symmetries == 0:
-        config = replace(config, symmetries=_most(scene, config, start))
+        config = _with_most(scene, config, start)
     if not config.use_symmetry and config.symmetries == 1:
         return config, None
     return config, Symmetry(scene, config.features, config.near_symmetry)
 
 
-def _most(scene: Scene, config: TrainConfig, start: NeRD | None) -> int:
+def _with_most(scene: Scene, config: TrainConfig, start: NeRD | None) -> TrainConfig:
+    network = network_config(config.network) if start is None else start.config
+    if (
+        not isinstance(network, TransformerConfig | MLPConfig)
+        or config.step is not None
+    ):
+        return replace(config, symmetries=1)
     if start is not None:
-        return getattr(start.config, "symmetries", 1)
-    is_able = isinstance(network_config(config.network), TransformerConfig | MLPConfig)
-    if config.step is not None or not is_able:
-        return 1
-    try:
-        return Symmetry(scene, config.features).counts()[-1]
-    except ValueError:  # a robot of a kind that has none
-        return 1
+        how = {"symmetries": network.symmetries, "near_symmetry": network.asymmetry}
+        return replace(config, **how)
+    for is_near in (False, True) if not config.use_symmetry else (False,):
+        with suppress(ValueError):  # a robot of a kind that has none
+            count = Symmetry(scene, config.features, is_near).counts()[-1]
+            if count > 1:
+                return replace(config, symmetries=count, near_symmetry=is_near)
+    return replace(config, symmetries=1)
 
 
 def fingerprint(model: NeRD) -> str:
