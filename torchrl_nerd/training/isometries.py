@@ -45,7 +45,7 @@ def find_isometries(scene: Scene, is_near: bool = False) -> list[Isometry]:
             "expected hinges or slides, actuators on them and one ground for "
             f"use_symmetry or symmetries, got '{scene.name}'"
         )
-    identity, *others = candidates(scene)
+    identity, *others = candidates(scene, NEAR) if is_near else candidates(scene)
     trial = Trial(scene)
     holds = trial.nearly_agrees if is_near else trial.agrees
     return [identity, *filter(holds, others)]

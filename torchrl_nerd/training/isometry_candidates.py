@@ -21,11 +21,11 @@ PLACE_TOL = 1e-6  # m, and of a unit vector
 LAW = ("condim", "priority", "friction", "solref", "solimp", "margin", "gap", "rbound")
 
 
-def candidates(scene: Scene) -> Iterator[Isometry]:
+def candidates(scene: Scene, law_rtol: float = PLACE_TOL) -> Iterator[Isometry]:
     """Isometries that put joints on joints, shapes on shapes and the ground on itself.
 
     Joints at one place, such as the hips of a planar walker, are mapped to themselves or to
-    each other.
+    each other. Numbers of shapes' contacts may differ by ``law_rtol`` of themselves.
     """
     actuated, model = list(scene.actuated), scene.model
     data, is_floating = mujoco.MjData(model), scene.base.is_floating
@@ -39,7 +39,7 @@ def candidates(scene: Scene) -> Iterator[Isometry]:
     known: list[list[float]] = []
     for order, sign in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         body = np.eye(3)[list(order)] * np.array(sign)[:, None]
-        if not shapes.are_mapped(body):
+        if not shapes.are_mapped(body, law_rtol):
             continue
         for is_swapped in (False, True):
             matched = _match_joints(model, data, center, body, is_swapped)
@@ -148,7 +148,7 @@ class Shapes:
         self.mutual = touches[np.ix_(own, own)]
         self.ground = np.asarray(touches[own][:, ~is_own].any(1))
 
-    def are_mapped(self, body: np.ndarray) -> bool:
+    def are_mapped(self, body: np.ndarray, law_rtol: float) -> bool:
         """Whether they lie on such shapes, which touch the same.
 
         How they are turned, and what they weigh, is left to the trial of steps.
@@ -156,7 +156,7 @@ class Shapes:
         onto: list[int] = []
         for place, law in zip(self.places @ body.T, self.laws, strict=True):
             near = np.abs(self.places - place).max(1) < PLACE_TOL
-            alike = np.isclose(self.laws, law, rtol=PLACE_TOL).all(1)
+            alike = np.isclose(self.laws, law, rtol=law_rtol).all(1)
             free = [i for i in np.flatnonzero(near & alike) if i not in onto]
             if not free:
                 return False
