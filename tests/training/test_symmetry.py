@@ -61,6 +61,12 @@ def test_the_groups_are_those_of_the_shapes(name, order):
     assert len(find_isometries(load_scene(name))) == order
 
 
+def test_anymal_has_two_mirrors_and_a_half_turn_but_nearly():
+    """Its features have them exactly, those that a contact law predicts as well."""
+    symmetry = Symmetry(load_scene("anymal"), FeatureConfig(True), is_near=True)
+    assert symmetry.counts() == [1, 2, 4]
+
+
 @pytest.mark.parametrize("name", ["double_pendulum", "cube_slope"])
 def test_a_ground_that_varies_is_refused(name):
     with pytest.raises(ValueError, match=f"one ground .* got '{name}'"):
