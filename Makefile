@@ -269,44 +269,43 @@ model-franka-mlp: data-franka ## Franka's MLP, with products: the same data, the
 	cp runs/franka_mlp_second/best/* $(PRETRAINED)/franka-mlp/
 
 # ANYmal's networks: single steps and rollouts, then both again with more data, as the Ant's.
-ANYMAL := --validate-every 4000 --save-every 500 --threads 1
-ANYMAL_DATA := datasets/anymal datasets/anymal_more datasets/anymal_resting
+# The robot is nearly symmetric: left and right, fore and hind.
+ANYMAL := --symmetries 4 --near-symmetry --validate-every 4000 --save-every 500 --threads 1
+ANYMAL_DATA := datasets/anymal datasets/anymal_more
 IN_ANYMAL := $(PY) experiments/time_to_policy.py --wanted 0 --frames 5000000 --horizon 16 \
-	--minibatch 8192 --lr 1e-3 --dynamics runs/anymal_mlp_first/best --episodes 64
+	--minibatch 8192 --lr 1e-3 --dynamics runs/anymal_mlp_first/best --episodes 64 \
+	--seed 11 --out runs/anymal_learned_11
 
 data-anymal: $(STAMP)
 	$(NERD) data anymal --trajectories 10000 --seed 21 --out datasets/anymal
 	$(NERD) data anymal --trajectories 10000 --seed 81 --out datasets/anymal_more
-	$(NERD) data anymal --strategy resting --trajectories 6000 --seed 71 --out datasets/anymal_resting
 
 data-anymal-learned: data-anymal
 	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) --rollout-lr-ratio 0.25 $(MLP) \
-		--steps 24000 --rollout-steps 4000 --out runs/anymal_mlp_first
-	$(IN_ANYMAL) anymal/forward --seed 11 --out runs/anymal_learned_11
-	$(IN_ANYMAL) anymal/sideways --seed 11 --out runs/anymal_learned_11
-	$(IN_ANYMAL) anymal/forward --seed 12 --out runs/anymal_learned_12
+		--steps 12000 --rollout-steps 2000 --out runs/anymal_mlp_first
+	$(IN_ANYMAL) anymal/forward
+	$(IN_ANYMAL) anymal/sideways
 	$(NERD) data anymal --policy runs/anymal_learned_*/anymal-*/*/[0-9]* \
-		--trajectories 2200 --steps 500 --seed 61 --out datasets/anymal_learned
+		--trajectories 1500 --steps 500 --seed 61 --out datasets/anymal_learned
 
 model-anymal-mlp: data-anymal-learned ## ANYmal's MLP: two stages, the second with data along policies
 	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) datasets/anymal_learned \
 		--lr 0.006 --adamw-lr 0.0018 --rollout-lr-ratio 0.4 $(MLP) \
-		--init-from runs/anymal_mlp_first/best --steps 10000 --rollout-steps 4500 --out runs/anymal_mlp_second
+		--init-from runs/anymal_mlp_first/best --steps 5000 --rollout-steps 2000 --out runs/anymal_mlp_second
 	cp runs/anymal_mlp_second/best/* $(PRETRAINED)/anymal-mlp/
+
+model-anymal: data-anymal-learned ## ANYmal's transformer, with the same data
+	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) --rollout-lr-ratio 0.15 $(TRANSFORMER) \
+		--steps 12000 --rollout-steps 1000 --out runs/anymal_first
+	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) datasets/anymal_learned \
+		--lr 0.005 --adamw-lr 0.0015 --rollout-lr-ratio 0.3 $(TRANSFORMER) \
+		--init-from runs/anymal_first/best --steps 5000 --rollout-steps 1500 --out runs/anymal_second
+	cp runs/anymal_second/last/* $(PRETRAINED)/anymal/
 
 anymal-wide: $(STAMP)
 	$(NERD) data anymal --trajectories 20000 --seed 1 --out datasets/anymal_wide
 	$(NERD) train anymal --data datasets/anymal_wide $(WIDE) --predicted-force --steps 10500 \
 		--bf16-fraction 0.7 --out runs/anymal_wide
-
-model-anymal: anymal-wide data-anymal-learned ## ANYmal's transformer: single steps, then two stages with products
-	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) --rollout-lr-ratio 0.15 $(TRANSFORMER) \
-		--init-from runs/anymal_wide/last --lr 0.006 --adamw-lr 0.0018 \
-		--steps 9000 --rollout-steps 1000 --out runs/anymal_second
-	$(NERD) train anymal $(ANYMAL) --data $(ANYMAL_DATA) datasets/anymal_learned \
-		--lr 0.005 --adamw-lr 0.0015 --rollout-lr-ratio 0.3 $(TRANSFORMER) \
-		--init-from runs/anymal_second/best --steps 8000 --rollout-steps 3000 --out runs/anymal_third
-	cp runs/anymal_third/best/* $(PRETRAINED)/anymal/
 
 PENDULUM := --network transformer-2x96 --predicted-force --unconstrained-motion --loss-eps 1.0
 
