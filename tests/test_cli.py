@@ -549,7 +549,10 @@ def test_a_scene_is_explained(name, tmp_path, capsys):
     counts = ", ".join(map(str, content["symmetries"]))
     assert f"symmetries of a network: {counts}" in text
     assert (content["symmetries"] == [1]) == bool(content["why_no_symmetries"])
-    assert ("--symmetries" in text) == (content["symmetries"] != [1])
+    most = max(content["symmetries"] + content["near_symmetries"])
+    assert ("--symmetries" in text) == (most > 1)
+    assert ("--near-symmetry" in text) == (content["near_symmetries"] != [1])
+    assert content["near_symmetries"] == ([1, 2, 4] if scene.name == "anymal" else [1])
     known = {"ant": [1, 2, 4], "cube": [1, 2, 4, 8], "anymal": [1], "cartpole": [1, 2]}
     assert content["symmetries"] == known.get(scene.name, content["symmetries"])
 
