@@ -37,9 +37,12 @@ def _symmetries(scene: Scene) -> tuple[dict[str, Any], str]:
     """Numbers of symmetries that a network can have, and in words, or why it is 1 alone."""
     counts, near, why = [1], [1], None
     try:
-        counts = Symmetry(scene).counts()
+        found = Symmetry.most(scene)
+        if found.is_near:
+            near = found.counts()
+        else:
+            counts = found.counts()
         if counts == [1]:
-            near = Symmetry(scene, is_near=True).counts()
             why = "no mirror or half turn commutes with MuJoCo's step and the features"
     except ValueError as error:
         why = str(error)
@@ -48,5 +51,5 @@ def _symmetries(scene: Scene) -> tuple[dict[str, Any], str]:
         how += f"nearly {near[-1]}: --symmetries {near[-1]} --near-symmetry"
     else:
         how += why or f"nerd train {scene.name} --symmetries {counts[-1]}"
-    found = {"symmetries": counts, "near_symmetries": near, "why_no_symmetries": why}
-    return found, how
+    numbers = {"symmetries": counts, "near_symmetries": near}
+    return numbers | {"why_no_symmetries": why}, how

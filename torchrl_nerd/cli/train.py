@@ -19,6 +19,7 @@ from torchrl_nerd.scenes import Scene
 from torchrl_nerd.settings import SettingError, expect_at_least, expect_same
 from torchrl_nerd.training.log import LoggerName
 from torchrl_nerd.training.start import begin_from, find_symmetry, make_model
+from torchrl_nerd.training.symmetry import Symmetry
 from torchrl_nerd.training.trainer import STATE, Trainer
 
 Kind = Literal["learned", "hybrid"]
@@ -98,8 +99,9 @@ class Train(SceneOptions, DeviceCommand):
             data = f"use the data in {', '.join(map(str, folders))}"
         self.expect_writable(out)
         initial = self.initial(scene)
-        self.expect_own(out, scene, initial)
-        model = self.untrained(scene, initial)
+        config, symmetry = find_symmetry(scene, self.config, initial)
+        self.expect_own(out, scene, config)
+        model = self.untrained(scene, initial, config, symmetry)
         weights = sum(weight.numel() for weight in model.network.parameters())
         count = getattr(model.config, "symmetries", 1)
         having = f" with symmetries {count}" if count > 1 else ""
@@ -110,9 +112,14 @@ class Train(SceneOptions, DeviceCommand):
             f"{self.config.total_steps} updates",
         ]
 
-    def untrained(self, scene: Scene, initial: NeRD | None) -> NeRD:
+    def untrained(
+        self,
+        scene: Scene,
+        initial: NeRD | None,
+        config: TrainConfig,
+        symmetry: Symmetry | None,
+    ) -> NeRD:
         """The model whose training begins; settings that do not fit are refused."""
-        config, symmetry = find_symmetry(scene, self.config, initial)
         if initial is not None:
             return begin_from(initial, scene, config, symmetry)
         return make_model(scene, config, symmetry=symmetry)
@@ -135,10 +142,9 @@ class Train(SceneOptions, DeviceCommand):
         for folder in filter(None, (out, self.export)):
             check_writable(folder / "card.json")
 
-    def expect_own(self, out: Path, scene: Scene, initial: NeRD | None) -> None:
+    def expect_own(self, out: Path, scene: Scene, config: TrainConfig) -> None:
         """Refuse a folder that holds a run of other settings."""
         if (out / STATE).exists():
-            config, _ = find_symmetry(scene, self.config, initial)
             asked = {"config": asdict(config), "scene_hash": scene.hash}
             expect_same(f"{out} holds a run", read_json(out / STATE), asked)
 
@@ -147,9 +153,11 @@ class Train(SceneOptions, DeviceCommand):
         scene, preset = self.load(), preset_of(self.scene)
         (out, folders), initial = self.folders, self.initial(scene)
         self.expect_writable(out)
-        self.untrained(scene, initial)  # refuses before data are drawn, or read
+        config, symmetry = find_symmetry(scene, self.config, initial)
+        # refuses before data are drawn, or read
+        self.untrained(scene, initial, config, symmetry)
         if self.is_to_draw(folders):
-            self.expect_own(out, scene, initial)
+            self.expect_own(out, scene, config)
             self.expect_long(preset.data)
             generate(scene, preset.data, folders[0], self.quiet, preset_strategy(scene))
         if self.threads is not None:
@@ -159,7 +167,7 @@ class Train(SceneOptions, DeviceCommand):
             scene,
             load_data(scene, *folders),
             source_of(scene),
-            self.config,
+            config,
             out,
             self.device,
             horizons=protocol.horizons[:2],

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -194,29 +193,35 @@ def find_symmetry(
     model to ``start`` from, else the largest that robot and network can have, if only
     nearly.
     """
+    found = None
     if config.symmetries == 0:
-        config = _with_most(scene, config, start)
+        config, found = _with_most(scene, config, start)
     if not config.use_symmetry and config.symmetries == 1:
         return config, None
-    return config, Symmetry(scene, config.features, config.near_symmetry)
+    if found is None:
+        found = Symmetry(scene, config.features, config.near_symmetry)
+    return config, found
 
 
-def _with_most(scene: Scene, config: TrainConfig, start: NeRD | None) -> TrainConfig:
+def _with_most(
+    scene: Scene, config: TrainConfig, start: NeRD | None
+) -> tuple[TrainConfig, Symmetry | None]:
     network = network_config(config.network) if start is None else start.config
     if (
         not isinstance(network, TransformerConfig | MLPConfig)
         or config.step is not None
     ):
-        return replace(config, symmetries=1)
+        return replace(config, symmetries=1), None
     if start is not None:
         how = {"symmetries": network.symmetries, "near_symmetry": network.asymmetry}
-        return replace(config, **how)
-    for is_near in (False, True) if not config.use_symmetry else (False,):
-        with suppress(ValueError):  # a robot of a kind that has none
-            count = Symmetry(scene, config.features, is_near).counts()[-1]
-            if count > 1:
-                return replace(config, symmetries=count, near_symmetry=is_near)
-    return replace(config, symmetries=1)
+        return replace(config, **how), None
+    find = Symmetry if config.use_symmetry else Symmetry.most
+    try:
+        found = find(scene, config.features)
+    except ValueError:  # a robot of a kind that has none
+        return replace(config, symmetries=1), None
+    how = {"symmetries": found.counts()[-1], "near_symmetry": found.is_near}
+    return replace(config, **how), found
 
 
 def fingerprint(model: NeRD) -> str:

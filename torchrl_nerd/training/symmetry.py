@@ -45,7 +45,8 @@ class Symmetry(nn.Module):
         is_near: bool = False,
     ) -> None:
         super().__init__()
-        self.name, group = scene.name, find_isometries(scene, is_near)
+        self.is_near, self.name = is_near, scene.name
+        group = find_isometries(scene, is_near)
         encode = SceneFeatures(scene, config), StateDelta(scene)
         parts = [states_in_contact(scene, STATES // 2, depth) for depth in MAX_DEPTHS]
         states = cast(TensorDict, TensorDict.cat(parts))
@@ -63,6 +64,15 @@ class Symmetry(nn.Module):
         self.isometries = nn.ModuleList(kept)
         tokens, targets = zip(*found, strict=True)
         self.tokens, self.targets = map(SignedPermutations, (tokens, targets))
+
+    @classmethod
+    def most(cls, scene: Scene, config: FeatureConfig = NO_PREDICTIONS) -> "Symmetry":
+        """The robot's symmetries; where a network can have none, those that hold nearly."""
+        exact = cls(scene, config)
+        if exact.counts() != [1]:
+            return exact
+        near = cls(scene, config, is_near=True)
+        return exact if near.counts() == [1] else near
 
     def complete(self, stats: dict[NestedKey, Stats]) -> dict[NestedKey, Stats]:
         """Statistics of tokens and targets with all their symmetric copies.
